@@ -22,7 +22,6 @@ from scm_world.env.batched.vector_env import EXECUTORS
 from scm_world.errors import UnknownOption, UnreadableFile
 
 SUCCESS = "is_success"
-_TIME_LIMIT = "max_episode_steps"
 
 
 def make_vec(
@@ -48,8 +47,7 @@ def make_vec(
             ``"processes"``.
 
     Raises:
-        UnknownOption: There is no such mode, the number is none, or ``max_episode_steps`` is
-            given: these environments have ``max_episode_length``.
+        UnknownOption: There is no such mode or option, or the number is none.
 
     Example:
         >>> envs = make_vec("scm_world/Pushing-v0", 2, {"floor_friction": 0.4}, backend="fake")
@@ -58,8 +56,6 @@ def make_vec(
         >>> envs.close()
     """
     one_of("vectorization_mode", vectorization_mode, (None, *EXECUTORS))
-    if options.pop(_TIME_LIMIT, None) is not None:
-        raise UnknownOption(_TIME_LIMIT, "a number", ("max_episode_length=…",))
     options.pop("disable_env_checker", None)  # of single environments
     made = as_curriculum(curriculum)
     envs: Any = gymnasium.make_vec(

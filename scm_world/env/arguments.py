@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import wraps
+from inspect import signature
+from typing import Any, TypeVar, cast
 
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from scm_world._types import Floats
 from scm_world.errors import ActionError, Infeasible, InterventionError, UnknownOption
@@ -16,6 +20,39 @@ from scm_world.variables.kinds import SPACES
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.structures import StructureCache
+
+Init = TypeVar("Init", bound=Callable[..., None])
+
+
+def refuse_unknown(given: Iterable[str], *known: Callable[..., Any]) -> None:
+    """Refuse keywords that none of some functions takes, with the nearest one that there is.
+
+    Raises:
+        UnknownOption: There is one.
+    """
+    names = dict.fromkeys(name for one in known for name in signature(one).parameters)
+    choices = [name for name in names if name not in ("self", "options", "member")]
+    for name in given:
+        if name not in names:
+            raise UnknownOption("option of the environment", name, choices)
+
+
+def known_options(init: Init) -> Init:
+    """Let an ``__init__`` refuse unknown keywords by ``UnknownOption``."""
+
+    @wraps(init)
+    def checked(*args: Any, **given: Any) -> None:
+        refuse_unknown(given, init)
+        init(*args, **given)
+
+    return cast(Init, checked)
+
+
+def limited(spec: EnvSpec | None, steps: int) -> EnvSpec | None:
+    """Give what Gymnasium knows of an environment the length of its episodes, if it has none."""
+    if spec is None or spec.max_episode_steps is not None:
+        return spec
+    return replace(spec, max_episode_steps=steps)
 
 
 def finite(size: int) -> str:

@@ -8,6 +8,7 @@ from weakref import WeakKeyDictionary
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of, whole_number
@@ -19,6 +20,8 @@ from scm_world.env.arguments import (
     beginning_structure,
     doubles,
     finite,
+    known_options,
+    limited,
     made_task,
     names_of,
 )
@@ -107,7 +110,10 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             the beginning of the next episode.
         variables_space: The space in which every target of an intervention must lie: ``"A"``,
             ``"B"``, ``"A|B"``, a ``Subset``, or the patterns and regions of one.
-        max_episode_length: In control steps; the task's own if None.
+        max_episode_length: In control steps; the task's own if None. Observations and
+            protocols know of it.
+        max_episode_steps: Truncate episodes after so many control steps even if they are longer:
+            what Gymnasium's ``TimeLimit`` does; never if None or -1.
         conventions: ``"scm_world"`` or ``"causal_world"``.
         render_mode: None, ``"rgb_array"`` or ``"human"``.
 
@@ -130,6 +136,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         "render_fps": 25,
     }
 
+    @known_options
     def __init__(
         self,
         task: Task | str = "pushing",
@@ -157,6 +164,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         attempts: int = 1,
         variables_space: AnyRegion | Mapping[str, Any] | None = None,
         max_episode_length: int | None = None,
+        max_episode_steps: int | None = None,
         conventions: str = "scm_world",
         render_mode: str | None = None,
     ) -> None:
@@ -228,6 +236,10 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self.action_space = self._delta.space() if self._delta else box(*bounds)
 
         self.limit = self.world.max_episode_length + int(self.world.conventions.extra_step)
+        if max_episode_steps not in (None, -1):
+            self.limit = min(
+                self.limit, whole_number("max_episode_steps", max_episode_steps, least=1)
+            )
         self._scale = reward_scale(self.world)
         self._terms = tuple(self.world.task.weights)
         self._version = -1
@@ -238,6 +250,15 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._arrange(beginning_structure(self.world, self._start))
         if goal_env:
             self.compute_reward = goal_reward(self.world)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium knows of it; ``max_episode_steps`` is the length of its episodes."""
+        return self.__dict__.get("spec")
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self.__dict__["spec"] = limited(spec, self.limit)
 
     def as_action(self, command: ArrayLike) -> NDArray[np.float64]:
         """Give the (absolute) action that stands for a command in SI units, shape (n,)."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from inspect import signature
 from typing import Any
 
@@ -67,11 +67,13 @@ def model_vector_env(num_envs: int = 1, model: Any = None, **options: Any) -> Sc
         ModelError: Likewise.
     """
     of_vector = {name: options.pop(name) for name in OF_VECTOR if name in options}
-    task, of_env = _split(model, options)
+    task, of_env = _split(model, options, OF_VECTOR)
     return ScmWorldVectorEnv(num_envs, task=task, **of_vector, **of_env)
 
 
-def _split(model: Any, options: Mapping[str, Any]) -> tuple[Task, dict[str, Any]]:
+def _split(
+    model: Any, options: Mapping[str, Any], besides: Sequence[str] = ()
+) -> tuple[Task, dict[str, Any]]:
     """Make the task, and give the options that are left for the environment."""
     given = options.get("task_options")
     shared = ("observe",) if options.get("observation_mode") == "custom" else ()
@@ -81,7 +83,7 @@ def _split(model: Any, options: Mapping[str, Any]) -> tuple[Task, dict[str, Any]
     of_env = {name: value for name, value in options.items() if name not in apart}
     for name in of_env:
         if name not in OF_ENV:
-            raise UnknownOption(f"option of {MODEL_ID}", name, (*OF_TASK, *OF_ENV))
+            raise UnknownOption(f"option of {MODEL_ID}", name, (*OF_TASK, *OF_ENV, *besides))
     if isinstance(model, Task):
         if of_task:
             raise UnknownOption(

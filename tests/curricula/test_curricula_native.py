@@ -151,15 +151,18 @@ def test_a_state_goes_on_in_the_other_kind(mode: AutoresetMode) -> None:
 
 
 def test_it_is_what_is_made_where_the_engine_has_it() -> None:
-    """MuJoCo steps many in one call; others take turns; a wrapper with a limit is refused."""
+    """MuJoCo steps many in one call; others take turns; there may be a time limit."""
     part = goals("A")
     assert type(make_vec(PUSHING, 2, part, backend="fake").env.executor) is LoopExecutor
     native = make_vec(PUSHING, 2, part, disable_env_checker=True, threads=2)
     assert isinstance(native.env.executor, NativeExecutor)
     assert [*native.env.get_attr("curriculum")] == [native.curriculum] * 2
     assert native.env.get_attr("where") == (None, None)
-    with pytest.raises(UnknownOption, match="max_episode_length"):
-        make_vec(PUSHING, 2, part, max_episode_steps=3)
+    limited = make_vec(PUSHING, 2, part, backend="fake", max_episode_steps=2)
+    limited.reset(seed=0)
+    assert [limited.step(np.zeros((2, 9), np.float32))[3].all() for _ in range(2)] == [False, True]
+    with pytest.raises(UnknownOption, match="did you mean 'frame_skip'"):
+        make_vec(PUSHING, 2, part, frameskip=3)
 
 
 def test_what_is_refused_happens_in_none_of_them() -> None:

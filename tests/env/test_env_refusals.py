@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from envs import BACKENDS, make
 from gymnasium.envs.registration import EnvSpec
+from model_tasks import CARTPOLE
 
 import scm_world as sw
 from scm_world.errors import (
@@ -200,3 +201,39 @@ def test_relative_actions_are_listed_too() -> None:
     """Where an action mode is unknown."""
     with pytest.raises(UnknownOption, match="delta_joint_positions"):
         make(action_mode="torque")
+
+
+@pytest.mark.parametrize("make_one", [gymnasium.make, gymnasium.make_vec])
+@pytest.mark.parametrize("id_", ["scm_world/Pushing-v0", "scm_world/Model-v0"])
+def test_a_misspelled_option_is_refused_with_the_nearest_one(
+    make_one: Callable[..., Any], id_: str
+) -> None:
+    """Of single environments, of many, and of models."""
+    model = {"model": CARTPOLE} if id_.endswith("Model-v0") else {}
+    with pytest.raises(UnknownOption, match="'actionmode'; did you mean 'action_mode'"):
+        make_one(id_, actionmode="joint_torques", **model)
+    if make_one is gymnasium.make_vec:
+        with pytest.raises(UnknownOption, match="'executer'; did you mean 'executor'"):
+            make_one(id_, executer="loop", **model)
+
+
+@pytest.mark.parametrize("backend", ["fake", "mujoco"])
+def test_a_time_limit_is_that_of_gymnasium(backend: str) -> None:
+    """Many environments are truncated where single ones are, and observe the same."""
+    options: Any = {"backend": backend, "max_episode_length": 9, "max_episode_steps": 3}
+    envs = gymnasium.make_vec("scm_world/Pushing-v0", 2, **options)
+    others = gymnasium.make_vec("scm_world/Pushing-v0", 2, vectorization_mode="sync", **options)
+    np.testing.assert_array_equal(envs.reset(seed=0)[0], others.reset(seed=0)[0])
+    for _ in range(5):
+        one, other = (each.step(np.zeros((2, 9), np.float32)) for each in (envs, others))
+        for mine, its in zip(one[:4], other[:4], strict=True):
+            np.testing.assert_array_equal(mine, its)
+    env = gymnasium.make("scm_world/Pushing-v0", backend=backend, max_episode_length=9)
+    lengths = [each.spec.max_episode_steps for each in (env, env.unwrapped, envs)]
+    assert lengths == [9, 9, 3]
+    assert gymnasium.make(env.spec).spec.max_episode_steps == 9
+    assert gymnasium.make("scm_world/Reaching-v0", backend=backend).spec.max_episode_steps == 125
+    with pytest.raises(UnknownOption, match="max_episode_steps"):
+        gymnasium.make_vec("scm_world/Pushing-v0", 2, backend=backend, max_episode_steps=0)
+    for each in (envs, others, env):
+        each.close()

@@ -9,11 +9,13 @@ from functools import partial
 from typing import Any, final
 
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from scm_world._arguments import one_of, whole_number
+from scm_world.env.arguments import limited, refuse_unknown
 from scm_world.env.batched.asking import (
     MASK,
     actions_of,
@@ -99,6 +101,8 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         member: Callable[..., Any] = ScmWorldEnv,
         **options: Any,
     ) -> None:
+        if member is ScmWorldEnv:
+            refuse_unknown(options, ScmWorldEnv, ScmWorldVectorEnv)
         self.num_envs = whole_number("num_envs", num_envs, least=1)
         self.autoreset_mode = _mode(autoreset_mode)
         self.copy = copy
@@ -179,6 +183,15 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         flags = buffers.terminations.copy(), buffers.truncations.copy()
         infos |= self._infos(self._everyone)
         return self._observations(), buffers.rewards.copy(), *flags, infos
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium knows of it; ``max_episode_steps`` is the length of its episodes."""
+        return self.__dict__.get("spec")
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self.__dict__["spec"] = limited(spec, self.get_attr("limit")[0])
 
     def _stepping(self, actions: Any) -> NDArray[np.bool_]:
         """Tell which environments take a step."""
