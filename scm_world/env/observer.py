@@ -237,6 +237,9 @@ def observer(
     main: Observer
     if how.goals and goals is None:
         raise UnknownOption("goal_env", True, (f"False: {declaration.task.name} has no goals",))
+    if how.goals and getattr(declaration.task, "success", None) is not None:
+        allowed = (f"False: goals do not decide the success of this {declaration.task.name}",)
+        raise UnknownOption("goal_env", True, allowed)
     if how.mode == "pixel":
         from scm_world.env.pixels import Pixels
 

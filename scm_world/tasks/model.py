@@ -13,21 +13,18 @@ from numba import njit
 
 from scm_world._types import Floats
 from scm_world.backends import Backend, read_model
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import UnknownOption
 from scm_world.geometry import chains
 from scm_world.graph import SCM
 from scm_world.models import Model, ParameterKey, Readout, Row, State
 from scm_world.tasks.base import Observed, Task, Timing
 from scm_world.tasks.composition import Clock, Composition
-from scm_world.tasks.rewards import SUCCESS
+from scm_world.tasks.rewards import SUCCESS, declared
 from scm_world.variables import (
     Action,
     Box,
-    Derived,
     Exogenous,
     Function,
-    Integers,
-    Linear,
     Measured,
     Parent,
     Rotations,
@@ -506,26 +503,6 @@ def _readout(row: Readout) -> Measured:
         mechanism=mechanism,
         doc=row.doc,
     )
-
-
-def declared(name: str, given: Any) -> Variable:
-    """Declare the reward, success or the end from a variable, or a function and its parents.
-
-    Raises:
-        ModelError: It is neither.
-    """
-    if isinstance(given, Measured | Derived) and given.name == name:
-        return given
-    function, *parents = given if isinstance(given, tuple | list) else (given,)
-    if not (callable(function) or isinstance(function, Function | Linear)) or not parents:
-        raise ModelError(
-            [
-                f"{name}={given!r} is no declaration: give a function and the names of its "
-                f"parents, ({name}_of, 'hinge.position'), or sw.Measured(name={name!r}, …)"
-            ]
-        )
-    whole: dict[str, Any] = {} if name == REWARD else {"dtype": "integer", "bounds": Integers(0, 1)}
-    return Measured(name=name, parents=tuple(parents), mechanism=function, **whole)
 
 
 def is_model(source: str) -> bool:

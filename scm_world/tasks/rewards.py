@@ -13,7 +13,7 @@ from scm_world._types import Value, Values
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.scalars import scalar
 from scm_world.tasks.base import checked_weight
-from scm_world.variables import Box, Function, Linear, Measured, Parent, Variable
+from scm_world.variables import Box, Derived, Function, Integers, Linear, Measured, Parent, Variable
 
 FRACTION = "fractional_success"
 SUCCESS = "success"
@@ -39,6 +39,9 @@ class Common(TypedDict, total=False):
             ``Measured`` variables with a mechanism, whose names begin with ``reward.``; their
             weights stand in ``weights``.
         joint_positions: Where the robot begins, shape (9,) [rad].
+        success: What counts in place of the usual goal: ``(function, "parent", …)``, a function of
+            variables of the task that gives a number in [0, 1], or 0 and 1. It becomes
+            ``fractional_success``, and more than 0.9 of it is ``success``.
     """
 
     weights: str | Mapping[str, float]
@@ -47,6 +50,7 @@ class Common(TypedDict, total=False):
     activate_sparse_reward: bool
     terms: Iterable[Measured | str]
     joint_positions: Sequence[float] | None
+    success: Any
 
 
 def resolve(
@@ -173,6 +177,43 @@ def reward(weights: Mapping[str, float]) -> Variable:
         parents=tuple(used),
         mechanism=Linear(weights=tuple(used.values())),
         doc="Weighted sum of the reward terms.",
+    )
+
+
+def declared(name: str, given: Any) -> Variable:
+    """Declare what counts from a variable, or from a function and its parents.
+
+    Args:
+        name: ``"reward"``, ``"success"``, ``"terminated"`` or ``"fractional_success"``.
+        given: A ``Measured`` of this name, or ``(function, "parent", …)``.
+
+    Raises:
+        ModelError: It is neither.
+    """
+    if isinstance(given, Measured | Derived) and given.name == name:
+        return given
+    function, *parents = given if isinstance(given, tuple | list) else (given,)
+    if not (callable(function) or isinstance(function, Function | Linear)) or not parents:
+        raise ModelError(
+            [
+                f"{name}={given!r} is no declaration: give a function and the names of its "
+                f"parents, ({name}_of, 'hinge.position'), or sw.Measured(name={name!r}, …)"
+            ]
+        )
+    form: dict[str, Any] = {"dtype": "integer", "bounds": Integers(0, 1)}
+    form = {"reward": {}, FRACTION: {"bounds": UNIT}}.get(name, form)
+    return Measured(name=name, parents=tuple(parents), mechanism=function, **form)
+
+
+def succeeded() -> Measured:
+    """Declare success: more than nine tenths of the fractional success."""
+    return Measured(
+        name=SUCCESS,
+        dtype="integer",
+        bounds=Integers(0, 1),
+        parents=(FRACTION,),
+        mechanism=Function(above, constants={"threshold": FULFILLED}),
+        doc="1 where more than nine tenths of the goal are filled.",
     )
 
 

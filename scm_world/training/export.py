@@ -124,13 +124,14 @@ def scored(
     """Evaluate a policy while something is trained.
 
     Returns:
-        The name of the metric, the first one of the task, and its means by protocol.
+        The name of the metric and its means by protocol.
     """
     form = {name: value for name, value in env.items() if name in (*OPTIONS, "task_options")}
     protocols = list(trials.protocols)
     given: dict[str, Any] = {"task": task, "n": trials.episodes, "seeds": SEED, "env": form}
     found = evaluate(policy, protocols, backend=backend, **given)
-    return found.metric(), {name: float(found.score(name).value) for name in found.protocols}
+    metric = found.metric(trials.metric)
+    return metric, {name: float(found.score(name, metric).value) for name in found.protocols}
 
 
 def words(scores: Mapping[str, float]) -> str:

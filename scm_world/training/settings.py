@@ -7,8 +7,10 @@ from typing import Annotated, Any, Literal, Self, final
 
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
+from scm_world._arguments import one_of
 from scm_world.curricula import resample
 from scm_world.errors import ScmWorldError, UnknownOption
+from scm_world.evaluation.episodes import METRICS
 from scm_world.tasks import tasks
 from scm_world.tasks.model import FILES, is_model
 from scm_world.variables.spaces import Frozen
@@ -166,6 +168,16 @@ class Network(Frozen):
     scaled: bool = False
 
 
+def known_metric(name: str) -> str:
+    """Refuse what evaluations do not measure."""
+    one_of("metric", name, METRICS)
+    return name
+
+
+Metric = Annotated[str, AfterValidator(known_metric)]
+"""One of ``METRICS``."""
+
+
 @final
 class Trials(Frozen):
     """Evaluations while an agent is trained; they do not change what it learns.
@@ -174,11 +186,14 @@ class Trials(Frozen):
         protocols: Names, see ``protocols_of``; none for no evaluation.
         episodes: Of each protocol, each time.
         times: How many evaluations there are, evenly spread.
+        metric: One of ``scm_world.evaluation.METRICS``, by which the best policy is kept; None: the
+            last fractional success, of a task without it success, else the return.
     """
 
     protocols: tuple[str, ...] = ("P0", "P5")
     episodes: Count = 20
     times: Count = 10
+    metric: Metric | None = None
 
 
 def observed(env: Mapping[str, Any], observations: Observations) -> dict[str, Any]:

@@ -7,10 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from scm_world.env import ScmWorldEnv, ScmWorldVectorEnv
 from scm_world.errors import Infeasible, InterventionError, ModelError, UnknownOption
+from scm_world.evaluation import evaluate
 from scm_world.geometry import rotation_matrix
 from scm_world.tasks import TASKS, term
 from scm_world.tasks.trifinger.feasibility import buried_goals
+from scm_world.tasks.trifinger.pushing import Pushing
 from scm_world.variables import Box, Draw, Function, Measured
 from scm_world.variables.kinds import SpaceName
 from scm_world.world import Simulation
@@ -169,3 +172,45 @@ def test_a_tilted_goal_rests_on_the_floor() -> None:
     turned = rotation_matrix(world["goal_block.orientation"])[2]
     assert height == pytest.approx(0.0325 * np.abs(turned).sum())
     assert height > 0.04
+
+
+def turning(spin: Any) -> float:
+    """Compute how fast a block turns, of 2 rad/s about the vertical, as a fraction."""
+    return float(np.clip(abs(spin[2]) / 2.0, 0.0, 1.0))
+
+
+SHORT = {"max_episode_length": 2}
+SPIN = "tool_block.angular_velocity"
+
+
+class Spinning(Pushing):
+    """Turn the block; where it lies does not matter."""
+
+    success = (turning, SPIN)
+
+
+@pytest.mark.parametrize("backend", ["fake", "mujoco"])
+def test_a_task_declares_its_own_success(backend: str) -> None:
+    """A block on the goal is no success where it should turn, in one world and in many."""
+    for task in (Spinning(), TASKS["pushing"](success=(turning, SPIN))):
+        world = Simulation(task, backend=backend)
+        world.reset(seed=0)
+        world.do(world.task.solution(world.values()))
+        assert (world["success"], world["fractional_success"]) == (0, 0.0)
+        world.do({SPIN: [0.0, 0.0, 1.0]})
+        assert (world["success"], float(world["fractional_success"])) == (0, 0.5)
+        world.do({SPIN: [0.0, 0.0, 3.0]})
+        assert (world["success"], world["fractional_success"]) == (1, 1.0)
+        assert world.model.parents("fractional_success") == (SPIN,)
+        world.close()
+    envs = ScmWorldVectorEnv(2, task=Spinning(), backend=backend)
+    envs.reset(seed=0)
+    envs.do({1: {SPIN: [0.0, 0.0, 30.0]}})
+    infos = envs.step(np.zeros((2, 9)))[-1]
+    assert infos["is_success"].tolist() == [False, True]
+    envs.close()
+    assert evaluate("still", task=Spinning(), n=1, env=SHORT).score("P0").value == 0.0
+    with pytest.raises(UnknownOption, match="goals do not decide"):
+        ScmWorldEnv(Spinning(), backend=backend, goal_env=True)
+    with pytest.raises(ModelError, match="give a function and the names of its parents"):
+        Simulation(TASKS["reaching"](success=turning), backend=backend)

@@ -463,3 +463,15 @@ def test_scales_follow_the_quantities() -> None:
         worlds.close()
     with pytest.raises(UnknownOption, match="normalize_observations"):
         agents.scales_of(None, {"normalize_observations": False})
+
+
+def test_the_best_policy_is_best_by_the_metric_that_was_asked_for(tmp_path: Path) -> None:
+    """Evaluations measure the return, if they should; what is no metric is refused."""
+    how = RECIPES["ppo"].but(**{"trials.metric": "return"})
+    found = run(how, tmp_path / "run")
+    files = sorted((tmp_path / "run" / "evaluations").glob("*.json"))
+    told = [json.loads(path.read_text()) for path in files]
+    assert {one["metric"] for one in told} == {"return"}
+    assert found.score == max(one["mean"] for one in told)
+    with pytest.raises(UnknownOption, match="did you mean 'return'"):
+        how.but(**{"trials.metric": "retrun"})

@@ -15,7 +15,15 @@ from scm_world.errors import UnknownOption
 from scm_world.models import ControlMode
 from scm_world.tasks.base import Observed, Scenario, Task, Timing, numbers_of
 from scm_world.tasks.composition import Clock, Composition, Entity
-from scm_world.tasks.rewards import FRACTION, Common, further_terms, resolve
+from scm_world.tasks.rewards import (
+    FRACTION,
+    SUCCESS,
+    Common,
+    declared,
+    further_terms,
+    resolve,
+    succeeded,
+)
 from scm_world.tasks.trifinger import hardware, shaping
 from scm_world.tasks.trifinger.entities.block_world import BlockWorld
 from scm_world.tasks.trifinger.entities.robot import ACTIONS, RESOLUTIONS, Robot
@@ -91,6 +99,7 @@ class TriFingerTask(Task):
         unchecked: Prefixes of variables; an intervention that sets one may put bodies as deep in
             one another as it likes, under the conventions of the predecessor.
         start: Where the robot begins, shape (9,) [rad].
+        success: What counts in place of the usual goal, if anything; see ``Common``.
     """
 
     action_modes = tuple(ACTIONS)
@@ -110,6 +119,7 @@ class TriFingerTask(Task):
     ready_terms: ClassVar[tuple[Measured, ...]] = shaping.ROBOT
     unchecked: ClassVar[tuple[str, ...]] = ()
     rest: ClassVar[tuple[float, ...]] = hardware.REST
+    success: Any = None
 
     def __init__(self, **common: Unpack[Common]) -> None:
         unknown = sorted(common.keys() - Common.__annotations__.keys())
@@ -117,6 +127,8 @@ class TriFingerTask(Task):
             raise UnknownOption(f"option of {self.name}", unknown[0], self.arguments())
         self.terms = further_terms(common.get("terms", ()), self.default_weights, self.ready_terms)
         self.weights = resolve(self.default_weights, self.paper_weights, common, self.terms)
+        if common.get("success") is not None:
+            self.success = common["success"]
         given = common.get("joint_positions")
         joints = numbers_of(self.rest if given is None else given)
         if joints is None or joints.shape != (hardware.N_JOINTS,):
@@ -177,7 +189,11 @@ class TriFingerTask(Task):
             made = BlockWorld(
                 *(there, tuple(self.shared()), self.decided_by, mode, self.conventions, unchecked)
             )
-            variables: list[Variable] = [*made.variables(), *self.readouts()]
+            readouts: Iterable[Variable] = self.readouts()
+            if self.success is not None:
+                own = {FRACTION: declared(FRACTION, self.success), SUCCESS: succeeded()}
+                readouts = [own.get(one.name, one) for one in readouts]
+            variables: list[Variable] = [*made.variables(), *readouts]
             if not self.absent:
                 return made, variables
             variables = _computable(variables)

@@ -16,7 +16,7 @@ from scm_world.geometry.overlap import aabb_overlap_fraction
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.tasks.base import Observed
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, FULFILLED, SUCCESS, UNIT, above, reward
+from scm_world.tasks.rewards import FRACTION, FULFILLED, UNIT, reward, succeeded
 from scm_world.tasks.trifinger import hardware, kernels
 from scm_world.tasks.trifinger.base import (
     TriFingerTask,
@@ -25,7 +25,7 @@ from scm_world.tasks.trifinger.base import (
     observe_tool,
 )
 from scm_world.tasks.trifinger.feasibility import fingers_reach
-from scm_world.variables import Function, Integers, Measured, Variable
+from scm_world.variables import Function, Measured, Variable
 from scm_world.variables.mechanisms import Stacked
 
 SECONDS_PER_BLOCK = 10.0
@@ -124,14 +124,7 @@ class Building(TriFingerTask):
         """Declare reward terms and success."""
         yield from self.dense()
         yield self.fractional_success()
-        yield Measured(
-            name=SUCCESS,
-            dtype="integer",
-            bounds=Integers(0, 1),
-            parents=(FRACTION,),
-            mechanism=Function(above, constants={"threshold": FULFILLED}),
-            doc="1 where more than nine tenths of the goal are filled.",
-        )
+        yield succeeded()
         yield from self.terms
         yield reward(self.weights)
 
