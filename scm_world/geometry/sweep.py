@@ -46,10 +46,29 @@ class Found(NamedTuple):
 
 
 @njit(cache=True)
-def _deepen(table: Floats, first: int, second: int, depth: float) -> None:
-    """Note a depth for two bodies, unless a greater one is known."""
+def _deepen(table: Floats, allowed: Floats, first: int, second: int, depth: float) -> bool:
+    """Note a depth for two bodies, unless a greater one is known; tell whether it is too deep."""
     low, high = min(first, second), max(first, second)
     table[low, high] = max(table[low, high], depth)
+    return bool(depth > allowed[low, high])
+
+
+@njit(cache=True)
+def _far(one: Floats, its_end: Floats, other: Floats, other_end: Floats, reach: float) -> bool:
+    """Tell whether the middles of two segments are farther apart than a distance [m]."""
+    total = 0.0
+    for k in range(3):
+        total += (one[k] + its_end[k] - other[k] - other_end[k]) ** 2
+    return total > 4.0 * reach * reach
+
+
+@njit(cache=True)
+def _half_length(start: Floats, end: Floats) -> float:
+    """Compute half the length of a segment [m]."""
+    total = 0.0
+    for k in range(3):
+        total += (end[k] - start[k]) ** 2
+    return 0.5 * math.sqrt(total)
 
 
 @njit(cache=True)
@@ -77,7 +96,8 @@ def _sweep_boxes(
     inner: float,
     height: float,
     table: Floats,
-) -> None:
+    allowed: Floats,
+) -> bool:
     """Compare the boxes that can move with all boxes, the floor and the wall.
 
     The wall has no upper end for a box whose center is beyond it: that one has left the arena.
@@ -88,13 +108,19 @@ def _sweep_boxes(
         half, center, rotation = halves[i], centers[i], rotations[i]
         for j in range(i):
             depth = box_box_kernel(half, center, rotation, halves[j], centers[j], rotations[j])
-            _deepen(table, i, j, depth)
+            if _deepen(table, allowed, i, j, depth):
+                return False
         for j in range(n_movable, len(halves)):
             depth = box_box_kernel(half, center, rotation, halves[j], centers[j], rotations[j])
-            _deepen(table, i, floor - len(halves) + j, depth)
-        _deepen(table, i, floor, box_floor_kernel(half, center, rotation))
+            if _deepen(table, allowed, i, floor - len(halves) + j, depth):
+                return False
+        if _deepen(table, allowed, i, floor, box_floor_kernel(half, center, rotation)):
+            return False
         top = math.inf if math.hypot(center[0], center[1]) > inner else height
-        _deepen(table, i, floor + 1, box_wall_kernel(half, center, rotation, inner, top))
+        depth = box_wall_kernel(half, center, rotation, inner, top)
+        if _deepen(table, allowed, i, floor + 1, depth):
+            return False
+    return True
 
 
 @njit(cache=True)
@@ -106,23 +132,35 @@ def _sweep_capsules(
     inner: float,
     height: float,
     table: Floats,
-) -> None:
+    allowed: Floats,
+) -> bool:
     """Compare the capsules with one another, the floor and the wall, as far as flags say."""
     floor = len(table) - 2
+    lengths = np.empty(len(capsules))
+    for c in range(len(capsules)):
+        lengths[c] = _half_length(ends[c, 0], ends[c, 1])
     for c in range(len(capsules)):
         body, group, flags = first_body + members[c, 1], members[c, 2], members[c, 3]
         start, end, radius = ends[c, 0], ends[c, 1], capsules[c, 6]
         if flags & FLOOR:
-            _deepen(table, body, floor, capsule_floor_kernel(start, end, radius))
+            depth = capsule_floor_kernel(start, end, radius)
+            if _deepen(table, allowed, body, floor, depth):
+                return False
         if flags & WALL:
             depth = capsule_wall_kernel(start, end, radius, inner, height)
-            _deepen(table, body, floor + 1, depth)
+            if _deepen(table, allowed, body, floor + 1, depth):
+                return False
         for d in range(c):
             if flags & members[d, 3] & OTHERS and members[d, 2] != group:
+                reach = lengths[c] + lengths[d] + radius + capsules[d, 6]
+                if _far(start, end, ends[d, 0], ends[d, 1], reach):
+                    continue
                 depth = capsule_capsule_kernel(
                     start, end, radius, ends[d, 0], ends[d, 1], capsules[d, 6]
                 )
-                _deepen(table, body, first_body + members[d, 1], depth)
+                if _deepen(table, allowed, body, first_body + members[d, 1], depth):
+                    return False
+    return True
 
 
 @njit(cache=True)
@@ -136,8 +174,13 @@ def _depths(
     frame_orientations: Floats,
     n_fixed: int,
     wall: tuple[float, float],
-) -> Floats:
-    """Compute how deep bodies lie in one another, shape (bodies, bodies); see ``sweep``."""
+    allowed: Floats,
+) -> tuple[Floats, bool]:
+    """Compute how deep bodies lie in one another, shape (bodies, bodies); see ``sweep``.
+
+    Of bodies that are far apart nothing is computed. It ends, and says False, with the first two
+    that lie deeper in one another than is allowed, shape (bodies, bodies).
+    """
     n_boxes, n_bodies = len(sizes), 0
     n_movable = n_boxes - n_fixed
     for c in range(len(members)):
@@ -148,18 +191,26 @@ def _depths(
         rotation_kernel(orientations[i], rotations[i])
     ends = np.empty((len(capsules), 2, 3))
     _place_capsules(capsules, members, frame_origins, frame_orientations, ends)
-    _sweep_boxes(halves, positions, rotations, n_fixed, wall[0], wall[1], table)
-    _sweep_capsules(capsules, members, ends, n_movable, wall[0], wall[1], table)
+    inner, height = wall
+    if not _sweep_capsules(
+        capsules, members, ends, n_movable, inner, height, table, allowed
+    ) or not _sweep_boxes(halves, positions, rotations, n_fixed, inner, height, table, allowed):
+        return table, False
     for i in range(n_boxes):
         number = i if i < n_movable else n_bodies + i
+        radius = math.sqrt(halves[i, 0] ** 2 + halves[i, 1] ** 2 + halves[i, 2] ** 2)
         for c in range(len(capsules)):
             if i >= n_movable and not members[c, 3] & OTHERS:
+                continue
+            reach = radius + _half_length(ends[c, 0], ends[c, 1]) + capsules[c, 6]
+            if _far(positions[i], positions[i], ends[c, 0], ends[c, 1], reach):
                 continue
             depth = box_capsule_kernel(
                 halves[i], positions[i], rotations[i], ends[c, 0], ends[c, 1], capsules[c, 6]
             )
-            _deepen(table, number, n_movable + members[c, 1], depth)
-    return table
+            if _deepen(table, allowed, number, n_movable + members[c, 1], depth):
+                return table, False
+    return table, True
 
 
 @njit(cache=True)
@@ -194,7 +245,7 @@ def apart_in_rows(
     """
     found = np.ones(len(frame_origins), dtype=np.bool_)
     for row in range(len(found)):
-        table = _depths(
+        _, found[row] = _depths(
             sizes[min(row, len(sizes) - 1)],
             positions[min(row, len(positions) - 1)],
             orientations[min(row, len(orientations) - 1)],
@@ -204,11 +255,8 @@ def apart_in_rows(
             frame_orientations[row],
             n_fixed,
             wall,
+            allowed,
         )
-        for i in range(len(table)):
-            for j in range(i + 1, len(table)):
-                if table[i, j] > allowed[i, j]:
-                    found[row] = False
     return found
 
 
@@ -240,12 +288,13 @@ def sweep(
         frame_orientations: Quaternions (x, y, z, w), shape (k, 4).
         n_fixed: How many boxes cannot move.
         wall: Inner radius and height [m].
-        tolerance: Only deeper intersections are found [m].
+        tolerance: Only deeper intersections are found [m]; not negative.
 
     Returns:
         The pairs and their depths.
     """
     bodies = sizes, positions, orientations, capsules, members, frame_origins, frame_orientations
-    table = _depths(*bodies, n_fixed, wall)
+    count = len(sizes) + int(members[:, 1].max(initial=-1)) + 3
+    table, _ = _depths(*bodies, n_fixed, wall, np.full((count, count), np.inf))
     deep = table > tolerance  # above the diagonal only
     return Found(np.argwhere(deep), table[deep])

@@ -20,7 +20,7 @@ from scm_world.world.plan import InterventionPlan
 from scm_world.world.solver import Solver, same
 
 CHUNK = 64
-"""How many draws are looked at together at first, and then four times as many."""
+"""How many draws are looked at together."""
 
 
 class Unknown(Exception):  # no error: such draws are planned one after another
@@ -157,7 +157,8 @@ class Candidates:
             raise Unknown
         values = {parent: self._value(parent) for parent in parents}
         own = variable.name if act.stream is None else f"{act.stream}/{variable.name}"
-        keys = [word_of(f"{own}#{attempt}") for attempt in self.attempts.tolist()]
+        attempts = self.attempts.tolist()
+        keys = [word_of(f"{own}#{attempt}" if attempt else own) for attempt in attempts]
         uniforms = np.empty((len(keys), source.n_uniforms(variable.shape)))
         where = np.array([self._key.noise.key, self._key.episode, self._key.step], dtype=np.uint64)
         philox(where, np.array(keys, dtype=np.uint64), uniforms)
@@ -185,6 +186,7 @@ def promising(
     structure: Callable[[NoiseKey], Plan | None] | None,
     key: NoiseKey,
     count: int,
+    first: int = 1,
 ) -> Iterator[tuple[int, Plan | None]]:
     """Yield the further draws that may be feasible, and the last one.
 
@@ -197,7 +199,8 @@ def promising(
         structure: Gives the structure of a draw, or None where that is refused; None where all
             draws have the same.
         key: Where to draw.
-        count: How many draws there are; the first one was number 0.
+        count: How many draws there are, the first one number 0.
+        first: Number of the first further one.
 
     Yields:
         The number of a draw, and its structure.
@@ -209,9 +212,8 @@ def promising(
     # What is asked of a body is refused where the body is not there.
     asked = {name.partition(".")[0] for name in (*plan.asked, *plan.removals)}
     alike_everywhere = asked.isdisjoint(plan.compiled.entity_names)
-    first, size = 1, CHUNK
-    while first < count - 1:
-        attempts = list(range(first, min(first + size, count - 1)))
+    for begin in range(first, count - 1, CHUNK):
+        attempts = list(range(begin, min(begin + CHUNK, count - 1)))
         if structure is None:
             places: dict[int, Plan | None] = dict.fromkeys(attempts, here)
         else:
@@ -225,8 +227,7 @@ def promising(
                 thinned[where] = frozenset(_thinned(made[where], before, key, alike))
             if where not in thinned or attempt in thinned[where]:
                 yield attempt, where
-        first, size = first + size, 4 * CHUNK
-    if count > 1:
+    if count > first:
         yield count - 1, None
 
 

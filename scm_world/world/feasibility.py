@@ -29,6 +29,7 @@ _PLACES = ("m", "rad", "1")
 """Units of states that do so: positions, angles and quaternions, not velocities."""
 ATTEMPTS = 1000
 """How often is drawn; one in sixty draws of the joints from A leaves all fingers apart."""
+NONE = f"none of {ATTEMPTS:,} draws was feasible; in the last one "
 REMEMBERED = 32
 """In how many structures draws are looked at together, where it is drawn which bodies there are."""
 
@@ -195,7 +196,11 @@ def feasible_plan(
     made: dict[Plan | None, InterventionPlan] = {}
     attempts: Iterator[tuple[int, Plan | None]] = iter(((0, None),))
     tried = ""
-    start = None if earlier is None else earlier.plan
+    start = None
+    if earlier is not None:  # most first draws are infeasible, too, and need no plan
+        start, key = earlier.plan, replace(key, kept=earlier.kept)
+        known: dict[Plan | None, InterventionPlan] = {start.compiled.plan: start}
+        attempts, tried = promising(base, known, None, key, ATTEMPTS, first=0), NONE
     while (drawn := next(attempts, None)) is not None:
         attempt, where = drawn
         key, last = replace(key, attempt=attempt), made.get(where, start)
@@ -208,16 +213,12 @@ def feasible_plan(
             problems = _buried(plan, request)
         if not problems:
             return plan, change
-        if draws and not attempt:
-            if earlier is not None:
-                kept = earlier.kept
-            else:
-                kept = _immaterial(structures, plan.compiled, request)
-                if _stay(structures, plan.compiled, request, kept, problems):
-                    tried = "whatever is drawn, "
-                    break
-            key = replace(key, kept=kept)
-            tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one "
+        if draws and not attempt and earlier is None:
+            kept = _immaterial(structures, plan.compiled, request)
+            if _stay(structures, plan.compiled, request, kept, problems):
+                tried = "whatever is drawn, "
+                break
+            key, tried = replace(key, kept=kept), NONE
             structure = None
             if draws_bodies(structures, request):
                 structure = partial(_structure, structures, base, request)
