@@ -38,6 +38,16 @@ NOISE = 2e-3  # share of the largest change of velocity; what is below is no evi
 STATES, DRAWS = 3, 60  # without contact: how many are measured, and tried
 SHARE = (0.75, 1.35)  # by which factors values are changed before they are measured
 DRY = "frictionloss"
+RESTING, SLIDING = 0.05, 0.2
+"""What heights of shapes that lie and coefficients of friction may be off by, relative."""
+FRICTIONS = ((0.6, 0.3), (0.3, 0.6), (0.6, 0.6))  # of the ground and of what slides on it
+SETTLED, GLIDE, GLIDING = 0.4, 0.5, 0.2  # [s] to come to rest, [m/s] at first, [s] at most
+STILL = 0.02  # [m/s] and [rad/s] that what is at rest has at most
+SPOTS = (5.0, 20.0, 80.0)  # [m] from the origin: where nothing else is
+ALOFT = 100.0  # [m] above the ground: where everything else is
+UP = ((0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)), (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))
+UPRIGHT = (*UP, (0.0, 0.0, 0.0, 1.0))
+"""Rotations after which the first, second or third axis is vertical."""
 ATTRIBUTES = {"damping": 5.0, "armature": 0.3, "stiffness": 20.0}
 """What is set at least, for each unit of inertia that the joint feels: 5/s, 20/s² etc."""
 KEPT = ("timestep", "orientation", "position", "axis")
@@ -462,7 +472,13 @@ class _Laws:
             reason = f"the backend {engine.name!r} cannot push bodies"
             yield from (self.silent(name, "motion", reason) for name in self.keys)
             return
+        before = self.world.snapshot()
+        touched = list(self.contact(before))
+        self.world.restore(before)
+        yield from touched
+        told = {law.variable for law in touched if law.law == "sliding"}
         self.vary()
+        self.keys = {name: key for name, key in self.keys.items() if name not in told}
         self.bodies = self.described()
         lacking = [*self.bodies.missing]
         if getattr(self.world.structure, "published", False):
@@ -487,6 +503,146 @@ class _Laws:
         if name in self.refused:
             return Law(variable=name, law=law, passed=False, reason=self.refused[name])
         return Law(variable=name, law=law, reason=reason)
+
+    # --- contact -----------------------------------------------------------------------------
+
+    def contact(self, before: Any) -> Iterator[Law]:
+        """Lay boxes and balls that can move freely on level ground, and let boxes slide there."""
+        self.bodies = bodies = self.described()
+        self.mechanics, self.start = Mechanics(bodies), self.state()[self.places]
+        grounds = [
+            number
+            for number, geom in enumerate(bodies.geoms)
+            if geom.kind == "plane" and not bodies.roots[geom.body]
+            if geom.position[2] == 0.0 and tuple(geom.orientation[:2]) == (0.0, 0.0)
+        ]
+        level = bodies.gravity[2] < 0.0 and not any(bodies.gravity[:2])
+        if len(grounds) != 1 or not level or (bodies.missing and self.engine.stages > 1):
+            return
+        ground, gravity = grounds[0], -bodies.gravity[2]
+        shaping: dict[tuple[str, int], list[tuple[str, ParameterKey]]] = {}
+        for name, key in self.keys.items():
+            if key[1] not in ("friction", "size"):
+                continue
+            try:
+                other = self.described({key: (1.0 + SHIFT) * self.values[key] + SHIFT})
+            except (ScmWorldError, ValueError):
+                continue  # no shape can have it
+            for number, (one, two) in enumerate(zip(bodies.geoms, other.geoms, strict=True)):
+                if getattr(one, key[1]) != getattr(two, key[1]):
+                    shaping.setdefault((key[1], number), []).append((name, key))
+        roots = [bodies.roots[geom.body] for geom in bodies.geoms]
+        slid: dict[str, list[tuple[float, float]]] = {}
+        for joint in bodies.joints:
+            own = [number for number, root in enumerate(roots) if root == joint.body]
+            alone = bodies.roots.count(joint.body) == 1 and len(own) == 1
+            if joint.kind != "free" or not alone:
+                continue
+            shape, geom = own[0], bodies.geoms[own[0]]
+            if geom.kind not in ("box", "sphere") or (ground, shape) not in bodies.touching:
+                continue
+            heights = [self.laid(joint, geom, axis) for axis in range(len(geom.size))]
+            known = [(k, found[0]) for k, found in enumerate(heights) if found is not None]
+            if known:
+                declared = tuple(geom.size[k] for k, _ in known)
+                error = max(abs(h / geom.size[k] - 1.0) for k, h in known)
+                for name, _ in shaping.get(("size", shape), ()):
+                    yield Law(
+                        variable=name, law="lying", declared=declared,
+                        found=tuple(h for _, h in known), error=error, passed=error <= RESTING,
+                        reason="" if error <= RESTING else f"lies {error:.0%} off the half edges",
+                    )  # fmt: skip
+            resting = heights[int(np.argmin(geom.size))]
+            if geom.kind != "box" or geom.slippery or resting is None:
+                continue
+            for frictions in FRICTIONS:
+                changed = {}
+                for number, friction in zip((ground, shape), frictions, strict=True):
+                    for name, key in shaping.get(("friction", number), ()):
+                        changed[key] = np.array(self.values[key])
+                        changed[key].flat[0] = friction
+                        slid.setdefault(name, [])
+                self.backend.apply(Difference(parameters=changed))
+                acts = self.braked(joint, resting[1], gravity)
+                self.backend.apply(Difference(parameters={k: self.values[k] for k in changed}))
+                if acts is not None:
+                    geoms = self.described(changed).geoms
+                    pair = (geoms[ground].friction, geoms[shape].friction)
+                    expected = math.prod(pair) if bodies.product else max(pair)
+                    for name, key in self.keys.items():
+                        if key in changed:
+                            slid[name].append((expected, acts))
+        for name, pairs in slid.items():
+            if not pairs:
+                continue
+            error = max(abs(acts / expected - 1.0) for expected, acts in pairs)
+            worst = max(pairs, key=lambda pair: abs(pair[1] / pair[0] - 1.0))
+            yield Law(
+                variable=name, law="sliding", declared=tuple(e for e, _ in pairs),
+                found=tuple(a for _, a in pairs), error=error, passed=error <= SLIDING,
+                reason="" if error <= SLIDING else "brakes as {1:.2f}, not {0:.2f}".format(*worst),
+            )  # fmt: skip
+
+    def laid(self, joint: Any, geom: Any, axis: int) -> tuple[float, Floats] | None:
+        """Let a shape come to rest on the ground, with one of its axes upright.
+
+        Returns:
+            How high its center is then, and the coordinates of everything; None where it does
+            not come to rest on the ground alone, or would tip.
+        """
+        body, at = self.bodies.bodies[joint.body], joint.start
+        turn = quaternion_product(UPRIGHT[axis], np.array(geom.orientation) * (-1, -1, -1, 1))
+        offset = rotation_matrix(turn) @ np.array(geom.position)
+        lever = rotation_matrix(turn) @ (np.array(body.center) - np.array(geom.position))
+        if np.abs(lever[:2]).max() > 0.3 * min(geom.size):
+            return None
+        for spot in SPOTS:
+            state = self.start.copy()
+            for number, other in enumerate(self.bodies.joints):
+                if other.kind == "free":
+                    state[other.start : other.start + 3] = (0.0, 3.0 * number, ALOFT)
+                    state[other.start + 7 : other.start + 13] = 0.0
+            state[at : at + 3] = np.array([spot, spot, geom.size[axis]]) - offset
+            state[at + 3 : at + 7] = turn
+            self.place(state)
+            self.backend.step(
+                self.world.composition.mode,
+                np.zeros(self.world.structure.n_commands),
+                math.ceil(SETTLED / self.bodies.timestep),
+            )
+            rest = self.state()[self.places]
+            if self.beneath(body.name) and np.abs(rest[at + 7 : at + 13]).max() <= STILL:
+                middle = rotation_matrix(rest[at + 3 : at + 7]) @ np.array(geom.position)
+                return float(rest[at + 2] + middle[2]), rest
+        return None
+
+    def beneath(self, name: str) -> bool:
+        """Tell whether a body touches nothing but what is fixed and lies under it."""
+        own = [c for c in self.backend.contacts() if name in c.bodies and c.force > 0.0]
+        return all(abs(c.normal[2]) > 0.99 for c in own)
+
+    def braked(self, joint: Any, rest: Floats, gravity: float) -> float | None:
+        """Measure the coefficient of friction with which what lies there slides along x."""
+        speed = joint.start + 7
+        state = rest.copy()
+        for other in self.bodies.joints:
+            if other.kind == "free" and other is not joint:
+                state[other.start + 2] = ALOFT
+                state[other.start + 7 : other.start + 13] = 0.0
+        state[speed : speed + 6] = 0.0
+        state[speed] = GLIDE
+        self.place(state)
+        command, passed = np.zeros(self.world.structure.n_commands), [GLIDE]
+        for _ in range(math.ceil(GLIDING / self.bodies.timestep)):
+            self.backend.step(self.world.composition.mode, command, 1)
+            passed.append(float(self.state()[self.places][speed]))
+            if not self.beneath(self.bodies.bodies[joint.body].name):
+                return None
+            if passed[-1] < 0.3 * GLIDE:
+                break
+        steps = len(passed) - 1 - len(passed) // 4
+        lost = passed[len(passed) // 4] - passed[-1]
+        return lost / (gravity * steps * self.bodies.timestep)
 
     # --- motion ------------------------------------------------------------------------------
 

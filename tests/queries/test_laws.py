@@ -107,7 +107,9 @@ def test_laws_hold_and_leave_no_trace(system: str, engine: str) -> None:
 
 def scaled(element, attribute, factor):
     """Multiply one parameter."""
-    return lambda key, value, _: value * factor if key == (element, attribute) else value
+    return lambda key, value, _: (
+        value * np.asarray(factor) if key == (element, attribute) else value
+    )
 
 
 def inverted(element):
@@ -136,6 +138,14 @@ TWISTS = {
     "undamped arm": ("arm", "shoulder.damping", kept("damping", 0.0)),
     "weak motor": ("arm", "motor.gear", scaled("motor", "gear", 0.5)),
     "weak servo": ("arm", "servo.kp", scaled("servo", "kp", 0.5)),
+    "slippery floor": ("pushing", "floor_friction", scaled("floor", "friction", 0.5)),
+    "rough floor": ("pushing", "floor_friction", scaled("floor", "friction", 1.5)),
+    "rough block": ("pushing", "tool_block.friction", scaled("tool_block", "friction", 2.0)),
+    "ice": ("pushing", "floor_friction", kept("friction", 0.01)),
+    "rough crate": ("arm", "crate.friction", scaled("crate", "friction", 2.0)),
+    "slippery ground": ("arm", "ground.friction", scaled("ground", "friction", 0.5)),
+    "large block": ("pushing", "tool_block.size", scaled("tool_block", "size", 1.2)),
+    "flat crate": ("arm", "crate.size", scaled("crate", "size", [1.0, 1.0, 0.8])),
 }
 
 
