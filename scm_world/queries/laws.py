@@ -38,8 +38,10 @@ NOISE = 2e-3  # share of the largest change of velocity; what is below is no evi
 STATES, DRAWS = 3, 60  # without contact: how many are measured, and tried
 SHARE = (0.75, 1.35)  # by which factors values are changed before they are measured
 DRY = "frictionloss"
-RESTING, SLIDING = 0.05, 0.2
-"""What heights of shapes that lie and coefficients of friction may be off by, relative."""
+RESTING, SLIDING, BOUNCING = 0.05, 0.2, 0.15
+"""What heights of shapes that lie and coefficients of friction may be off by, relative, and the
+share of its speed that a box keeps when it bounces."""
+BOUNCES, DROP = (0.3, 0.6), 1.0  # restitution, and [m/s] of what falls on the ground
 FRICTIONS = ((0.6, 0.3), (0.3, 0.6), (0.6, 0.6))  # of the ground and of what slides on it
 SETTLED, GLIDE, GLIDING = 0.4, 0.5, 0.2  # [s] to come to rest, [m/s] at first, [s] at most
 STILL = 0.02  # [m/s] and [rad/s] that what is at rest has at most
@@ -287,6 +289,19 @@ class Mechanics:
         return np.asarray(step * (found + np.linalg.solve(left, pushed)), dtype=np.float64)
 
 
+def compared(
+    name: str, law: str, pairs: list[tuple[float, float]], tolerance: float, said: str
+) -> Law:
+    """Compare expected and measured values: bounces as they are, all else relative."""
+    errors = [abs(two - one) / (1.0 if law == "bouncing" else one) for one, two in pairs]
+    passed, worst = max(errors) <= tolerance, pairs[int(np.argmax(errors))]
+    return Law(
+        variable=name, law=law, declared=tuple(one for one, _ in pairs),
+        found=tuple(two for _, two in pairs), error=max(errors), passed=passed,
+        reason="" if passed else said.format(*worst),
+    )  # fmt: skip
+
+
 @final
 class _Laws:
     """All measurements on one world."""
@@ -473,10 +488,10 @@ class _Laws:
             yield from (self.silent(name, "motion", reason) for name in self.keys)
             return
         before = self.world.snapshot()
-        touched = list(self.contact(before))
+        touched = list(self.contact())
         self.world.restore(before)
         yield from touched
-        told = {law.variable for law in touched if law.law == "sliding"}
+        told = {law.variable for law in touched if law.law != "lying"}
         self.vary()
         self.keys = {name: key for name, key in self.keys.items() if name not in told}
         self.bodies = self.described()
@@ -506,8 +521,8 @@ class _Laws:
 
     # --- contact -----------------------------------------------------------------------------
 
-    def contact(self, before: Any) -> Iterator[Law]:
-        """Lay boxes and balls that can move freely on level ground, and let boxes slide there."""
+    def contact(self) -> Iterator[Law]:
+        """Lay boxes and balls that can move freely on level ground; let boxes bounce and slide."""
         self.bodies = bodies = self.described()
         self.mechanics, self.start = Mechanics(bodies), self.state()[self.places]
         grounds = [
@@ -517,10 +532,40 @@ class _Laws:
             if geom.position[2] == 0.0 and tuple(geom.orientation[:2]) == (0.0, 0.0)
         ]
         level = bodies.gravity[2] < 0.0 and not any(bodies.gravity[:2])
-        if len(grounds) != 1 or not level or (bodies.missing and self.engine.stages > 1):
+        if len(grounds) != 1 or not level:
             return
-        ground, gravity = grounds[0], -bodies.gravity[2]
-        shaping: dict[tuple[str, int], list[tuple[str, ParameterKey]]] = {}
+        ground, shaping = grounds[0], self.shaping()
+        roots = [bodies.roots[geom.body] for geom in bodies.geoms]
+        slid: dict[str, list[tuple[float, float]]] = {}
+        bouncing = {name: key for name, key in self.keys.items() if key[1] == "restitution"}
+        for joint in bodies.joints:
+            own = [number for number, root in enumerate(roots) if root == joint.body]
+            alone = bodies.roots.count(joint.body) == 1 and len(own) == 1
+            if joint.kind != "free" or not alone or (ground, own[0]) not in bodies.touching:
+                continue
+            shape, geom = own[0], bodies.geoms[own[0]]
+            if geom.kind not in ("box", "sphere"):
+                continue
+            found = [self.laid(joint, geom, axis) for axis in range(len(geom.size))]
+            heights = [(half, f[0]) for half, f in zip(geom.size, found, strict=True) if f]
+            for name, _ in shaping.get(("size", shape), ()) if heights else ():
+                yield compared(name, "lying", heights, RESTING, "lies at {1:.3g} m, not {0:.3g}")
+            rest = found[int(np.argmin(geom.size))]
+            if geom.kind != "box" or geom.slippery or rest is None:
+                continue
+            for name, key in bouncing.items():  # of the first box: all contacts have the same
+                kept = [(share, self.bounced(joint, rest[1], key, share)) for share in BOUNCES]
+                yield compared(name, "bouncing", kept, BOUNCING, "keeps {1:.2f}, not {0:.2f}")
+            bouncing = {}
+            grips = shaping.get(("friction", ground), []), shaping.get(("friction", shape), [])
+            for name, pairs in self.rubbed(joint, rest[1], (ground, shape), grips).items():
+                slid.setdefault(name, []).extend(pairs)
+        for name, pairs in slid.items():
+            yield compared(name, "sliding", pairs, SLIDING, "brakes as {1:.2f}, not {0:.2f}")
+
+    def shaping(self) -> dict[tuple[str, int], list[tuple[str, ParameterKey]]]:
+        """Give the variables that sizes and frictions of shapes depend on."""
+        found: dict[tuple[str, int], list[tuple[str, ParameterKey]]] = {}
         for name, key in self.keys.items():
             if key[1] not in ("friction", "size"):
                 continue
@@ -528,60 +573,32 @@ class _Laws:
                 other = self.described({key: (1.0 + SHIFT) * self.values[key] + SHIFT})
             except (ScmWorldError, ValueError):
                 continue  # no shape can have it
-            for number, (one, two) in enumerate(zip(bodies.geoms, other.geoms, strict=True)):
+            for number, (one, two) in enumerate(zip(self.bodies.geoms, other.geoms, strict=True)):
                 if getattr(one, key[1]) != getattr(two, key[1]):
-                    shaping.setdefault((key[1], number), []).append((name, key))
-        roots = [bodies.roots[geom.body] for geom in bodies.geoms]
-        slid: dict[str, list[tuple[float, float]]] = {}
-        for joint in bodies.joints:
-            own = [number for number, root in enumerate(roots) if root == joint.body]
-            alone = bodies.roots.count(joint.body) == 1 and len(own) == 1
-            if joint.kind != "free" or not alone:
+                    found.setdefault((key[1], number), []).append((name, key))
+        return found
+
+    def rubbed(
+        self, joint: Any, rest: Floats, pair: tuple[int, int], grips: tuple[list[Any], list[Any]]
+    ) -> dict[str, list[tuple[float, float]]]:
+        """Give the expected and the measured friction for each variable that it depends on."""
+        found: dict[str, list[tuple[float, float]]] = {}
+        for frictions in FRICTIONS:
+            changed = {}
+            for variables, friction in zip(grips, frictions, strict=True):
+                for _, key in variables:
+                    changed[key] = np.array(self.values[key])
+                    changed[key].flat[0] = friction
+            self.backend.apply(Difference(parameters=changed))
+            acts = self.braked(joint, rest, -self.bodies.gravity[2])
+            self.backend.apply(Difference(parameters={key: self.values[key] for key in changed}))
+            if acts is None:
                 continue
-            shape, geom = own[0], bodies.geoms[own[0]]
-            if geom.kind not in ("box", "sphere") or (ground, shape) not in bodies.touching:
-                continue
-            heights = [self.laid(joint, geom, axis) for axis in range(len(geom.size))]
-            known = [(k, found[0]) for k, found in enumerate(heights) if found is not None]
-            if known:
-                declared = tuple(geom.size[k] for k, _ in known)
-                error = max(abs(h / geom.size[k] - 1.0) for k, h in known)
-                for name, _ in shaping.get(("size", shape), ()):
-                    yield Law(
-                        variable=name, law="lying", declared=declared,
-                        found=tuple(h for _, h in known), error=error, passed=error <= RESTING,
-                        reason="" if error <= RESTING else f"lies {error:.0%} off the half edges",
-                    )  # fmt: skip
-            resting = heights[int(np.argmin(geom.size))]
-            if geom.kind != "box" or geom.slippery or resting is None:
-                continue
-            for frictions in FRICTIONS:
-                changed = {}
-                for number, friction in zip((ground, shape), frictions, strict=True):
-                    for name, key in shaping.get(("friction", number), ()):
-                        changed[key] = np.array(self.values[key])
-                        changed[key].flat[0] = friction
-                        slid.setdefault(name, [])
-                self.backend.apply(Difference(parameters=changed))
-                acts = self.braked(joint, resting[1], gravity)
-                self.backend.apply(Difference(parameters={k: self.values[k] for k in changed}))
-                if acts is not None:
-                    geoms = self.described(changed).geoms
-                    pair = (geoms[ground].friction, geoms[shape].friction)
-                    expected = math.prod(pair) if bodies.product else max(pair)
-                    for name, key in self.keys.items():
-                        if key in changed:
-                            slid[name].append((expected, acts))
-        for name, pairs in slid.items():
-            if not pairs:
-                continue
-            error = max(abs(acts / expected - 1.0) for expected, acts in pairs)
-            worst = max(pairs, key=lambda pair: abs(pair[1] / pair[0] - 1.0))
-            yield Law(
-                variable=name, law="sliding", declared=tuple(e for e, _ in pairs),
-                found=tuple(a for _, a in pairs), error=error, passed=error <= SLIDING,
-                reason="" if error <= SLIDING else "brakes as {1:.2f}, not {0:.2f}".format(*worst),
-            )  # fmt: skip
+            both = [self.described(changed).geoms[number].friction for number in pair]
+            expected = math.prod(both) if self.bodies.product else max(both)
+            for name, _ in (*grips[0], *grips[1]):
+                found.setdefault(name, []).append((expected, acts))
+        return found
 
     def laid(self, joint: Any, geom: Any, axis: int) -> tuple[float, Floats] | None:
         """Let a shape come to rest on the ground, with one of its axes upright.
@@ -621,28 +638,41 @@ class _Laws:
         own = [c for c in self.backend.contacts() if name in c.bodies and c.force > 0.0]
         return all(abs(c.normal[2]) > 0.99 for c in own)
 
-    def braked(self, joint: Any, rest: Floats, gravity: float) -> float | None:
-        """Measure the coefficient of friction with which what lies there slides along x."""
-        speed = joint.start + 7
+    def thrown(self, joint: Any, rest: Floats, velocity: tuple[float, float, float]) -> int:
+        """Put a body where it lay at rest, with a velocity; tell where that is in the state."""
         state = rest.copy()
         for other in self.bodies.joints:
-            if other.kind == "free" and other is not joint:
-                state[other.start + 2] = ALOFT
+            if other.kind == "free":
+                if other is not joint:
+                    state[other.start + 2] = ALOFT
                 state[other.start + 7 : other.start + 13] = 0.0
-        state[speed : speed + 6] = 0.0
-        state[speed] = GLIDE
+        state[joint.start + 7 : joint.start + 10] = velocity
         self.place(state)
-        command, passed = np.zeros(self.world.structure.n_commands), [GLIDE]
+        return int(joint.start + 7)
+
+    def bounced(self, joint: Any, rest: Floats, key: ParameterKey, restitution: float) -> float:
+        """Measure which share of its speed a body keeps that falls on the ground."""
+        self.backend.apply(Difference(parameters={key: np.array(restitution)}))
+        at = self.thrown(joint, rest, (0.0, 0.0, -DROP)) + 2
+        command = np.zeros(self.world.structure.n_commands)
+        steps = range(math.ceil(GLIDING / self.bodies.timestep))
+        best = max(float(self.step(command, {})[at]) for _ in steps)
+        self.backend.apply(Difference(parameters={key: self.values[key]}))
+        return best / DROP
+
+    def braked(self, joint: Any, rest: Floats, gravity: float) -> float | None:
+        """Measure the coefficient of friction with which what lies there slides along x."""
+        at = self.thrown(joint, rest, (GLIDE, 0.0, 0.0))
+        command, speeds = np.zeros(self.world.structure.n_commands), [GLIDE]
         for _ in range(math.ceil(GLIDING / self.bodies.timestep)):
-            self.backend.step(self.world.composition.mode, command, 1)
-            passed.append(float(self.state()[self.places][speed]))
+            speeds.append(float(self.step(command, {})[at]))
             if not self.beneath(self.bodies.bodies[joint.body].name):
                 return None
-            if passed[-1] < 0.3 * GLIDE:
+            if speeds[-1] < 0.3 * GLIDE:
                 break
-        steps = len(passed) - 1 - len(passed) // 4
-        lost = passed[len(passed) // 4] - passed[-1]
-        return lost / (gravity * steps * self.bodies.timestep)
+        first = len(speeds) // 4
+        lost = speeds[first] - speeds[-1]
+        return lost / (gravity * (len(speeds) - 1 - first) * self.bodies.timestep)
 
     # --- motion ------------------------------------------------------------------------------
 

@@ -144,6 +144,8 @@ TWISTS = {
     "ice": ("pushing", "floor_friction", kept("friction", 0.01)),
     "rough crate": ("arm", "crate.friction", scaled("crate", "friction", 2.0)),
     "slippery ground": ("arm", "ground.friction", scaled("ground", "friction", 0.5)),
+    "rubber": ("pushing", "restitution", scaled("world", "restitution", 2.0)),
+    "clay": ("pushing", "restitution", kept("restitution", 0.0)),
     "large block": ("pushing", "tool_block.size", scaled("tool_block", "size", 1.2)),
     "flat crate": ("arm", "crate.size", scaled("crate", "size", [1.0, 1.0, 0.8])),
 }
