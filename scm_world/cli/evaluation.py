@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
@@ -114,6 +115,7 @@ def evaluate(
             engine=pool,
             out=folder,
             progress=tell,
+            tell=partial(console.say, stderr=True),
         )
     metric = metric or next(name for name in METRICS if name in found.metrics)
     files = found.save(folder, kind=format_)

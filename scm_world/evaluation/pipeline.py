@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
@@ -11,13 +12,13 @@ from hashlib import blake2b
 from typing import Any, final
 
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
-from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner
+from scm_world.evaluation.episodes import METRICS, EpisodeRow, EpisodeRunner
 from scm_world.evaluation.results import Evaluation, columns_of
 from scm_world.evaluation.setups import Setup, Shard, prepare
 from scm_world.output.durable import locked, made, write_whole
 from scm_world.output.reading import read_text
 from scm_world.output.remote import Location, located
-from scm_world.queries.progress import Progress
+from scm_world.queries.progress import Progress, Tell, clock
 from scm_world.tasks import Task
 from scm_world.work.executors import Executor, Serial, opened
 
@@ -81,6 +82,7 @@ def evaluate(
     out: Location | str | None = None,
     trusted: Sequence[str] | None = None,
     progress: Progress | None = None,
+    tell: Tell | None = None,
 ) -> Evaluation:
     """Find out how well policies do in protocols.
 
@@ -108,6 +110,7 @@ def evaluate(
             interruption, and adds policies, protocols, engines or episodes to it.
         trusted: Packages whose functions may be named as policies; any if None.
         progress: Called with how many episodes are done, and how many there are.
+        tell: Called with a line after each protocol: its scores, and how much time is left.
 
     Returns:
         The table of all episodes, and what follows from it.
@@ -140,7 +143,7 @@ def evaluate(
         opened(engine, workers) as executor,
         locked(folder) if folder is not None else nullcontext(),
     ):
-        rows = played(setup, executor, folder=folder, progress=progress)
+        rows = played(setup, executor, folder=folder, progress=progress, tell=tell)
     policies = {(one.agent, one.run): one.player.policy for one in setup.agents}
     return Evaluation(setup.about(), columns_of(rows), policies)
 
@@ -151,6 +154,7 @@ def played(
     *,
     folder: Location | None = None,
     progress: Progress | None = None,
+    tell: Tell | None = None,
 ) -> list[EpisodeRow]:
     """Play what has not been played, and give all rows in their order.
 
@@ -159,6 +163,7 @@ def played(
         executor: Plays the shards; this process if None.
         folder: For what is finished.
         progress: Called with how many episodes are done, and how many there are.
+        tell: Called with a line after each protocol.
     """
     shards = setup.shards()
     keys = [setup.key(shard) if folder is not None else "" for shard in shards]
@@ -170,12 +175,20 @@ def played(
             if kept is not None:
                 found[place] = kept
 
-    def tell() -> None:
-        if progress is not None:
-            done = sum(map(len, found.values()))
-            progress(done, sum(shard.stop - shard.first for shard in shards))
+    planned = sum(shard.stop - shard.first for shard in shards)
+    before, begun = sum(map(len, found.values())), time.perf_counter()
 
-    tell()
+    def told(protocol: int | None = None) -> None:
+        done = sum(map(len, found.values()))
+        if progress is not None:
+            progress(done, planned)
+        mine = [place for place, shard in enumerate(shards) if shard.protocol == protocol]
+        if tell is not None and mine and found.keys() >= {*mine}:
+            spent = time.perf_counter() - begun
+            left = spent / (done - before) * (planned - done)
+            tell(line_of([row for place in mine for row in found[place]], left))
+
+    told()
     missing = [place for place in range(len(shards)) if place not in found]
     with opened(executor) as player:
         if not isinstance(player, Serial):
@@ -196,8 +209,28 @@ def played(
             found[place] = rows
             if folder is not None:
                 write_part(folder, keys[place], rows)
-            tell()
+            told(shards[place].protocol)
     return [row for place in range(len(shards)) for row in found[place]]
+
+
+def line_of(rows: Sequence[EpisodeRow], left: float) -> str:
+    """Say in a line what the episodes of a protocol gave, and how much time is left [s].
+
+    Example:
+        >>> row = EpisodeRow("mine", 0, "mujoco", "P0", 0, 0, 250, {"success": 1.0})
+        >>> line_of([row, row], 75.0)
+        'P0, 2 episodes: success mine 1.000; about 1:15 left'
+    """
+    metric = next(name for name in METRICS if name in rows[0].scores)
+    several = len({row.engine for row in rows}) > 1
+    scores: dict[str, list[float]] = {}
+    for row in rows:
+        name = f"{row.agent} on {row.engine}" if several else row.agent
+        scores.setdefault(name, []).append(row.scores[metric])
+    means = ", ".join(f"{name} {sum(one) / len(one):.3f}" for name, one in scores.items())
+    time_left = f"about {clock(left)} left" if left else "all is played"
+    what = f"{rows[0].protocol}, {len(rows)} episodes: {metric.replace('_', ' ')} {means}"
+    return f"{what}; {time_left}"
 
 
 def write_part(folder: Location, key: str, rows: Sequence[EpisodeRow]) -> None:

@@ -8,6 +8,22 @@ Progress = Callable[[int, int], None]
 """Called after each piece of work with how many are done, and how many there will be."""
 
 
+Tell = Callable[[str], None]
+"""Called with a sentence about each event."""
+
+
+def clock(seconds: float) -> str:
+    """Write a duration.
+
+    Example:
+        >>> clock(75.4), clock(7384.0)
+        ('1:15', '2:03:04')
+    """
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
 def part(progress: Progress | None, before: int, total: int) -> Progress | None:
     """Tell of a part of some work as of the whole.
 

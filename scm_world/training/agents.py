@@ -24,7 +24,7 @@ from scm_world.env.batched.vector_env import fastest
 from scm_world.errors import Diverged, MissingExtra, UnknownOption, UnreadableFile
 from scm_world.output.durable import made, write_durably, write_whole
 from scm_world.policies import save_policy
-from scm_world.queries.progress import Progress
+from scm_world.queries.progress import Progress, clock
 from scm_world.training.export import begin_with, exported, mean, scored, words
 from scm_world.training.recipe import Recipe, curriculum_of
 from scm_world.training.sb3 import Sb3VecEnv
@@ -44,6 +44,7 @@ except ImportError as error:
 __all__ = ["Watch", "begin_with", "checkpoints", "device_for", "make_learner", "make_worlds"]
 
 SUCCESS, FRACTION = "is_success", "fractional_success"
+LINES = 10.0  # [s] between lines about the training
 
 SEEDS = 1_000_003
 """Between the noises of two seeds; a seed has one for each world."""
@@ -449,6 +450,7 @@ class Watch(BaseCallback):
         self.recipe, self._worlds, self._folder, self._backend = recipe, worlds, folder, backend
         self._card, self._progress, self._tell, self._every = dict(card), progress, tell, every
         self._kept, self._seen, self._tries = time.perf_counter(), 0, 0
+        self._told = time.perf_counter(), 0
         self.score: float | None = None
         self.stop = False
 
@@ -456,6 +458,7 @@ class Watch(BaseCallback):
         """Resume from a checkpoint, perhaps with more steps than before."""
         self.score = resume(model, self._worlds, path)["score"]
         self._seen, self._tries = model.num_timesteps, self._due(model.num_timesteps)
+        self._told = time.perf_counter(), model.num_timesteps
 
     # --- called by Stable-Baselines3 ---
 
@@ -495,9 +498,16 @@ class Watch(BaseCallback):
         self.logger.record("time/cpu_seconds", time.process_time())
         if self._progress is not None:
             self._progress(min(steps, recipe.steps), recipe.steps)
+        now = time.perf_counter()
+        if now - self._told[0] >= LINES and steps > self._told[1]:
+            rate = (steps - self._told[1]) / (now - self._told[0])
+            self._told = now, steps
+            self._tell(self._line(steps, rate))
         if recipe.trials.protocols and self._due(steps) > self._tries:
             self._tries = self._due(steps)
+            begun = time.perf_counter()
             self._evaluate(steps)
+            self._told = self._told[0] + time.perf_counter() - begun, self._told[1]
         if is_last or self.stop or time.perf_counter() - self._kept >= self._every:
             self._keep()
 
@@ -524,6 +534,22 @@ class Watch(BaseCallback):
             first, done = recipe.network.log_std, min(steps / recipe.steps, 1.0)
             with torch.no_grad():
                 policy.log_std.clamp_(max=first + done * (recipe.network.log_std_end - first))
+
+    def _line(self, steps: int, rate: float) -> str:
+        """Say what the last episodes of training gave, and how fast it is.
+
+        Args:
+            steps: That are done.
+            rate: Of them in a second.
+        """
+        episodes, solved, said = self.model.ep_info_buffer, self.model.ep_success_buffer, []
+        if episodes:
+            said.append(f"return {np.mean([episode['r'] for episode in episodes]):.3g}")
+        if solved:
+            said.append(f"success {np.mean(solved):.2f}")
+        left = max(self.recipe.steps - steps, 0) / rate
+        said.append(f"{rate:,.0f} steps per second, about {clock(left)} left")
+        return f"{steps:,} of {self.recipe.steps:,} steps: {', '.join(said)}"
 
     def _due(self, steps: int) -> int:
         """Return how many evaluations there should have been after so many steps."""

@@ -27,10 +27,10 @@ from scm_world.policies import MlpPolicy, load_policy, save_policy
 from scm_world.policies.cards import OPTIONS
 from scm_world.policies.scripted import NAMED
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.progress import Progress
+from scm_world.queries.progress import Progress, Tell
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.training.export import mean, scored, words
-from scm_world.training.loop import Tell, open_folder, torch_threads
+from scm_world.training.loop import open_folder, torch_threads
 from scm_world.training.settings import (
     ENV,
     LESSONS,

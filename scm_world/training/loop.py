@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
@@ -21,14 +21,12 @@ from scm_world.output.durable import is_draft, locked, made, write_whole
 from scm_world.output.reading import read_bytes, read_text
 from scm_world.policies import file_of, load_policy
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.progress import Progress
+from scm_world.queries.progress import Progress, Tell
 from scm_world.training.recipe import Recipe
 
 FORMAT = "scm_world/run/1"
 EVERY = 60.0  # [s] between checkpoints
 LARGEST_SEED = 2**32 - 1  # of Stable-Baselines3
-
-Tell = Callable[[str], None]
 
 
 @final

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -110,17 +111,20 @@ def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert not (tmp_path / "run").exists()
 
 
-def test_an_agent_is_trained(tmp_path: Path) -> None:
-    """What is done is said before; at the end, where the policy is and how it is evaluated."""
+def test_an_agent_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is done is said before and on the way; at the end, where the policy is."""
     pytest.importorskip("stable_baselines3")
+    monkeypatch.setattr("scm_world.training.agents.LINES", 0.0)
     folder = tmp_path / "run"
-    found = called("pushing", *SMALL, f"--out={folder}")
+    short = (*SMALL, "--set=episode_length=5")
+    found = called("pushing", *short, f"--out={folder}")
     assert found.exit_code == 0, found.output
     text = found.output.replace("\n", "")
     assert "Training PPO on pushing" in text
-    assert text.count("32 of 64 steps") == text.count("64 of 64 steps") == 1
+    assert text.count("32 of 64 steps:") == text.count("64 of 64 steps:") == 1
+    assert re.search(r"64 of 64 steps: return \S+, success 0.00, \S+ steps per second", text)
     assert f"scm-world evaluate {folder / 'best.safetensors'} pushing" in text
-    again = called("pushing", *SMALL, f"--out={folder}", "--quiet")
+    again = called("pushing", *short, f"--out={folder}", "--quiet")
     assert again.exit_code == 0
     assert "Training" not in again.output
     other = called("pushing", *SMALL, f"--out={folder}", "--seed=1")
