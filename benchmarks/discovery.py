@@ -226,6 +226,7 @@ RIGS = (
     *((f"servo:{n}", 20) for n in (5, 8, 10, 20, 50)),
     ("servo:10", 100),
     ("servo:10:2", 20),
+    ("servo:20:4", 20),
     *((f"springs:{n}", 20) for n in (5, 8, 10, 20)),
 )
 """Families of physics, and rows: for each node, or control steps for each number of the state."""

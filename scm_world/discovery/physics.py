@@ -41,10 +41,10 @@ LEAST, MOST = 5, 50  # arms, masses
 SECOND = 0.3  # probability of a second cause, from 8 arms on
 BACK = 3  # how far before the nearest cause the second one can be, in the causal order
 SHARE = 0.4  # deviation of an arm that is its own, as a share of the whole
-SPREAD = 0.35  # [rad] standard deviation of an arm, times 0.6 to 1.4
+SPREAD = 0.25  # [rad] standard deviation of an arm, times 0.6 to 1.4
 ARM = (0.2, 0.04)  # [kg], [m] mass and length
 CONTROL_DT = 0.2  # [s] of a control step: in this time an arm comes to rest
-REACH = Box(-1.0, 1.0)  # [rad] where interventions hold an arm
+REACH = 2.0  # standard deviations of an arm, to either side, within which interventions hold it
 
 
 @final
@@ -73,8 +73,8 @@ def servo(n: int, seed: int = 0, hidden: int = 0) -> Servos:
     A chain through all arms in random order, from 8 arms on with further edges, is the graph.
     Each arm is a pendulum; its motor is a position servo. Its command is its own set point, drawn
     for each episode, plus a weighted sum of the measured angles of its causes. Weights are such
-    that the share of each angle that is its own is the same, as in iSCM, and that its spread is
-    drawn at random: variances say nothing of the order. Gravity bends the effects a little.
+    that the share of each angle that is its own is about the same, as in iSCM, and that its spread
+    is drawn at random: variances say nothing of the order. Gravity bends the effects a little.
 
     Args:
         n: Number of arms.
@@ -85,21 +85,24 @@ def servo(n: int, seed: int = 0, hidden: int = 0) -> Servos:
         Ormaniec et al., *Standardizing structural causal models*, ICLR 2025, for scaled weights.
     """
     rng = np.random.default_rng([seed, n, hidden, 11])
-    upper = np.diag(np.ones(n - 1, dtype=bool), 1)
+    upper = np.zeros((hidden + n, hidden + n), dtype=bool)  # forces, then arms in causal order
+    upper[hidden:, hidden:] = np.diag(np.ones(n - 1, dtype=bool), 1)
     for j in range(2, n if n >= 8 else 0):
         if rng.random() < SECOND:
-            upper[rng.integers(max(0, j - 1 - BACK), j - 1), j] = True
-    weights = np.where(upper, rng.uniform(0.5, 1.0, (n, n)) * rng.choice([-1.0, 1.0], (n, n)), 0.0)
-    totals = np.zeros((n, n))  # of each arm, the weights of all set points
-    for j in range(n):
+            upper[hidden + rng.integers(max(0, j - 1 - BACK), j - 1), hidden + j] = True
+    for k in range(hidden):
+        upper[k, hidden + rng.choice(n, 2, replace=False)] = True
+    sizes = rng.uniform(0.5, 1.0, upper.shape) * rng.choice([-1.0, 1.0], upper.shape)
+    weights, totals = np.where(upper, sizes, 0.0), np.zeros(upper.shape)
+    for j in range(hidden + n):
         size = np.linalg.norm(weights[:, j] @ totals)
         if size > 0.0:
+            size = max(size, np.linalg.norm(weights[:, j]))  # causes that cancel stay small
             weights[:, j] *= math.sqrt(1.0 - SHARE**2) / size
-        totals[j] = weights[:, j] @ totals
+        totals[j] = weights[:, j] @ totals  # of each arm, the weights of all set points and forces
         totals[j, j] = SHARE if size > 0.0 else 1.0
-    own, spread = np.diag(totals), SPREAD * rng.uniform(0.6, 1.4, n)
-    weights *= spread / spread[:, None]
-    pairs = [tuple(sorted(rng.choice(n, 2, replace=False).tolist())) for _ in range(hidden)]
+    spread = SPREAD * np.concatenate([np.ones(hidden), rng.uniform(0.6, 1.4, n)])
+    own, weights = np.diag(totals) * spread, weights * spread / spread[:, None]
     order = rng.permutation(n)
     named = [f"{at:0{len(str(n - 1))}d}" for at in order]  # in causal order
     mass, length = ARM
@@ -110,7 +113,7 @@ def servo(n: int, seed: int = 0, hidden: int = 0) -> Servos:
     for k in range(hidden):
         name = f"force{k}"
         drawn.append(Exogenous(name=name, unit="rad", default=0.0, distribution=Normal(std=SPREAD)))
-    for j, name in enumerate(named):
+    for j, name in enumerate(named, start=hidden):
         arms[name] = (
             f'<body name="arm{name}" pos="{0.2 * int(name):g} 0 0"><joint name="arm{name}" '
             f'axis="0 1 0" damping="{2.0 * math.sqrt((stiffness + torque) * inertia):.9g}"/>'
@@ -125,22 +128,24 @@ def servo(n: int, seed: int = 0, hidden: int = 0) -> Servos:
             name=f"servo{name}.setpoint",
             unit="rad",
             default=0.0,
-            distribution=Normal(std=spread[j] * own[j]),
+            distribution=Normal(std=own[j]),
             doc="What the servo would do without the others; drawn for each episode.",
         )
         aim = Exogenous(
             name=f"servo{name}.hold",
             unit="rad",
             default=0.0,
-            distribution=REACH,
+            distribution=Box(-REACH * spread[j], REACH * spread[j]),
             doc="Where an intervention holds the arm; drawn for each episode.",
         )
         drawn += [point, aim]
         holds[f"servo{name}.control"] = Mechanism(Linear(weights=(bend,)), parents=(aim.name,))
-        causes = {f"arm{named[i]}.position": weights[i, j] for i in np.flatnonzero(upper[:, j])}
-        forces = {f"force{k}": 1.0 for k, pair in enumerate(pairs) if j in pair}
-        edges += [(cause, f"arm{name}.position") for cause in (*forces, *causes)]
-        follows = {point.name: 1.0, **forces, **causes}
+        causes = {
+            f"force{i}" if i < hidden else f"arm{named[i - hidden]}.position": weights[i, j]
+            for i in np.flatnonzero(upper[:, j])
+        }
+        edges += [(cause, f"arm{name}.position") for cause in causes]
+        follows = {point.name: 1.0, **causes}
         mechanisms[f"servo{name}.control"] = Mechanism(
             Linear(weights=tuple(bend * float(weight) for weight in follows.values())),
             parents=tuple(follows),
