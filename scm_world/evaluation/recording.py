@@ -50,6 +50,7 @@ Singles = NDArray[np.float32]
 
 INFOS = ("success", "fractional_success")
 ALL = "all"
+TEACHER = "teacher"
 
 _UNUSED: Mapping[str, Any] = {
     "start": None,
@@ -103,11 +104,12 @@ class Recording:
         return f"Recording of {words}, of {_name(self.environment)}"
 
     def pairs(self) -> tuple[Singles, Singles]:
-        """Return observations and the actions that followed, for behavior cloning.
+        """Return observations and what should be done there, for behavior cloning.
 
         Returns:
-            Observations, shape (n, k), and actions, shape (n, m), of all control steps. The parts
-            of a dictionary observation follow one another in the order of their names.
+            Observations, shape (n, k), and actions, shape (n, m), of all control steps: the labels
+            where a teacher was asked, else the actions that followed. The parts of a dictionary
+            observation follow one another in the order of their names.
 
         Raises:
             ModelError: The observations have several lengths, as the structure changed.
@@ -120,7 +122,9 @@ class Recording:
         lengths = sorted({len(row) for row in rows})
         if len(lengths) != 1:
             raise ModelError([f"pairs need observations of one length, got the lengths {lengths}"])
-        actions = np.concatenate([episode.actions for episode in self.episodes])
+        actions = np.concatenate(
+            [one.actions if one.labels is None else one.labels for one in self.episodes]
+        )
         return np.array(rows, dtype=np.float32), actions.astype(np.float32)
 
     def replay(self, which: int | None = None, *, task: Task | str | None = None) -> int:
@@ -209,13 +213,15 @@ class Recording:
     def to_minari(self, dataset_id: str, **about: Any) -> Any:
         """Write a dataset of Minari; its ``recover_environment`` returns the environment.
 
-        It is for learners: what a bit-exact replay needs besides is in the file of ``save`` alone.
+        Its actions are those that were played, so that every transition is one; the labels of a
+        teacher are ``infos["label"]``, of which the last row is there twice. What a bit-exact
+        replay needs besides is in the file of ``save`` alone.
 
         Args:
             dataset_id: Such as ``"scm_world/pushing/sweep-v0"``.
             about: Arguments of ``minari.create_dataset_from_buffers``: ``author``,
                 ``author_email``, ``code_permalink``, ``algorithm_name``, ``description``,
-                ``data_format``, ….
+                ``data_format``, ``ref_min_score``, ``ref_max_score``, ….
 
         Returns:
             The ``minari.MinariDataset``.
@@ -287,6 +293,7 @@ class _Episode:
     states: list[Floats] = field(default_factory=list)
     actions: list[NDArray[Any]] = field(default_factory=list)
     returns: list[tuple[float, bool, bool]] = field(default_factory=list)
+    labels: list[Any] = field(default_factory=list)
     interventions: tuple[tuple[int, Mapping[str, Any]], ...] = ()
 
 
@@ -346,8 +353,12 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._write(self._now, observation, info)
         return observation, info
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Any, label: Any = None) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance one control step.
+
+        Args:
+            action: That is played.
+            label: What should be done here instead, if that is known; shape (n_actions,).
 
         Raises:
             NotReset: There is no episode.
@@ -361,6 +372,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         taken = np.array(action if single else doubles(action, n))  # as the environment reads it
         observation, reward, terminated, truncated, info = self.env.step(action)
         episode.actions.append(taken)
+        episode.labels.append(label)
         episode.returns.append((float(reward), bool(terminated), bool(truncated)))
         self._write(episode, observation, info)
         return observation, reward, terminated, truncated, info
@@ -444,7 +456,23 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             truncations=np.array(cuts, dtype=np.bool_),
             infos=infos,
             states=np.array([*map(_digest, episode.states)], dtype=np.int64),
+            labels=None
+            if any(label is None for label in episode.labels)
+            else np.array(episode.labels, dtype=np.float32),
         )
+
+
+CORRELATION = 0.8
+"""Of the noise of actions, from a control step to the next one."""
+
+
+def action_noise(random: np.random.Generator, size: int) -> Iterator[Floats]:
+    """Yield correlated noise for actions, shape (size,), with a standard deviation of one."""
+    noise = np.zeros(size)
+    while True:
+        innovation = np.sqrt(1.0 - CORRELATION**2) * random.standard_normal(size)
+        noise = CORRELATION * noise + innovation
+        yield noise
 
 
 def record(
@@ -456,9 +484,16 @@ def record(
     first: int = 0,
     do: Mapping[str, Any] | None = None,
     infos: Sequence[str] | str | None = None,
+    noise: float = 0.0,
+    labels: Any = None,
     out: Location | str | None = None,
 ) -> Recording:
     """Run a policy for some episodes, and record them.
+
+    A learner of demonstrations has to know what to do beside the path of its teacher, too. With
+    ``noise`` and ``labels="teacher"`` the policy is driven off its path, and what it would do
+    there is recorded beside what was played (DART); with a learner as the policy and its teacher
+    as ``labels``, that is a round of DAgger. ``Recording.pairs`` gives the labels.
 
     Args:
         policy: Anything that ``as_player`` reads.
@@ -468,7 +503,14 @@ def record(
         first: Number of the first episode within the noise.
         do: An intervention at every reset.
         infos: Names in ``info`` that are kept; see ``Recorder``.
+        noise: Largest standard deviation of what is added to actions, in their units; each episode
+            has one between 0 and that, and it changes slowly (correlation 0.8 between steps).
+        labels: Who is asked at every step what to do there: ``"teacher"`` for the policy itself,
+            or another policy; nobody if None.
         out: Where to save the recording, if anywhere.
+
+    Source:
+        Laskey et al., *DART*, CoRL 2017; Ross et al., *DAgger*, AISTATS 2011.
 
     Raises:
         UnknownOption: A number is not whole, or the environment or the policy is none.
@@ -481,15 +523,30 @@ def record(
         Recording of 2 episodes, 10 control steps, of reaching
     """
     player, recorder = as_player(policy), Recorder(env, infos)
+    teacher = player if labels in (None, TEACHER) else as_player(labels)
     whole_number("n", n, least=1)
+    if not (isinstance(noise, int | float) and 0.0 <= noise < np.inf):
+        raise UnknownOption("noise", noise, ("a standard deviation of actions, 0 or more",))
+    inner = unwrapped_env(env, "Recorder")
+    space: Any = env.action_space
     start: dict[str, Any] = {"seed": seed, "options": {"episode": first, "do": do}}
     for _ in range(n):
         observation, _info = recorder.reset(**start)
         start = {"options": {"do": do}}  # the next episode, also after attempts that failed
-        player.begin(unwrapped_env(env, "Recorder"))
+        player.begin(inner)
+        if teacher is not player:
+            teacher.begin(inner)
+        random = np.random.default_rng([inner.world.noise.seed, inner.world.episode])
+        scale = noise * random.uniform()
+        noises = action_noise(random, inner.world.compiled.n_actions)
         over = False
         while not over:
-            observation, _, ended, cut, _info = recorder.step(player.act(observation))
+            action = player.act(observation)
+            right = action if teacher is player else teacher.act(observation)
+            label = None if labels is None else np.clip(right, space.low, space.high)
+            if noise:
+                action = np.clip(action + scale * next(noises), space.low, space.high)
+            observation, _, ended, cut, _info = recorder.step(action, label)
             over = ended or cut
     found = recorder.recording(player.about)
     if out is not None:

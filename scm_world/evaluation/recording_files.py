@@ -61,6 +61,8 @@ class Recorded:
         truncations: Whether each step ended it for lack of time, shape (T,).
         infos: Entries of ``info`` by name, each of shape (T + 1,).
         states: A digest of the true state of each instant, shape (T + 1,).
+        labels: What a teacher would have done at each step, in the units of actions, shape
+            (T, n_actions); None where nobody was asked.
     """
 
     environment: Mapping[str, Any] = field(repr=False)
@@ -74,6 +76,7 @@ class Recorded:
     truncations: NDArray[np.bool_] = field(repr=False)
     infos: Mapping[str, NDArray[Any]] = field(repr=False)
     states: Integers = field(repr=False)
+    labels: NDArray[Any] | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         """Return the number of control steps."""
@@ -121,6 +124,8 @@ class Recorded:
             found.update(array.tobytes())
         for name in sorted(self.infos):
             found.update(self.infos[name].tobytes())
+        if self.labels is not None:
+            found.update(self.labels.tobytes())
         return found
 
 
@@ -315,6 +320,10 @@ def to_parquet(header: str, episodes: Sequence[Recorded]) -> bytes:
     kind = np.result_type(*(episode.actions for episode in episodes))
     actions = [row for episode in episodes for row in (*episode.actions.astype(kind), None)]
     columns["action"] = _lists(arrow, actions, kind)
+    labels = [one.labels for one in episodes if one.labels is not None]
+    if len(labels) == len(episodes):
+        rows = [row for one in labels for row in (*one, None)]
+        columns["label"] = _lists(arrow, rows, labels[0].dtype)
     for column, name in _STEPS.items():
         rows = [row for one in episodes for row in (*getattr(one, name).tolist(), None)]
         columns[column] = arrow.array(rows)
@@ -378,6 +387,7 @@ def from_parquet(
                 if rows[name].null_count == 0
             },
             "states": rows["state"].to_numpy(),
+            "labels": np.array(_rows(at_steps["label"])) if "label" in rows.column_names else None,
         }
 
     episodes = []
@@ -448,7 +458,7 @@ def to_minari(episodes: Sequence[Recorded], dataset_id: str, **about: Any) -> An
             rewards=episode.rewards.tolist(),
             terminations=episode.terminations.tolist(),
             truncations=episode.truncations.tolist(),
-            infos={name: episode.infos[name].tolist() for name in names},
+            infos={name: episode.infos[name].tolist() for name in names} | _labelled(episode),
         )
         for number, (episode, observations) in enumerate(zip(episodes, seen, strict=True))
     ]
@@ -464,6 +474,13 @@ def to_minari(episodes: Sequence[Recorded], dataset_id: str, **about: Any) -> An
         raise
     finally:
         env.close()
+
+
+def _labelled(episode: Recorded) -> dict[str, Any]:
+    """Give the labels of an episode as an info, which has a row for the last instant, too."""
+    if episode.labels is None:
+        return {}
+    return {"label": np.concatenate([episode.labels, episode.labels[-1:]])}
 
 
 def _gym_arguments(made_with: Mapping[str, Any]) -> dict[str, Any]:

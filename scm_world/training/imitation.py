@@ -20,7 +20,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.episodes import EpisodeRunner
 from scm_world.evaluation.protocols import chosen, protocols_of
-from scm_world.evaluation.recording import Recording
+from scm_world.evaluation.recording import Recording, action_noise
 from scm_world.output.durable import locked, made, write_durably
 from scm_world.output.reading import read_arrays
 from scm_world.policies import MlpPolicy, load_policy, save_policy
@@ -54,9 +54,6 @@ SHARD = 25
 
 SEED = 5_000_003
 """Added to seeds, so that no evaluation has the episodes of the demonstrations."""
-
-CORRELATION = 0.8
-"""Of the noise of actions, from a control step to the next one."""
 
 UNIT = 0.1
 """Of actions, while they are learned: errors of that size count fully, larger ones linearly."""
@@ -326,17 +323,15 @@ def _episode(
     """Run an episode; return what was observed and what the teacher would have done, and infos."""
     teacher, size = NAMED[lesson.teacher](), env.world.compiled.n_actions
     scale, share = lesson.noise * random.uniform(), lesson.share * random.uniform(0.0, 2.0)
-    noise, learns, over, info = np.zeros(size), False, False, dict[str, Any]()
+    noises, learns, over, info = action_noise(random, size), False, False, dict[str, Any]()
     pairs = []
     while not over:
         right = np.clip(env.toward(teacher(env.world)), -1.0, 1.0)
         pairs.append((np.array(observation, np.float32), right.astype(np.float32)))
         if learner is not None and random.uniform() < 1.0 / lesson.stretch:
             learns = random.uniform() < share
-        innovation = np.sqrt(1.0 - CORRELATION**2) * random.standard_normal(size)
-        noise = CORRELATION * noise + innovation
         action = learner(observation) if learner is not None and learns else right
-        given = np.clip(action + scale * noise, -1.0, 1.0)
+        given: Any = np.clip(action + scale * next(noises), -1.0, 1.0)
         observation, _, terminated, truncated, info = env.step(given)
         over = terminated or truncated
         if not over and turn.step(env):

@@ -469,3 +469,51 @@ def test_what_minari_cannot_hold_is_refused(minari: Any, tmp_path: Path) -> None
     good.to_minari("test-v0", **AUTHOR, **ARROW)
     with pytest.raises(ValueError, match="already"):
         good.to_minari("test-v0", **AUTHOR, **ARROW)
+
+
+# --- labels -----------------------------------------------------------------------------------
+
+
+def test_a_teacher_that_is_pushed_off_its_path_says_what_to_do_there(tmp_path: Path) -> None:
+    """What is played has noise, what is learned from has none, and all of it happens again."""
+    env = make(action_mode="delta_joint_positions")
+    noisy = record("across", env, 2, noise=0.5, labels="teacher", seed=3)
+    other = record("across", env, 1, noise=0.5, labels="teacher", seed=3, first=1)
+    assert noisy[1] == other[0]  # the noise follows from seed and number
+    assert noisy.replay() == 2 * STEPS
+    for episode in noisy:
+        assert episode.labels is not None
+        assert not np.array_equal(episode.labels, episode.actions)
+        assert np.abs(episode.actions).max() <= 1.0
+    env.reset(seed=3, options={"episode": 0})
+    player = as_player("across")
+    player.begin(env.unwrapped)
+    for step, played in enumerate(noisy[0].actions):
+        said = np.clip(player.act(env.unwrapped.observe()), -1.0, 1.0)
+        np.testing.assert_array_equal(noisy[0].labels[step], said.astype(np.float32))
+        env.step(played)
+    np.testing.assert_array_equal(noisy.pairs()[1], np.concatenate([e.labels for e in noisy]))
+    loaded = Recording.load(noisy.save(tmp_path / "runs"))
+    assert loaded.episodes == noisy.episodes
+    np.testing.assert_array_equal(loaded[1].labels, noisy[1].labels)
+
+
+def test_a_learner_acts_and_its_teacher_says_what_it_should_do() -> None:
+    """A round of DAgger: labels come from another policy; without any, actions are learned."""
+    learner = record("still", make(), 1, labels="across")
+    assert learner[0] != record("still", make(), 1)[0]
+    np.testing.assert_array_equal(learner[0].actions, record("still", make(), 1)[0].actions)
+    assert not np.array_equal(learner.pairs()[1], learner[0].actions)
+    assert record("still", make(), 1)[0].labels is None
+    with pytest.raises(UnknownOption, match="noise"):
+        record("still", make(), 1, noise=-0.1)
+
+
+def test_labels_are_infos_of_minari(minari: Any) -> None:
+    """Transitions have the actions that were played; labels are beside them."""
+    recording = record("across", make(), 1, noise=0.3, labels="teacher")
+    given = {**AUTHOR, **ARROW, "ref_min_score": 1.0, "ref_max_score": 2.0}
+    dataset = recording.to_minari("scm_world/pushing/labels-v0", **given)
+    np.testing.assert_array_equal(dataset[0].actions, recording[0].actions)
+    np.testing.assert_array_equal(dataset[0].infos["label"][:-1], recording[0].labels)
+    assert minari.get_normalized_score(dataset, np.array([1.5])) == 0.5
