@@ -12,6 +12,7 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -24,13 +25,14 @@ from scm_world.discovery.data.truth import projected
 from scm_world.discovery.learners import baselines, learn
 from scm_world.discovery.learners.moving import paired, sparse_pooled, verified
 from scm_world.discovery.learners.simulators import SCMSimulator
-from scm_world.discovery.metrics import evaluate, sortability
+from scm_world.discovery.metrics import evaluate, evaluate_marks, sortability
 from scm_world.discovery.problems import DONE, problem, random_model
 from scm_world.discovery.run import discover
 from scm_world.errors import ModelError, in_one_line
 from scm_world.evaluation.statistics.intervals import mean_interval
+from scm_world.graph import SCM
 from scm_world.queries.experiments.versions import versions
-from scm_world.variables import Shift
+from scm_world.variables import Derived, Exogenous, Linear, Normal, Parent, Shift
 
 HERE = Path(__file__).parent / "discovery"
 
@@ -154,8 +156,8 @@ def case(name: str, kind: str, each: int, seed: int) -> tuple[list[Any], Dataset
     return truth, Dataset.of(data.values[np.ix_(rows, columns)], shown, targets=targets)
 
 
-def tried(learner: str, data: Dataset, truth: list[Any], names: Any = None) -> dict[str, Any]:
-    """Let a learner find a graph within the limit, and score it; or say why there is none."""
+def limited(learner: str, data: Dataset) -> Any:
+    """Let a learner find a graph within the limit; return why there is none otherwise."""
 
     def stop(*_: Any) -> None:
         raise TimeoutError(f"stopped after {LIMIT:g} s")
@@ -163,11 +165,18 @@ def tried(learner: str, data: Dataset, truth: list[Any], names: Any = None) -> d
     signal.signal(signal.SIGALRM, stop)
     signal.setitimer(signal.ITIMER_REAL, LIMIT)
     try:
-        found = learn(learner, data)
+        return learn(learner, data)
     except (TimeoutError, ModelError) as error:
-        return {"failed": in_one_line(error)}
+        return in_one_line(error)
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+def tried(learner: str, data: Dataset, truth: list[Any], names: Any = None) -> dict[str, Any]:
+    """Let a learner find a graph within the limit, and score it; or say why there is none."""
+    found = limited(learner, data)
+    if isinstance(found, str):
+        return {"failed": found}
     s = evaluate(found, truth, names=data.names if names is None else names)
     return {
         "shd": s.shd,
@@ -280,6 +289,114 @@ def physics() -> Any:
     return found
 
 
+OBSERVED = ("fci", "pc", "boss", "empty", "complete", "correlation", "sort_regress")
+SET = ("do_order", "gies", "permscore")
+HIDDEN = (
+    *((f"er2:10:{k}", 1000) for k in (1, 2, 4)),
+    *(("er2:10:2", n) for n in (200, 5000)),
+    ("iscm2:10:2", 1000),
+    ("mlp2:10:2", 1000),
+)
+"""Family with hidden variables, and rows: observational ones, or as many with interventions."""
+SERIES = ("fci", "lpcmci", "pcmci+", "j-pcmci+", "empty", "complete", "correlation", "sort_regress")
+EPISODES, LENGTH = 20, 50
+
+
+def series(kind: str, seed: int) -> Dataset:
+    """Draw episodes of five variables with memory, a lagged and perhaps an instantaneous cause.
+
+    One further variable acts on two of them.
+
+    Args:
+        kind: ``"hidden series"``: it has memory and noise in each step. ``"hidden context"``: it
+            keeps its value over an episode. ``"none hidden"``: it is in the table.
+        seed: Of the model and the data.
+    """
+    rng = np.random.default_rng([seed, 29])
+    names = [f"x{i}" for i in range(5)]
+    parents = {name: {Parent(name, 1): 0.5} for name in names}
+    for i, name in enumerate(names):
+        cause = Parent(names[int(rng.integers(5))], 1)
+        parents[name].setdefault(cause, float(rng.choice([-0.4, 0.4])))
+        if i and rng.random() < 0.5:
+            parents[name][Parent(names[i - 1])] = float(rng.choice([-0.6, 0.6]))
+    for name in rng.choice(names, 2, replace=False).tolist():
+        parents[name][Parent("h", 1)] = float(rng.choice([-0.8, 0.8]))
+    made: list[Any] = [
+        Derived(
+            name=name,
+            parents=tuple(of),
+            mechanism=Linear(weights=tuple(of.values())),
+            noise=Normal(),
+        )
+        for name, of in parents.items()
+    ]
+    memory = Derived(
+        name="h", parents=(Parent("h", 1),), mechanism=Linear(weights=(0.7,)), noise=Normal()
+    )
+    still = Exogenous(name="h", distribution=Normal())
+    data = collect(
+        SCM([*made, still if kind == "hidden context" else memory]),
+        Design(), EPISODES, seed=seed, steps=LENGTH,
+    )  # fmt: skip
+    return data if kind == "none hidden" else data.hide(["h"])
+
+
+def marked(learner: str, data: Dataset, truth: Any) -> dict[str, Any]:
+    """Let a learner find a graph within the limit, and score its edge marks; or say why not."""
+    found = limited(learner, data)
+    if isinstance(found, str):
+        return {"failed": found}
+    scores: dict[str, Any] = asdict(evaluate_marks(found, truth))
+    if found.targets:
+        pairs = zip(found.targets, data.regimes, strict=True)
+        right = [set(one) == set(regime.targets) for one, regime in pairs if regime.targets]
+        scores["targets"] = float(np.mean(right))
+    if found.marks is None:
+        scores["direct_f1"] = evaluate(found, truth.edges, names=truth.names).f1
+    return {**scores, "seconds": found.seconds}
+
+
+def hidden() -> Any:
+    """Hidden variables: edge marks against the ancestral graphs, with trivial baselines."""
+    cases: list[tuple[str, int, list[Any]]] = []
+    for name, n in HIDDEN:
+        kinds = [(learner, "observational") for learner in OBSERVED]
+        kinds += [(learner, "interventional") for learner in SET]
+        runs: list[Any] = []
+        for seed in SEEDS:
+            made = problem(name, seed=seed)
+            tables = {kind: made.data(kind, n, seed) for kind in dict(map(reversed, kinds))}
+            runs += [(w, kind, marked(w, tables[kind], made.truth)) for w, kind in kinds]
+        cases.append((name, n, runs))
+    for kind in ("hidden series", "hidden context", "none hidden"):
+        runs = []
+        for seed in SEEDS:
+            table = series(kind, seed)
+            runs += [(w, "observational", marked(w, table, table.truth)) for w in SERIES]
+        cases.append((kind, EPISODES * LENGTH, runs))
+    rows = []
+    for name, n, runs in cases:
+        for who, kind in dict.fromkeys((w, k) for w, k, _ in runs):
+            mine = [run for w, k, run in runs if (w, k) == (who, kind)]
+            done = [run for run in mine if "failed" not in run]
+            row: dict[str, Any] = {
+                "model": name, "rows": n, "learner": who, "data": kind,
+                "seeds": [SEEDS.start, SEEDS.stop - 1],
+                "failed": dict(Counter(run["failed"] for run in mine if "failed" in run)),
+            }  # fmt: skip
+            for key in done[0] if done else ():
+                values = [run[key] for run in done if run[key] is not None]
+                if values:
+                    bounded = key not in ("pag_distance", "seconds")
+                    interval = mean_interval(values, proportion=bounded).as_dict()
+                    row[key] = {k: interval[k] for k in ("value", "low", "high")}
+                    row[key]["n"] = len(values)
+            rows.append(row)
+            print(json.dumps(row), flush=True)
+    return rows
+
+
 CONFIRMED = 5  # seeds of a family whose edges are tried by paired experiments
 UNITS = 2  # episodes of each of them
 
@@ -343,6 +460,7 @@ PARTS: dict[str, Callable[[], Any]] = {
     "nonlinear": nonlinear,
     "families": families,
     "physics": physics,
+    "hidden": hidden,
     "moving": moving,
     "steps": steps,
 }

@@ -166,7 +166,18 @@ def load_task(name: str, option: Sequence[str] | None = None) -> Task:
 
 
 def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:
-    """Return a task, or the causal model that ``module:function`` returns; see ``load_task``."""
+    """Return a task, or the causal model of a JSON file or ``module:function``; see ``load_task``.
+
+    Raises:
+        UnknownOption: ``option`` is given for a file of a causal model.
+        UnreadableFile: A JSON file holds no causal model.
+    """
+    if name.endswith(".json"):
+        from scm_world.discovery.problems import model_of_file
+
+        if option:
+            raise UnknownOption("--option", option[0], ("left out: a JSON file has no arguments",))
+        return model_of_file(name)
     from scm_world.graph import scm as graph
     from scm_world.queries import SCM
     from scm_world.tasks.factories import load_factory

@@ -39,6 +39,8 @@ BRIEF = (
     *("shd", "shd_standardised", "f1", "precision", "recall", "auprc", "sid"),
     *("experiments", "seconds"),
 )
+BRIEF_MARKS = ("shd", "f1", "seconds")
+"""Beside scores of edge marks, so that the table fits a terminal."""
 SMALL: dict[str, tuple[str, ...]] = {
     "towers": ("number_of_blocks_in_tower=1,1,2", "tower_dims=0.035,0.035,0.07"),
     "stacked_blocks": ("num_of_levels=2", "max_level_width=0.04"),
@@ -59,7 +61,7 @@ def discover(
     option: options.Option = None,
     resolution: options.Resolution = None,
     learner: options.Text = None,
-    baselines: bool = True,
+    baselines: Annotated[bool, typer.Option("--baselines/--no-baselines")] = True,
     data: options.Text = None,
     budget: str = "1000",
     seeds: options.Count = 3,
@@ -82,9 +84,9 @@ def discover(
     Example: scm-world discover er2:20 --learner do_order,gies
 
     Args:
-        task: A task, a model.xml or model.urdf, or module:function; with --learner also a family
-            with a size (er2:20, sf2:50, servo:10), the JSON file of an SCM, or several with commas
-            between them.
+        task: A task, a model.xml or model.urdf, or module:name; with --learner also a family with a
+            size (er2:20, servo:10; er2:20:3 hides three more), the JSON file of an SCM, or several
+            with commas between them.
         probes: Number of states to experiment in.
         strict: Exit 1 if the SHD is not 0.
         learner: Learners to benchmark, with commas; see 'scm-world list'.
@@ -239,7 +241,7 @@ def _benchmark(
     out: Location | None,
 ) -> None:
     """Run learners over budgets and seeds; print a table per problem."""
-    from scm_world.discovery.benchmark_report import COLUMNS, HEADS, summary
+    from scm_world.discovery.benchmark_report import HEADS, MARKED, columns, summary
     from scm_world.discovery.benchmarks import benchmark, slug
     from scm_world.discovery.learners.registry import baselines as trivial
     from scm_world.discovery.learners.registry import learner as find
@@ -251,6 +253,8 @@ def _benchmark(
     if ":" in named[0]:  # a custom learner, beside where the command is called
         sys.path.insert(0, str(Path.cwd()))
     beside = [name for name in trivial() if named[1] and name not in learners]
+    if not any(find(name).marked for name in learners):
+        beside = [name for name in beside if not find(name).marked]
     if all(find(name).takes == ("paired",) for name in learners):
         beside = []  # it needs no data
     policies = (*NAMED, "still", "usual")
@@ -282,22 +286,29 @@ def _benchmark(
             engine=pool,
             progress=tell,
         )
-    columns = [column for column in COLUMNS if column.key in BRIEF]
     for (name, both), oracles in product(summary(result).items(), (False, True)):
         truth, rows = result.problems[name], [row for row in both if row.is_oracle == oracles]
         most = max((row.run.budget for row in rows), default=0)
         rows = [row for row in rows if row.run.learner not in beside or row.run.budget == most]
         if not rows:
             continue
+        there = columns(rows)
+        brief = BRIEF_MARKS if any(column.key == "pag_distance" for column in there) else BRIEF
+        shown = [column for column in there if column.key in (*brief, *MARKED)]
         size = f"{len(truth.names)} variables, {len(truth.edges)} true edges"
+        size += f", {len(truth.confounded)} pairs with hidden causes" * bool(truth.confounded)
+        spreads = next((r.spreads for r in rows if "variance_sortability" in r.spreads), {})
+        for key, title in (("variance", "varsortability"), ("r2", "R²-sortability")):
+            if f"{key}_sortability" in spreads:
+                size += f", {title} {spreads[f'{key}_sortability'].mean:.2f}"
         console.table(
-            (*HEADS[1:], *(column.title for column in columns)),
+            (*HEADS[1:], *(column.title for column in shown)),
             [  # the means over seeds; the ranges are in report.html
                 (
                     *row.heads[1:],
                     *(
                         Text(row.text(c).partition(" [")[0], "bold" if c.key in row.best else "")
-                        for c in columns
+                        for c in shown
                     ),
                 )
                 for row in rows

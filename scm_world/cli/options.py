@@ -65,13 +65,15 @@ System = Annotated[
     str,
     typer.Argument(
         metavar="SYSTEM",
-        help="A task (see 'scm-world list'), a model.xml or model.urdf, or module:function.",
+        help="A task (see 'scm-world list'), a model.xml or model.urdf, the model.json of an SCM, "
+        "or module:name of a function or an SCM.",
     ),
 ]
 Systems = Annotated[
     str,
     typer.Argument(
-        metavar="SYSTEM", help="A task, a model.xml or model.urdf, module:function, or 'all'."
+        metavar="SYSTEM",
+        help="A task, a model.xml, model.urdf or model.json, module:name, or 'all'.",
     ),
 ]
 Option = Annotated[

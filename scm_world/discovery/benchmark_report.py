@@ -16,6 +16,7 @@ from scm_world.discovery.benchmarks import BenchmarkResult, BenchmarkRun
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import baselines
 from scm_world.discovery.problems import GroundTruth
+from scm_world.graph.ancestral import HEAD, SIGNS, Marks
 from scm_world.output.canvas import PALETTE, blank, save, small_png, styled
 from scm_world.output.durable import write_whole
 from scm_world.output.pages import Entry, render
@@ -62,10 +63,19 @@ COLUMNS = (
     ScoreColumn("auroc", "AUROC", "more", 2),
     ScoreColumn("sid", "SID", "less"),
     ScoreColumn("effect_rmse", "effect RMSE", "less"),
+    ScoreColumn("pag_distance", "PAG distance", "less"),
+    ScoreColumn("adjacency_f1", "adjacency F1", "more", 2),
+    ScoreColumn("head_f1", "heads F1", "more", 2),
+    ScoreColumn("tail_f1", "tails F1", "more", 2),
+    ScoreColumn("targets", "targets found", "more", 2),
+    ScoreColumn("variance_sortability", "varsortability", "", 2),
+    ScoreColumn("r2_sortability", "R²-sortability", "", 2),
     ScoreColumn("seconds", "seconds"),
     ScoreColumn("experiments", "experiments"),
     ScoreColumn("bound", "bound"),
 )
+MARKED = ("pag_distance", "adjacency_f1", "head_f1", "tail_f1", "targets")
+"""Of graphs with edge marks, and of unknown targets: shown where some run has them."""
 
 # --- tables ---------------------------------------------------------------------------------------
 
@@ -186,6 +196,12 @@ def summary(result: BenchmarkResult) -> dict[str, list[SummaryRow]]:
     return rows
 
 
+def columns(rows: Iterable[SummaryRow]) -> list[ScoreColumn]:
+    """Return the columns of a table of some rows."""
+    there = {key for row in rows for key in row.spreads}
+    return [column for column in COLUMNS if column.key in there or column.key not in MARKED]
+
+
 def counted(result: BenchmarkResult) -> str:
     """Say how many runs there are and how they ended."""
     ends = [run.status for run in result.runs]
@@ -298,25 +314,30 @@ VERDICTS = {
     "extra": ("+", "found, not true", "#B0508C"),
     "reversed": ("⇄", "found the other way round", "#00785A"),
     "undirected": ("?", "true, found without direction", "#222222"),
+    "marked": ("≠", "found with other marks than in the partial ancestral graph", "#7A4B00"),
     "unscored": ("∘", "not scored", "#6B7280"),
 }
 """The sign in a matrix, what it means, and its color; each sign alone is enough."""
-BESIDE = ("shd", "f1", "precision", "recall")  # scores beside a single run
+BESIDE = ("shd", "f1", "precision", "recall", "pag_distance")  # scores beside a single run
 
 
 class Link(NamedTuple):
-    """An edge and its verdict; an undirected one has its true direction, if it has one."""
+    """An edge and its verdict; an undirected one has its true direction, if it has one.
+
+    Of a graph with edge marks it has the signs that are written between the two.
+    """
 
     cause: str
     effect: str
     lag: int
     verdict: str
     directed: bool = True
+    signs: str = ""
 
     @property
     def words(self) -> str:
         """Cause, effect and lag, such as ``"x → y, t−1"``."""
-        between = "→" if self.directed else "—"
+        between = self.signs or ("→" if self.directed else "—")
         return f"{self.cause} {between} {self.effect}" + f", t−{self.lag}" * (self.lag > 0)
 
 
@@ -334,6 +355,8 @@ def compare(truth: GroundTruth, found: EstimatedGraph) -> list[Link]:
         [('x → z, t−1', 'extra'), ('y → x', 'reversed'), ('y → z', 'missing')]
     """
     kept = found.restricted(truth.names)
+    if kept.marks is not None:
+        return _compare_marks(truth, kept.marks)
     missing, directed = set(truth.edges), set(kept.directed)
     links: list[Link] = []
     for one, other in kept.undirected:
@@ -357,6 +380,30 @@ def compare(truth: GroundTruth, found: EstimatedGraph) -> list[Link]:
     return sorted(
         link._replace(verdict="unscored") if {*link[:2]} in apart else link for link in links
     )
+
+
+def _compare_marks(truth: GroundTruth, marks: Marks) -> list[Link]:
+    """Compare edge marks with the partial ancestral graph of the truth."""
+    known = truth.pag(len(marks) - 1 or None)
+    made = np.concatenate([marks, np.zeros_like(known)[len(marks) :]])
+    links = []
+    for lag, i, j in np.argwhere((made != 0) | (known != 0)).tolist():
+        if lag == 0 and i > j:
+            continue
+        said, true = ((m[lag, i, j], m[0, j, i] if lag == 0 else HEAD) for m in (made, known))
+        verdict = "missing" if not said[0] else "extra" if not true[0] else "marked"
+        left, right = (int(mark) for mark in (said if said[0] else true))
+        links.append(
+            Link(
+                truth.names[i],
+                truth.names[j],
+                lag,
+                "correct" if said == true else verdict if truth.pairs[i, j] else "unscored",
+                directed=lag > 0,
+                signs=f"{SIGNS[left][0]}-{SIGNS[right][1]}",
+            )
+        )
+    return sorted(links)
 
 
 def report(result: BenchmarkResult) -> str:
@@ -383,9 +430,9 @@ def report(result: BenchmarkResult) -> str:
             *((f"s{at}", name) for at, name in enumerate(result.problems)),
         ],
         note=NOTE,
-        heads=[*HEADS, *(column.title for column in COLUMNS)],
-        rows=_entries(row for row in rows if not row.is_oracle),
-        oracles=_entries(row for row in rows if row.is_oracle),
+        heads=[*HEADS, *(column.title for column in columns(rows))],
+        rows=_entries((row for row in rows if not row.is_oracle), columns(rows)),
+        oracles=_entries((row for row in rows if row.is_oracle), columns(rows)),
         oracle_note=ORACLES,
         budgets=small_png(draw_budgets(result)),
         problems=problems,
@@ -394,8 +441,8 @@ def report(result: BenchmarkResult) -> str:
     )
 
 
-def _entries(rows: Iterable[SummaryRow]) -> list[list[str | Entry]]:
-    return [[*row.heads, *(_entry(row, column) for column in COLUMNS)] for row in rows]
+def _entries(rows: Iterable[SummaryRow], shown: Sequence[ScoreColumn]) -> list[list[str | Entry]]:
+    return [[*row.heads, *(_entry(row, column) for column in shown)] for row in rows]
 
 
 def _entry(row: SummaryRow, column: ScoreColumn) -> Entry:
@@ -409,5 +456,9 @@ def _compared(truth: GroundTruth, run: BenchmarkRun) -> dict[str, Any]:
     for link in links:
         for ends in [link[:2]] if link.directed else [link[:2], link[1::-1]]:
             cells.setdefault(ends, []).append(link)
-    scores = {c.title: number(run.scores.get(c.key), c) for c in COLUMNS if c.key in BESIDE}
+    scores = {
+        c.title: number(run.scores.get(c.key), c)
+        for c in COLUMNS
+        if c.key in BESIDE and (c.key in run.scores or c.key not in MARKED)
+    }
     return {"run": run, "cells": cells, "scores": scores}

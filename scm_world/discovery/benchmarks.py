@@ -23,9 +23,10 @@ from pydantic import FiniteFloat, PlainValidator, TypeAdapter
 
 from scm_world._arguments import load, whole_number
 from scm_world.discovery.data import Dataset
+from scm_world.discovery.data.truth import Pair
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import SOURCES, Learner, Source, learn, learner
-from scm_world.discovery.metrics import effect_rmse, evaluate
+from scm_world.discovery.metrics import effect_rmse, evaluate, evaluate_marks, sortability
 from scm_world.discovery.physics import PHYSICS
 from scm_world.discovery.problems import GroundTruth, Problem, TaskView, problem, problem_label
 from scm_world.errors import (
@@ -78,6 +79,7 @@ class BenchmarkRun:
         bound: Fewest that can do in theory, if known.
         edges: The true edges, where this seed has another graph than the first one: each seed
             draws its own model of a family.
+        confounded: The same of pairs with a hidden common cause.
     """
 
     problem: str
@@ -96,6 +98,7 @@ class BenchmarkRun:
     experiments: int = 0
     bound: int | None = None
     edges: tuple[EdgeKey, ...] | None = None
+    confounded: tuple[Pair, ...] | None = None
 
     @property
     def key(self) -> tuple[str, str, str, bool, int, int]:
@@ -108,7 +111,7 @@ class BenchmarkRun:
     def record(self) -> dict[str, Any]:
         """Everything but the graphs: a row of the table."""
         facts = {f.name: getattr(self, f.name) for f in fields(self)}
-        graphs = [facts.pop(name) for name in ("found", "edges", "scores")]
+        graphs = [facts.pop(name) for name in ("found", "edges", "confounded", "scores")]
         return {**facts, **graphs[-1]}
 
     def as_dict(self) -> dict[str, Any]:
@@ -153,7 +156,9 @@ class BenchmarkResult:
     def truth_of(self, run: BenchmarkRun) -> GroundTruth:
         """Return the graph that a run is compared with."""
         truth = self.problems[run.problem]
-        return truth if run.edges is None else replace(truth, edges=run.edges)
+        if run.edges is None:
+            return truth
+        return replace(truth, edges=run.edges, confounded=run.confounded or ())
 
     @property
     def records(self) -> list[dict[str, Any]]:
@@ -286,9 +291,9 @@ def benchmark(
     marks = {name: _learner_version(learner(name)) for name in learners}
     truths: dict[str, GroundTruth] = {}
     named = [label if isinstance(p, SCM) else p for p, label in zip(problems, shown, strict=True)]
-    for given, name in zip(problems, named, strict=True):
+    for given, name, label in zip(problems, named, shown, strict=True):
         with closing(problem(given, view=view)) as known:
-            truths[known.truth.name], marks[name] = known.truth, known.version
+            truths[label], marks[name] = replace(known.truth, name=label), known.version
     asked = {
         "problems": named,
         "learners": learners,
@@ -301,6 +306,9 @@ def benchmark(
     }
     settings = json.loads(json.dumps({**asked, "versions": versions(), "marks": marks}))
     folder = None if out is None else located(out)
+    chosen = map(learner, learners)
+    marked = any(one.marked and not one.baseline for one in chosen)
+    marked = marked or any(truth.confounded for truth in truths.values())
     groups = []
     for (given, label), seed in product(zip(problems, shown, strict=True), range(seeds)):
         runs = [
@@ -312,7 +320,7 @@ def benchmark(
             if not even or (standardised and n == spent[-1] and kind != "paired")
         ]
         place = None if folder is None else folder / "data" / slug(label)
-        groups.append([_Job(given, run, spent[-1], view, place) for run in runs])
+        groups.append([_Job(given, run, spent[-1], view, place, marked) for run in runs])
     if engine is None:
         engine, workers = PROCESS, 1 if workers is None else workers
     with opened(engine, workers) as executor:
@@ -409,6 +417,7 @@ class _Job:
         collected: Rows, episodes or steps to collect: the largest budget of the benchmark.
         view: Of a task or a world.
         folder: Where collected data are kept; nowhere if None.
+        marked: Whether edge marks are compared with the ancestral graphs of the truth.
     """
 
     name: str | SCM
@@ -416,6 +425,7 @@ class _Job:
     collected: int
     view: TaskView
     folder: Location | None
+    marked: bool = False
 
 
 def slug(name: str) -> str:
@@ -472,8 +482,9 @@ def _all_runs(
             progress(number + 1, planned)
 
     def keep(run: BenchmarkRun) -> None:
-        if run.edges == truths[run.problem].edges:
-            run = replace(run, edges=None)
+        truth = truths[run.problem]
+        if (run.edges, run.confounded) == (truth.edges, truth.confounded):
+            run = replace(run, edges=None, confounded=None)
         with lock:
             if folder is not None:
                 path = run_path(folder, run)
@@ -589,7 +600,7 @@ class _Runner:
             table = part.standardised() if job.run.standardised else part
         started = time.perf_counter()
         try:
-            run = self._learned(job.run, table)
+            run = self._learned(job.run, table, job.marked)
             _as_json(run.as_dict())  # what cannot be written has failed
         except MissingExtra:
             raise
@@ -598,21 +609,31 @@ class _Runner:
             return replace(job.run, status="failed", message=said, seconds=seconds)
         return run
 
-    def _learned(self, run: BenchmarkRun, table: Dataset | None) -> BenchmarkRun:
+    def _learned(self, run: BenchmarkRun, table: Dataset | None, marked: bool) -> BenchmarkRun:
         made: Any = self._problem
         truth, chosen = made.truth, learner(run.learner)
         if table is None:
             found = learn(chosen, made.simulator(run.seed), seed=run.seed, budget=run.budget)
         else:
             found = learn(chosen, table, seed=run.seed)
-        compared = evaluate(found, truth.edges, names=truth.names, pairs=truth.pairs)
-        scores = {k: v for k, v in compared.as_dict().items() if isinstance(v, int | float | None)}
-        scores["sid"] = compared.sid
-        if table is not None and not run.standardised:
+        scores: dict[str, Any] = {}
+        if found.marks is None:  # a partial ancestral graph is no estimate of a directed one
+            compared = evaluate(found, truth.edges, names=truth.names, pairs=truth.pairs)
+            plain = compared.as_dict()
+            scores = {k: v for k, v in plain.items() if isinstance(v, int | float | None)}
+            scores["sid"] = compared.sid
+        if marked or found.marks is not None:
+            scores |= asdict(evaluate_marks(found, truth))
+        if table is not None and found.marks is None and not run.standardised:
             if not self._held_out:
                 self._held_out.append(made.held_out(run.seed))
             test = self._held_out[0]
             scores["effect_rmse"] = None if test is None else effect_rmse(found, table, test)
+        if table is not None and found.targets:
+            there = [k for k in np.unique(table.regime) if table.regimes[k].targets]
+            right = [set(found.targets[k]) == set(table.regimes[k].targets) for k in there]
+            scores["targets"] = float(np.mean(right))
+        scores |= _sortable(table, truth)
         return replace(
             run,
             found=found.restricted(truth.names),
@@ -621,4 +642,14 @@ class _Runner:
             experiments=found.experiments,
             bound=found.bound,
             edges=truth.edges if run.seed else None,
+            confounded=truth.confounded if run.seed else None,
         )
+
+
+def _sortable(table: Dataset | None, truth: GroundTruth) -> dict[str, float]:
+    """Return how well variance and R² of the rows tell the order, where that is defined."""
+    rows = None if table is None else table.observational
+    if rows is None or len(rows) <= len(truth.names) or not set(truth.names) <= set(rows.names):
+        return {}
+    known = sortability(rows.select(truth.names), truth.edges)
+    return {f"{k}_sortability": v for k, v in known.items() if math.isfinite(v)}

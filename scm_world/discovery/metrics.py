@@ -10,6 +10,7 @@ import numpy as np
 
 from scm_world._types import Floats, Integers
 from scm_world.discovery.data.dataset import Dataset
+from scm_world.discovery.data.truth import GroundTruth
 from scm_world.discovery.distances import (
     MEMBERS,
     Adjustment,
@@ -21,7 +22,8 @@ from scm_world.discovery.distances import (
 )
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import ModelError, UnknownVariable, raise_all
-from scm_world.graph.equivalence import Bools, extension, is_acyclic, topological_order
+from scm_world.graph.ancestral import HEAD, TAIL
+from scm_world.graph.equivalence import Bools, extension, is_acyclic, meets, topological_order
 from scm_world.queries.experiments.effects import EdgeKey
 
 
@@ -214,6 +216,89 @@ def evaluate(
         pairs=int(counts.sum()),
         **_within_an_instant(kept.edges, true, counts),
     )
+
+
+@final
+@dataclass(frozen=True)
+class MarkScores:
+    """How well a graph with edge marks agrees with the true ancestral graphs.
+
+    What an estimate says is compared with the maximal ancestral graph (is it true?), and what it
+    could say with the partial one (is it found?). Marks at the later end of edges through time are
+    heads by the order of time, and do not count.
+
+    Attributes:
+        adjacency_precision: Pairs joined in the estimate that no set of variables separates, as a
+            fraction; 1 if it joins none.
+        adjacency_recall: Such pairs that the estimate joins; None if there is none.
+        adjacency_f1: Harmonic mean of the two; None if one of them is.
+        head_precision: Estimated heads that are heads, as a fraction; 1 if there are none.
+        head_recall: Heads of the partial ancestral graph that were estimated; None if it has none.
+        head_f1: Harmonic mean of the two; None if one of them is.
+        tail_precision: As of heads.
+        tail_recall: As of heads.
+        tail_f1: As of heads.
+        pag_distance: Pairs that are joined otherwise than in the partial ancestral graph: not at
+            all, wrongly, or with another mark.
+    """
+
+    adjacency_precision: float
+    adjacency_recall: float | None
+    adjacency_f1: float | None
+    head_precision: float
+    head_recall: float | None
+    head_f1: float | None
+    tail_precision: float
+    tail_recall: float | None
+    tail_f1: float | None
+    pag_distance: int
+
+
+def evaluate_marks(found: EstimatedGraph, truth: GroundTruth) -> MarkScores:
+    """Compare the edge marks of an estimate with the ancestral graphs of a truth.
+
+    Args:
+        found: Of any learner. Without marks, an edge without direction is o-o and others are -->.
+        truth: Whose variables are compared; pairs that are not scored are left out. What was
+            before the longest lag of an estimate through time is hidden.
+
+    Raises:
+        ModelError: The true graph has a cycle within the instant.
+
+    Source:
+        Colombo, Maathuis, Kalisch and Richardson, *Learning high-dimensional directed acyclic
+        graphs with latent and selection variables*, Annals of Statistics 2012, section 4, on
+        comparing edges and marks apart.
+
+    Example:
+        >>> truth = GroundTruth(name="m", names=("x", "y", "z"),
+        ...                     edges=(("x", "z", 0), ("y", "z", 0)))
+        >>> found = EstimatedGraph.of_marks(truth.names, [[0, 0, 2], [0, 0, 1], [1, 1, 0]])
+        >>> scores = evaluate_marks(found, truth)
+        >>> scores.adjacency_f1, scores.head_precision, scores.head_recall, scores.pag_distance
+        (1.0, 0.6666666666666666, 1.0, 1)
+    """
+    made = found.restricted(truth.names).ancestral
+    lags = len(made) - 1 or None
+    real, known = truth.mag(lags), truth.pag(lags)
+    made = np.concatenate([made, np.zeros_like(real)[len(made) :]])
+    made, real, known = (np.where(truth.pairs, each, 0) for each in (made, real, known))
+    once = np.ones(real.shape, dtype=bool)  # a pair within the instant counts once
+    once[0] = np.triu(once[0])
+    rates: dict[str, Any] = {}
+    for name, said, true, learnable in (
+        ("adjacency", (made != 0) & once, real != 0, (known != 0) & once),
+        *((k, made == m, real == m, known == m) for k, m in (("head", HEAD), ("tail", TAIL))),
+    ):
+        precision = float((said & true).sum() / said.sum()) if said.any() else 1.0
+        recall = float((said & learnable).sum() / learnable.sum()) if learnable.any() else None
+        both = precision + (recall or 0.0)
+        f1 = 2 * precision * (recall or 0.0) / both if both else 0.0
+        rates |= {f"{name}_precision": precision, f"{name}_recall": recall}
+        rates[f"{name}_f1"] = None if recall is None else f1
+    other = made != known
+    other[0] |= other[0].T
+    return MarkScores(**rates, pag_distance=int((other & once).sum()))
 
 
 def matrices(edges: Iterable[EdgeKey], names: tuple[str, ...], lags: int) -> Bools:
@@ -463,7 +548,9 @@ def sortability(data: Dataset, edges: Iterable[EdgeKey]) -> dict[str, float]:
         grows = 0.5 * (1.0 + np.sign(order[None, :] - order[:, None]))
         paths, count, right = step, 0.0, 0.0
         for _ in range(len(at) - 1):
+            if not paths.any():
+                break
             count, right = count + paths.sum(), right + (paths * grows).sum()
-            paths = (paths.astype(np.int64) @ step) > 0
+            paths = meets(paths, step)
         found[name] = float(right / count) if count else float("nan")
     return found

@@ -6,7 +6,7 @@ import hashlib
 import inspect
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, final, runtime_checkable
@@ -15,6 +15,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world import queries
 from scm_world._types import Floats, Value
 from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
 from scm_world.discovery.data.recorded import first_name, settable
@@ -22,6 +23,7 @@ from scm_world.discovery.data.truth import GroundTruth as GroundTruth
 from scm_world.discovery.data.truth import (
     observed_part,
     truth_of_episodes,
+    truth_of_model,
     truth_of_steps,
 )
 from scm_world.discovery.learners.simulators import (
@@ -295,18 +297,30 @@ class Problem(Protocol):
 
 @final
 class SCMProblem:
-    """A causal model without physics. The budget counts rows."""
+    """A causal model without physics. The budget counts rows.
+
+    Args:
+        name: To show.
+        scm: The model.
+        hidden: Variables that are in no table and are never set.
+    """
 
     EPISODE = 10  # control steps of an episode of a model with lags
 
-    def __init__(self, name: str, scm: SCM) -> None:
-        self._scm = scm
+    def __init__(self, name: str, scm: SCM, hidden: Sequence[str] = ()) -> None:
+        self._scm, self._hidden = scm, tuple(hidden)
         self._steps = self.EPISODE if any(edge.lag for edge in scm.edges) else None
-        edges = tuple(edge.key for edge in scm.edges)
-        about = {"kind": "model", "budget": "rows"}
-        self.truth = GroundTruth(name=name, names=tuple(scm), edges=edges, about=about)
-        self.version = hashlib.sha256(to_json(scm).encode()).hexdigest()[:16]
+        names, edges = tuple(n for n in scm if n not in hidden), tuple(e.key for e in scm.edges)
+        about: dict[str, Any] = {"kind": "model", "budget": "rows"}
+        self.truth = GroundTruth(name=name, names=names, edges=edges, about=about)
+        if hidden:
+            about["hidden"] = len(hidden)
+            projected = observed_part(name, truth_of_model(scm), names)
+            self.truth = replace(projected, weights={}, about=about)
+        text = to_json(scm) + "".join(hidden)
+        self.version = hashlib.sha256(text.encode()).hexdigest()[:16]
         values = {v.name: _values_of(v) for v in scm.variables if v.settable}
+        values = {name: act for name, act in values.items() if name in names}
         self._values = {name: act for name, act in values.items() if act is not None}
 
     def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
@@ -319,17 +333,26 @@ class SCMProblem:
         design = Design("single", tuple(self._values), self._values, observed) if acts else Design()
         episodes = budget if self._steps is None else -(-budget // self._steps)
         steps: Any = {} if self._steps is None else {"steps": self._steps}
-        return collect(self._scm, design, episodes, seed=seed, **steps, **options)
+        whole = collect(self._scm, design, episodes, seed=seed, **steps, **options)
+        return whole.hide(self._hidden) if self._hidden else whole
 
     def held_out(self, seed: int) -> Dataset | None:
         """Set each variable in turn to 2, which no learner is given; None if one cannot be 2."""
         if self._steps is not None or any(act != DONE for act in self._values.values()):
             return None
         design = Design("single", tuple(self._values), 2.0, 0.0)
-        return collect(self._scm, design, 200 * len(self._values), seed=seed + 1_000_000)
+        whole = collect(self._scm, design, 200 * len(self._values), seed=seed + 1_000_000)
+        return whole.hide(self._hidden) if self._hidden else whole
 
     def simulator(self, seed: int) -> PairedSimulator:
-        """Return paired experiments on the mechanisms."""
+        """Return paired experiments on the mechanisms.
+
+        Raises:
+            ModelError: Variables are hidden: the experiments would read and set them.
+        """
+        if self._hidden:
+            what = f"{self.truth.name} hides variables, which paired experiments would set"
+            raise ModelError([f"{what}; take data='observational' or 'interventional'"])
         return SCMSimulator(self._scm, seed)
 
     def close(self) -> None:
@@ -590,10 +613,10 @@ def problem(name: str | SCM, *, seed: int = 0, view: TaskView | None = None) -> 
     """Return a benchmark problem.
 
     Args:
-        name: A model, or the name of a problem: a family with a size (``"er2:20"``, or
-            ``"servo:10"`` for one of physics), a task, the file of a model (.xml, .urdf), the JSON
-            file of an ``SCM``, or ``"module:function"`` for a function that gives a task, a world,
-            an ``SCM`` or a ``Problem``.
+        name: A model, or the name of a problem: a family with a size (``"er2:20"``; with three
+            hidden variables besides ``"er2:20:3"``; ``"servo:10"`` for one of physics), a task, the
+            file of a model (.xml, .urdf), the JSON file of an ``SCM``, or ``"module:function"`` for
+            a function that gives a task, a world, an ``SCM`` or a ``Problem``.
         seed: Which model of the family.
         view: Of a task or a world.
 
@@ -609,28 +632,51 @@ def problem(name: str | SCM, *, seed: int = 0, view: TaskView | None = None) -> 
     if isinstance(name, SCM):
         return SCMProblem(problem_label(name, view), name)
     if name.partition(":")[0] in FAMILIES:
-        return SCMProblem(name, random_model(name, seed))
+        seen, _, unseen = name.partition(":")[2].partition(":")
+        if not unseen:
+            return SCMProblem(name, random_model(name, seed))
+        return _partly_hidden(name, seed, seen, unseen)
     if name.partition(":")[0] in PHYSICS:
         family, n, hidden = numbers_of(name)
         if family == "servo":
             return ServoProblem(name, servo(n, seed, hidden), view.options)
         return WorldProblem(name, replace(view, view="step"), Springs(n, seed))
     if name.endswith(".json"):
-        try:
-            return SCMProblem(Path(name).stem, from_json(read_text(Path(name))))
-        except (OSError, ValueError) as error:
-            advice = "give a file that scm_world.graph.to_json wrote"
-            raise UnreadableFile(name, " ".join(str(error).split()), advice) from None
+        return SCMProblem(Path(name).stem, model_of_file(name))
     if ":" in name:
         made = load_factory(name)(**view.arguments)
         if isinstance(made, SCM | Problem):
-            return SCMProblem(name, made) if isinstance(made, SCM) else made
+            return SCMProblem(problem_label(name, view), made) if isinstance(made, SCM) else made
     elif name not in TASKS and not name.endswith(FILES):
         families = (f"{family}:N" for family in (*FAMILIES, *PHYSICS))
         raise UnknownOption(
             "problem", name, (*TASKS, *families, "FILE.json", "FILE.xml", "FILE.urdf")
         )
     return WorldProblem(name, view)
+
+
+def model_of_file(path: str) -> queries.SCM:
+    """Read a causal model that ``to_json`` wrote.
+
+    Raises:
+        UnreadableFile: The file does not exist, or holds no model.
+    """
+    try:
+        return queries.SCM(from_json(read_text(Path(path))))
+    except (OSError, ValueError) as error:
+        advice = "give a file that scm_world.graph.to_json wrote"
+        raise UnreadableFile(path, " ".join(str(error).split()), advice) from None
+
+
+def _partly_hidden(name: str, seed: int, seen: str, hidden: str) -> SCMProblem:
+    """Draw a model of N + K variables, of which the K that act on most others are hidden."""
+    family = name.partition(":")[0]
+    if not (seen.isdecimal() and hidden.isdecimal() and 1 <= int(hidden) <= int(seen)):
+        shown = (f"{family}:N:K with N variables and 1 to N hidden ones besides",)
+        raise UnknownOption("family of models", name, shown)
+    model = random_model(f"{family}:{int(seen) + int(hidden)}", seed)
+    ranked = sorted(model, key=lambda n: (-len(model.children(n)), n))
+    return SCMProblem(name, model, ranked[: int(hidden)])
 
 
 def problem_label(name: str | SCM, view: TaskView) -> str:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, in_one_line
+from scm_world.graph import SCM
 from scm_world.tasks.model import is_model
 
 OWN_TASKS = ("scm_world.tasks.model:ModelTask",)
@@ -19,7 +20,7 @@ OWN_TASKS = ("scm_world.tasks.model:ModelTask",)
 
 
 def load_factory(reference: str) -> Callable[..., Any]:
-    """Import a function.
+    """Import a function; of a causal model, one that returns it.
 
     Args:
         reference: ``"package.module:name"``, looked up in the present folder too, or
@@ -55,11 +56,14 @@ def load_factory(reference: str) -> Callable[..., Any]:
         finally:
             if added and here in sys.path:
                 sys.path.remove(here)
-    found: Callable[..., Any] | None = getattr(module, name, None)
+    found: Any = getattr(module, name, None)
+    if isinstance(found, SCM):
+        return lambda: found
     if not callable(found):
         offered = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
         raise UnknownOption(f"function in {home}", name, offered)
-    return found
+    made: Callable[..., Any] = found
+    return made
 
 
 def refuse_untrusted(task: str, trusted: Sequence[str] | None) -> None:

@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 import scm_world as sw
 from scm_world.cli import app
 from scm_world.discovery.data import Design, collect, load
-from scm_world.graph import from_json
+from scm_world.graph import from_json, to_json
 from scm_world.queries import load_episode
 from scm_world.variables import Box, Normal
 
@@ -186,3 +186,58 @@ def test_a_sweep_has_the_same_units_at_every_point(file: str) -> None:
     done = call("sweep", f"{file}:chain", "--over", "x=0", "--preset", "fast", "--out", "no")
     assert done.exit_code == 2, done.output
     assert "--preset cannot be 'fast'" in " ".join(done.output.split())
+
+
+@pytest.mark.parametrize("name", ["model.json", "models.py:MODEL"])
+def test_files_and_objects_of_equations_are_systems(file: str, name: str) -> None:
+    """A JSON file and an SCM object of a module: without and with a learner, and in queries."""
+    Path(file).write_text(f"{FILE}\n\nMODEL = chain(3.0)\n")
+    model = sw.SCM(
+        [
+            sw.Exogenous(name="x", distribution=Normal(), a=Box(0.0, 1.0)),
+            sw.Derived(
+                name="y", parents=("x",), mechanism=sw.Linear(weights=(3.0,)), noise=Normal()
+            ),
+        ]
+    )
+    Path("model.json").write_text(to_json(model))
+    for number, words in enumerate(
+        (
+            ("graph", name),
+            ("variables", name),
+            ("effect", name, "y", "x=1", "--versus", "x=0", "-n", "5"),
+            ("verify", name, "--probes", "4"),
+            ("collect", name, "--n", "6", "--target", "x"),
+            ("discover", name, "--learner", "do_order", "--no-baselines", "--budget", "30,40",
+             "--seeds", "1"),
+        )
+    ):  # fmt: skip
+        out = () if number < 2 else ("--out", f"out{number}")
+        result = call(*words, *out)
+        assert result.exit_code == 0, (words, result.output)
+    effect = json.loads(Path("out2", "effect.json").read_text())
+    assert effect["mean"] == pytest.approx(3.0)
+    assert load("out4").truth is not None
+
+
+def test_what_a_learner_said_is_in_the_terminal(file: str) -> None:
+    """A learner that fails: which one, on what, how often, and its own words in one line."""
+    Path("troubled.py").write_text(
+        "def learn(data, *, seed=0):\n    raise ValueError('no luck with\\nthese rows')\n"
+    )
+    words = ("--no-baselines", "--budget", "20,30", "--seeds", "1", "--out", "out")
+    result = call("discover", f"{file}:chain", "--learner", "troubled:learn", *words)
+    assert result.exit_code == 0, result.output
+    said = " ".join(result.output.split())
+    assert "troubled:learn on models:chain, not done in 3 run(s)" in said
+    assert "ValueError: no luck with these rows" in said
+
+
+def test_a_file_without_a_model_is_refused(file: str) -> None:
+    """One line with what to do; a JSON file has no arguments."""
+    Path("other.json").write_text("{}")
+    for name in ("other.json", "nowhere.json"):
+        result = call("graph", name)
+        assert result.exit_code == 2
+        assert "to_json" in result.output
+    assert "no arguments" in call("graph", "other.json", "--option", "a=1").output

@@ -12,10 +12,11 @@ import pytest
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.learners import EstimatedGraph, learn, libraries
 from scm_world.discovery.learners.known import OTHERS
+from scm_world.discovery.problems import problem
 from scm_world.errors import ModelError
 
-MODULES = {"causal-learn": "causallearn", "gies": "gies", "tigramite": "tigramite"}
-NEEDS = {each.name: MODULES[each.package] for each in OTHERS}
+MODULES = {"causal-learn": "causallearn"}
+NEEDS = {each.name: MODULES.get(each.package, each.package) for each in OTHERS}
 STATIC = ["pc", "ges", "boss", "grasp", "gies"]
 COLLIDER = {("a", "c", 0), ("b", "c", 0), ("c", "d", 0)}
 
@@ -81,6 +82,13 @@ def told(found: EstimatedGraph, *words: str) -> bool:
     return any(all(word in note for word in words) for note in found.notes)
 
 
+def pairs(hidden: bool, n: int = 4000) -> Dataset:
+    """Draw x → a, y → b and a common cause of a and b, which is no column if it is hidden."""
+    x, y, h, one, two = np.random.default_rng(3).normal(size=(5, n))
+    columns = [x, x + h + one, y + h + two, y] + [h] * (not hidden)
+    return Dataset.of(np.stack(columns, axis=1), list("xaby") + ["h"] * (not hidden))
+
+
 # --- what they find ----------------------------------------------------------------------------
 
 
@@ -123,6 +131,69 @@ def test_a_shared_intercept_uses_means() -> None:
     data = Dataset.of(np.stack([x, y], axis=1), ["x", "y"], targets=targets)
     assert not learn("gies", data).edges.any()
     assert learn("gies_shared", data).directed == (("x", "y", 0),)
+
+
+def test_a_hidden_cause_is_two_heads() -> None:
+    """FCI tells a <-> b from edges; with the cause in the table there is none. Marks are kept."""
+    pytest.importorskip("causallearn")
+    found = learn("fci", pairs(hidden=True), alpha=0.001)
+    assert found.words == ("x o-> a", "a <-> b", "b <-o y")
+    assert (found.directed, found.undirected) == ((("x", "a", 0), ("y", "b", 0)), ())
+    assert EstimatedGraph.from_dict(found.as_dict()).words == found.words
+    assert learn("fci", pairs(hidden=False), alpha=0.001).words == (
+        "x o-> a", "a <-o h", "b <-o y", "b <-o h"
+    )  # fmt: skip
+
+
+def test_a_hidden_series_is_two_heads() -> None:
+    """LPCMCI tells a series that moves two others; the later ends of lagged edges are heads."""
+    pytest.importorskip("tigramite")
+    draw = np.random.default_rng(1).normal(size=(5, 1500))
+    rows = np.zeros((1500, 4))
+    hidden = np.zeros(1500)
+    for t in range(1, 1500):
+        hidden[t] = 0.3 * hidden[t - 1] + draw[0, t]
+        rows[t] = 0.6 * rows[t - 1] + draw[1:, t]
+        rows[t, 1:3] += hidden[t]
+        rows[t, 1] += 0.7 * rows[t - 1, 0]
+        rows[t, 2] += 0.7 * rows[t - 1, 3]
+    data = Dataset.of(rows, list("xaby"), episode=[0] * 1500, step=range(1500))
+    found = learn("lpcmci", data, alpha=0.001)
+    assert "a <-> b" in found.words
+    assert {"x@-1 o-> a", "y@-1 o-> b"} <= set(found.words)
+    assert found.marks is not None
+    assert found.marks.shape == (2, 4, 4)
+    assert ("a", "b", 0) not in learn("lpcmci", data).directed
+
+
+def test_a_hidden_circumstance_is_told() -> None:
+    """J-PCMCI+ conditions on what differs between episodes, and names what it acts on."""
+    pytest.importorskip("tigramite")
+    data = series(episodes=15)
+    hidden = data.hide(["k"])
+    found = learn("j-pcmci+", hidden)
+    assert told(found, "in no column acts on y", "between episodes")
+    assert ("x", "y", 1) in found.directed
+    assert ("k", "y", 1) in learn("j-pcmci+", data).directed
+    with pytest.raises(ModelError, match="two or more"):
+        learn("j-pcmci+", hidden.rows(hidden.episode == 0))
+
+
+def test_unknown_targets_are_found() -> None:
+    """PermScore finds the graph and what was set, of which it is told nothing."""
+    pytest.importorskip("permscore")
+    made = problem("er2:6", seed=1)
+    table = made.data("interventional", 600, 0)
+    found = learn("permscore", table)
+    assert set(found.directed) == set(made.truth.edges)
+    assert found.targets == tuple(regime.targets for regime in table.regimes)
+    assert EstimatedGraph.from_dict(found.as_dict()).targets == found.targets
+    wrong = tuple(replace(r, targets=("x0",) * bool(r.targets)) for r in table.regimes)
+    blind = learn("permscore", replace(table, regimes=wrong))
+    assert (blind.targets, blind.words) == (found.targets, found.words)
+    assert (blind.edge_scores == found.edge_scores).all()
+    with pytest.raises(ModelError, match="at least one other regime"):
+        learn("permscore", table.observational)
 
 
 def test_surer_edges_explain_more() -> None:
@@ -214,11 +285,28 @@ def test_links(words: str, expected: str) -> None:
 # --- awkward data --------------------------------------------------------------------------------
 
 
+def test_marks_of_vectors_and_of_the_past() -> None:
+    """Columns of a variable have one mark at each end, a circle where theirs differ."""
+    pytest.importorskip("causallearn")
+    data = series(episodes=40, steps=30)
+    found = learn("fci", data.select(["x", "y", "z", "w"]))
+    assert found.marks is not None
+    assert found.marks.shape == (2, 4, 4)
+    assert any(word.startswith("x@-1") and word.endswith("> y") for word in found.words)
+    table = pairs(hidden=True)
+    both = tuple(
+        replace(column, name=f"v[{i}]", variable="v", component=i)
+        for i, column in enumerate(table.columns[1:3])
+    )
+    vector = replace(table, columns=(table.columns[0], *both, table.columns[3]))
+    assert learn("fci", vector, alpha=0.001).words == ("x o-> v", "v <-o y")
+
+
 @pytest.mark.parametrize("name", NEEDS)
 def test_the_same_seed_gives_the_same(name: str) -> None:
     """Results are bit-equal, and the global generators of the caller are not touched."""
     pytest.importorskip(NEEDS[name])
-    data = series(10)
+    data = chains(None, "x", "y") if name == "permscore" else series(10)
     before = random.getstate(), np.random.get_state()[1].tolist()  # noqa: NPY002 # must not change
     found = [learn(name, data, seed=5) for _ in range(2)]
     assert found[0].edges.tobytes() == found[1].edges.tobytes()
@@ -249,7 +337,7 @@ def test_columns_that_cannot_be_used(static: str) -> None:
     assert told(found, "other columns determine", "copy", "sum")
 
 
-@pytest.mark.parametrize("name", NEEDS)
+@pytest.mark.parametrize("name", sorted(NEEDS.keys() - {"permscore", "j-pcmci+"}))
 def test_nothing_varies(name: str) -> None:
     """A table of constants has no edges, and neither has one with a single column."""
     pytest.importorskip(NEEDS[name])
@@ -281,12 +369,12 @@ def test_units_do_not_matter(static: str) -> None:
     np.testing.assert_array_equal(found[0].edges, found[1].edges)
 
 
-@pytest.mark.parametrize("name", ["pc", "ges", "boss", "grasp", "pcmci+"])
+@pytest.mark.parametrize("name", ["pc", "ges", "boss", "grasp", "fci", "pcmci+", "lpcmci"])
 def test_observational_learners_leave_interventions_out(name: str) -> None:
     """They see the rows in which nothing is done, say so, and refuse if there are none."""
     pytest.importorskip(NEEDS[name])
     data = chains(None, "x")
-    if name != "pcmci+":
+    if "pcmci" not in name:
         found = learn(name, data)
         assert told(found, "300 of 600 rows were left out")
         np.testing.assert_array_equal(found.edges, learn(name, data.observational).edges)

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.discovery.data.recorded import first_name, is_state
-from scm_world.errors import ModelError
 from scm_world.graph import SCM
+from scm_world.graph.ancestral import Marks, last_slice, mag, pag, window
+from scm_world.graph.ancestral import edge_words as edge_words
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.identification import nature_graph
 from scm_world.queries.outcomes import Outcome
@@ -66,32 +67,48 @@ class GroundTruth:
                 found[at[cause], at[effect]] = True
         return found
 
-    def pag(self) -> Any:
-        """Give the partial ancestral graph: what can be learned of it without interventions.
+    def mag(self, lags: int | None = None) -> Marks:
+        """Give the maximal ancestral graph: edge marks, without circles.
+
+        Args:
+            lags: How many control steps before the present are observed; the longest lag of the
+                graph if None. All that was before is hidden.
 
         Returns:
-            A ``causallearn.graph.GeneralGraph.GeneralGraph``.
+            Shape (lags + 1, p, p): at [lag, i, j] the mark at i, so many steps before j; see
+            ``scm_world.graph.ancestral``.
 
         Raises:
-            ModelError: Edges have lags.
-            MissingExtra: causal-learn is not installed.
+            ModelError: There is a cycle within the instant.
         """
-        from scm_world._arguments import load
+        return last_slice(*self._window(lags))
 
-        if any(lag for *_, lag in (*self.edges, *self.confounded)):
-            raise ModelError(["a partial ancestral graph has no lags"])
-        dags = load("causallearn.graph.Dag", "causal-learn")
-        nodes = load("causallearn.graph.GraphNode", "causal-learn")
-        converted = load("causallearn.utils.DAG2PAG", "causal-learn")
-        hidden = [f"hidden {number}" for number in range(len(self.confounded))]
-        made = {name: nodes.GraphNode(name) for name in (*self.names, *hidden)}
-        dag = dags.Dag([*made.values()])
-        for cause, effect, _ in self.edges:
-            dag.add_directed_edge(made[cause], made[effect])
-        for name, (one, other, _) in zip(hidden, self.confounded, strict=True):
-            dag.add_directed_edge(made[name], made[one])
-            dag.add_directed_edge(made[name], made[other])
-        return converted.dag2pag(dag, [made[name] for name in hidden])
+    def pag(self, lags: int | None = None) -> Marks:
+        """Give the partial ancestral graph: the marks that can be learned without interventions.
+
+        The order of control steps is taken for known. Arguments and result are those of ``mag``.
+
+        Example:
+            >>> truth = GroundTruth(name="m", names=("x", "y"), edges=(("x", "y", 0),))
+            >>> edge_words(truth.names, truth.mag()), edge_words(truth.names, truth.pag())
+            (('x --> y',), ('x o-o y',))
+        """
+        marks, lags = self._window(lags)
+        tiers = np.repeat(np.arange(lags + 1), len(self.names)).tolist()
+        return last_slice(pag(marks, tiers), lags)
+
+    def _window(self, lags: int | None) -> tuple[Marks, int]:
+        """Return the maximal ancestral graph of a window through time, and its lags."""
+        at = {name: i for i, name in enumerate(self.names)}
+        most = max((lag for *_, lag in (*self.edges, *self.confounded)), default=0)
+        edges = np.zeros((most + 1, len(at), len(at)), dtype=bool)
+        shared = np.zeros_like(edges)
+        for matrix, pairs in ((edges, self.edges), (shared, self.confounded)):
+            for one, other, lag in pairs:
+                matrix[lag, at[one], at[other]] = True
+        shared[0] |= shared[0].T
+        lags = most if lags is None else lags
+        return mag(*window(edges, shared, lags)), lags
 
 
 def truth_of_model(model: SCM) -> dict[str, Any]:
@@ -112,7 +129,12 @@ def truth_of_model(model: SCM) -> dict[str, Any]:
         if (isinstance(v, Derived) and v.noise is not None)
         or (isinstance(v, Exogenous) and v.distribution is not None)
     ]
-    return {"edges": edges, "noisy": noisy}
+    held = [
+        v.name
+        for v in model.variables
+        if model.is_temporal and isinstance(v, Exogenous) and v.per == "episode"
+    ]
+    return {"edges": edges, "noisy": noisy, "held": held}
 
 
 def truth_of_steps(model: SCM, names: Iterable[str], bundles: Mapping[str, Any]) -> dict[str, Any]:
@@ -128,7 +150,9 @@ def truth_of_steps(model: SCM, names: Iterable[str], bundles: Mapping[str, Any])
     found = (edge.key for edge in model.edges)
     named = ((whole.get(c, c), whole.get(e, e), lag) for c, e, lag in found)
     edges = dict.fromkeys((c, e, lag) for c, e, lag in named if {c, e} <= known and (lag or c != e))
-    return {"edges": [[*edge, None] for edge in edges], "noisy": sorted(known)}
+    held = [v.name for v in model.variables if v.name in known and v.role == "parameter"]
+    written = [[*edge, None] for edge in edges]
+    return {"edges": written, "noisy": sorted(known), "held": held}
 
 
 def truth_of_episodes(
@@ -190,7 +214,8 @@ def observed_part(name: str, written: Mapping[str, Any], names: Sequence[str]) -
     """Project a graph on the variables that are in a table (a latent projection).
 
     A cause acts through hidden variables as if directly. A hidden variable with noise confounds all
-    pairs that it reaches through hidden ones only.
+    pairs that it reaches through hidden ones only; one that keeps its value over an episode does so
+    across control steps, a variable with itself among them.
 
     Args:
         name: Of the system.
@@ -203,6 +228,9 @@ def observed_part(name: str, written: Mapping[str, Any], names: Sequence[str]) -
     known, after = set(names), dict[str, list[tuple[str, int]]]()
     for cause, effect, lag, _ in written["edges"]:
         after.setdefault(cause, []).append((effect, lag))
+    for name in written.get("held", ()):
+        if name not in known:
+            after.setdefault(name, []).append((name, 1))
 
     def reached(start: str) -> list[tuple[str, int]]:
         found: dict[tuple[str, int], None] = {}
@@ -226,9 +254,8 @@ def observed_part(name: str, written: Mapping[str, Any], names: Sequence[str]) -
         children = reached(source)
         for i, (one, early) in enumerate(children):
             for other, late in children[i + 1 :]:
-                if one != other:
-                    first, second = sorted([(early, one), (late, other)])
-                    confounded[first[1], second[1], second[0] - first[0]] = None
+                first, second = sorted([(early, one), (late, other)])
+                confounded[first[1], second[1], second[0] - first[0]] = None
     weights = {
         (cause, effect, lag): float(weight)
         for cause, effect, lag, weight in written["edges"]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.errors import ModelError
+from scm_world.graph.ancestral import CIRCLE, HEAD, TAIL, Marks, edge_words
 from scm_world.queries.experiments.effects import EdgeKey
 
 FORMAT = "scm_world/found/2"
@@ -34,6 +35,11 @@ class EstimatedGraph:
         seconds: How long it took.
         versions: Of the libraries that it is made of.
         notes: What one should know about the result.
+        marks: Shape (lags + 1, p, p), of a learner that allows for hidden causes: at [lag, i, j]
+            the mark at i of the edge from so many control steps before j; see
+            ``scm_world.graph.ancestral``. Then ``edges`` says where i may act on j: no head at i.
+        targets: Of a learner that is not told what was set: for each regime of the table the
+            variables that were, as it estimates; empty otherwise.
     """
 
     names: tuple[str, ...]
@@ -46,6 +52,8 @@ class EstimatedGraph:
     seconds: float = 0.0
     versions: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    marks: Marks | None = None
+    targets: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self) -> None:
         """Check the shapes."""
@@ -53,6 +61,9 @@ class EstimatedGraph:
         if self.edges.shape != self.edge_scores.shape or self.edges.shape[1:] != (p, p):
             shapes = f"{self.edges.shape} and {self.edge_scores.shape}"
             raise ModelError([f"edges and edge_scores have shapes {shapes}, of {p} variables"])
+        if self.marks is not None and self.marks.shape != self.edges.shape:
+            shapes = f"{self.edges.shape} and {self.marks.shape}"
+            raise ModelError([f"edges and marks have shapes {shapes}; they must have one"])
 
     @classmethod
     def of(
@@ -118,6 +129,44 @@ class EstimatedGraph:
             matrix[lag, at[cause], at[effect]] = 1.0
         return cls.of(names, matrix, **others)
 
+    @classmethod
+    def of_marks(cls, names: Sequence[str], marks: Any, **others: Any) -> EstimatedGraph:
+        """Make one from edge marks, shape (p, p) or (lags + 1, p, p).
+
+        Raises:
+            ModelError: A number is no mark, or an edge has a mark at one end only.
+
+        Example:
+            >>> found = EstimatedGraph.of_marks(["x", "y", "z"], [[0, 2, 0], [1, 0, 1], [0, 1, 0]])
+            >>> found.words, found.directed
+            (('x o-> y', 'y <-> z'), (('x', 'y', 0),))
+        """
+        given = np.array(marks, dtype=np.int8)
+        given = given[None] if given.ndim == 2 else given
+        if not np.isin(given, (0, HEAD, TAIL, CIRCLE)).all():
+            raise ModelError([f"marks are {HEAD}, {TAIL}, {CIRCLE}, and 0 where is no edge"])
+        if ((given[0] == 0) != (given[0].T == 0)).any() or given[0].diagonal().any():
+            raise ModelError(["an edge within an instant has a mark at both ends, and no loops"])
+        others.setdefault("edge_scores", (given != 0).astype(np.float64))
+        scores = others.pop("edge_scores")
+        found = cls.of(names, (given != 0) & (given != HEAD), edge_scores=scores, **others)
+        return replace(found, marks=given)
+
+    @property
+    def ancestral(self) -> Marks:
+        """Its edge marks; without, an edge without direction is o-o, and others are -->."""
+        if self.marks is not None:
+            return self.marks
+        marks = np.where(self.edges, TAIL, 0).astype(np.int8)
+        marks[0][self.edges[0].T & ~self.edges[0]] = HEAD
+        marks[0][self.edges[0].T & self.edges[0]] = CIRCLE
+        return marks
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Its edges with their marks, such as ``"x o-> y"`` or ``"x@-1 <-> y"``."""
+        return edge_words(self.names, self.ancestral)
+
     @property
     def directed(self) -> tuple[EdgeKey, ...]:
         """Edges that have a direction: cause, effect, lag."""
@@ -140,11 +189,19 @@ class EstimatedGraph:
         new = [names.index(name) for name in kept]
         old = [at[name] for name in kept]
         shape = (len(self.edges), len(names), len(names))
-        edges, edge_scores = np.zeros(shape, bool), np.zeros(shape)
-        for lag in range(shape[0]):
-            edges[lag][np.ix_(new, new)] = self.edges[lag][np.ix_(old, old)]
-            edge_scores[lag][np.ix_(new, new)] = self.edge_scores[lag][np.ix_(old, old)]
-        return replace(self, names=tuple(names), edges=edges, edge_scores=edge_scores)
+
+        def part(matrix: NDArray[Any]) -> Any:
+            made = np.zeros(shape, matrix.dtype)
+            made[:, np.array(new, int)[:, None], new] = matrix[:, np.array(old, int)[:, None], old]
+            return made
+
+        return replace(
+            self,
+            names=tuple(names),
+            edges=part(self.edges),
+            edge_scores=part(self.edge_scores),
+            marks=None if self.marks is None else part(self.marks),
+        )
 
     # --- files --------------------------------------------------------------------------------
 
@@ -164,6 +221,8 @@ class EstimatedGraph:
             "seconds": self.seconds,
             "versions": self.versions,
             "notes": list(self.notes),
+            **({} if self.marks is None else {"marks": self.marks.tolist()}),
+            **({"targets": [list(names) for names in self.targets]} if self.targets else {}),
         }
 
     @classmethod
@@ -197,6 +256,8 @@ class EstimatedGraph:
                 seconds=float(data["seconds"]),
                 versions=dict(data["versions"]),
                 notes=tuple(data["notes"]),
+                marks=np.array(data["marks"], np.int8) if "marks" in data else None,
+                targets=tuple(tuple(map(str, each)) for each in data.get("targets", ())),
             )
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise ModelError([f"not a graph that a learner found: {error!r}"]) from None

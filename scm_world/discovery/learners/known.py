@@ -38,11 +38,17 @@ OURS = (
 _causal_learn = partial(
     Learner, takes=("observational",), extra="causal-learn", package="causal-learn"
 )
+_tigramite = partial(
+    Learner, takes=("observational",), temporal=True, extra="tigramite", package="tigramite"
+)
 OTHERS = (
     _causal_learn("pc", libraries.pc, doc="tests of partial correlation"),
     _causal_learn("ges", libraries.ges, doc="greedy search over equivalence classes by BIC"),
     _causal_learn("boss", libraries.boss, doc="best order by BIC, moving one column at a time"),
     _causal_learn("grasp", libraries.grasp, doc="sparsest order by BIC, by tucks"),
+    _causal_learn(
+        "fci", libraries.fci, marked=True, doc="tests of partial correlation; causes may be hidden"
+    ),
     Learner(
         "gies", libraries.gies, ("observational", "interventional"), extra="discovery",
         package="gies", doc="greedy search over interventional equivalence classes by BIC",
@@ -53,9 +59,20 @@ OTHERS = (
         doc="gies with one intercept in all regimes: means count",
     ),
     Learner(
-        "pcmci+", libraries.pcmci_plus, ("observational",), temporal=True, extra="tigramite",
-        package="tigramite",
+        "permscore", libraries.permscore, ("interventional",), extra="discovery",
+        package="permscore", doc="best order by BIC, and what was set, without being told",
+    ),
+    _tigramite(
+        "pcmci+", libraries.pcmci_plus,
         doc="tests of partial correlation over time, with edges within the instant",
+    ),
+    _tigramite(
+        "j-pcmci+", libraries.jpcmci_plus,
+        doc="pcmci+ for episodes whose circumstances differ and may be hidden",
+    ),
+    _tigramite(
+        "lpcmci", libraries.lpcmci, marked=True,
+        doc="tests of partial correlation over time; causes may be hidden",
     ),
 )  # fmt: skip
 """Existing baselines behind our call. Without its library a learner names the extra to install."""
@@ -63,6 +80,7 @@ OTHERS = (
 _baseline = partial(Learner, baseline=True)
 BASELINES = (
     _baseline("empty", trivial.empty, doc="baseline: no edge"),
+    _baseline("complete", trivial.complete, marked=True, doc="baseline: all pairs o-o"),
     _baseline("bipartite", trivial.bipartite, doc="baseline: every cause on every outcome"),
     _baseline("roles", trivial.roles, doc="baseline: the same, but colors on nothing"),
     _baseline(

@@ -1,4 +1,4 @@
-"""Learners of other libraries: PC, GES, BOSS and GRaSP, GIES, and PCMCI+.
+"""Learners of other libraries: PC, GES, BOSS, GRaSP, FCI, GIES, PermScore, PCMCI+ and its kin.
 
 None of the libraries is imported before it is used. A setting that is not allowed raises
 ``UnknownOption``, data that cannot be used ``ModelError``.
@@ -12,7 +12,11 @@ Sources:
     algorithm*, UAI 2022). Gamella, Taeb, Heinze-Deml and Bühlmann, *Characterization and greedy
     learning of Gaussian structural causal models under unknown interventions*, 2022, for GIES
     (Hauser and Bühlmann, JMLR 2012). Runge, *Discovering contemporaneous and lagged causal
-    relations in autocorrelated nonlinear time series datasets*, UAI 2020, for PCMCI+.
+    relations in autocorrelated nonlinear time series datasets*, UAI 2020, for PCMCI+. Spirtes,
+    Meek and Richardson, *Causal inference in the presence of latent variables and selection bias*,
+    UAI 1995, for FCI. Gerhardus and Runge, *High-recall causal discovery for autocorrelated time
+    series with latent confounders*, NeurIPS 2020, for LPCMCI. Günther, Ninad and Runge, *Causal
+    discovery for time series from multiple datasets with latent contexts*, UAI 2023, for J-PCMCI+.
 """
 
 from __future__ import annotations
@@ -21,6 +25,7 @@ import random
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
 from importlib import import_module
 from io import StringIO
 from typing import Any
@@ -29,12 +34,13 @@ import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
-from scm_world.discovery.data.dataset import Bools, Dataset
+from scm_world.discovery.data.dataset import Bools, Dataset, Regime
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption
+from scm_world.graph.ancestral import CIRCLE, HEAD, TAIL, Marks
+from scm_world.graph.equivalence import skeleton
 
 BIC = "local_score_BIC_from_cov"
-ARROW = 1  # the end mark of causal-learn
 RIDGE = 1e-9
 """Added to the variances of standardised columns. Some vary only where they are set, and on a
 variance of zero the search of GIES never ends."""
@@ -94,7 +100,7 @@ def pc(
             show_progress=False, max_k=depth,
         )  # fmt: skip
         marks = np.array(result.G.graph)
-        contrary = int(np.sum((marks == ARROW) & (marks.T == ARROW))) // 2
+        contrary = int(np.sum((marks == HEAD) & (marks.T == HEAD))) // 2
         return edges_of_marks(marks), _contradictions(contrary)
 
     return _static("pc", search, data, seed, settings)
@@ -166,6 +172,40 @@ def grasp(data: Dataset, *, seed: int = 0, penalty: float = 2.0, depth: int = 3)
     return _static("grasp", search, data, seed, settings)
 
 
+def fci(
+    data: Dataset,
+    *,
+    seed: int = 0,
+    alpha: float = 0.01,
+    depth: int | None = None,
+    longest: int | None = None,
+) -> EstimatedGraph:
+    """Find a partial ancestral graph by tests of partial correlation: causes may be hidden.
+
+    Args:
+        data: Rows; those in which something is done are left out.
+        seed: Not used: nothing is drawn.
+        alpha: Level of the tests.
+        depth: Most columns that a test conditions on in the first search; None for no limit.
+        longest: Most edges of a discriminating path; None for no limit.
+    """
+    settings = {
+        "alpha": _number("alpha of 'fci'", alpha, below=1.0),
+        "depth": None if depth is None else whole_number("depth of 'fci'", depth, least=0),
+        "longest": None if longest is None else whole_number("longest of 'fci'", longest, least=3),
+    }
+
+    def search(table: Dataset) -> tuple[Any, str]:
+        graph, _ = import_module("causallearn.search.ConstraintBased.FCI").fci(
+            table.values, "fisherz", alpha, -1 if depth is None else depth,
+            -1 if longest is None else longest, background_knowledge=_past_first(table),
+            show_progress=False,
+        )  # fmt: skip
+        return np.array(graph.graph), ""
+
+    return _static("fci", search, data, seed, settings, marked=True)
+
+
 def gies(
     data: Dataset,
     *,
@@ -211,24 +251,73 @@ def gies(
     return _static("gies", search, data, seed, settings, done=True)
 
 
+def permscore(
+    data: Dataset, *, seed: int = 0, restarts: int = 3, margin: float = 1.0, single: bool = True
+) -> EstimatedGraph:
+    """Find a graph, and what was set in each regime, without being told.
+
+    It is told which rows belong to one regime, and in which nothing is done.
+
+    Args:
+        data: Rows under several regimes, one of them without interventions.
+        seed: Of the orders that the search begins with.
+        restarts: Number of these orders.
+        margin: Times the penalty of a target; larger is more careful.
+        single: Whether a regime has at most one target.
+
+    Raises:
+        ModelError: No row is without interventions, or all are.
+    """
+    settings = {
+        "restarts": whole_number("restarts of 'permscore'", restarts, least=1),
+        "margin": _number("margin of 'permscore'", margin),
+        "single": _switch("single of 'permscore'", single),
+    }
+    done = np.array([bool(regime.targets) for regime in data.regimes])
+    kinds = [k for k in np.unique(data.regime).tolist() if done[k]]
+    if not kinds or done[data.regime].all():
+        needed = "rows in which nothing is done, and rows of at least one other regime"
+        raise ModelError([f"'permscore' needs {needed}; there are {len(kinds)} other regimes"])
+    targets: list[tuple[str, ...]] = [()] * len(data.regimes)
+
+    def search(table: Dataset) -> tuple[Bools, str]:
+        groups = [~done[data.regime], *(data.regime == k for k in kinds)]
+        fitted = import_module("permscore").fit(
+            [table.values[rows] for rows in groups],
+            restarts=restarts, margin=margin, assignment=single, seed=seed,
+        )  # fmt: skip
+        for number, kind in enumerate(kinds, 1):
+            targets[kind] = tuple(table.names[i] for i in sorted(fitted.target_sets[number]))
+        return np.array(fitted.graph) != 0, ""
+
+    blind = replace(data, regimes=(Regime(),) * len(data.regimes))
+    found = _static("permscore", search, blind, seed, settings)
+    return replace(found, targets=tuple(targets))
+
+
 def _static(
     learner: str,
-    search: Callable[[Dataset], tuple[Bools, str]],
+    search: Callable[[Dataset], tuple[Any, str]],
     data: Dataset,
     seed: int,
     settings: dict[str, Any],
     *,
     done: bool = False,
+    marked: bool = False,
 ) -> EstimatedGraph:
-    """Estimate a static graph with a library; ``search`` gives edges and a note."""
+    """Estimate a static graph with a library; ``search`` gives edges, or marks, and a note."""
     table, notes = usable(learner, data, done=done)
-    edges, note = np.zeros((len(table.names), len(table.names)), bool), ""
-    if len(edges) > 1:  # some libraries fail where there is nothing to find
+    made, note = np.zeros((len(table.names), len(table.names)), np.int8), ""
+    if len(made) > 1:  # some libraries fail where there is nothing to find
         with _quietly(learner, seed):
-            edges, note = search(table)
-    notes += (note,) * bool(note)
-    gain = likelihood_gain(table, edges)
-    found = EstimatedGraph.of(table.names, edges, edge_scores=gain, notes=notes, settings=settings)
+            made, note = search(table)
+    more: dict[str, Any] = {"notes": notes + (note,) * bool(note), "settings": settings}
+    if marked:
+        gain = likelihood_gain(table, skeleton(made != 0))
+        found = EstimatedGraph.of_marks(table.names, made, edge_scores=gain, **more)
+    else:
+        gain = likelihood_gain(table, made != 0)
+        found = EstimatedGraph.of(table.names, made, edge_scores=gain, **more)
     return found.restricted(data.names)
 
 
@@ -245,7 +334,7 @@ def edges_of_marks(marks: Any) -> Bools:
         [[False, True], [False, False]]
     """
     at = np.array(marks)
-    return np.asarray((at != 0) & ((at != ARROW) | (at.T == ARROW)))
+    return np.asarray((at != 0) & ((at != HEAD) | (at.T == HEAD)))
 
 
 def _contradictions(count: int) -> str:
@@ -338,51 +427,161 @@ def pcmci_plus(
         alpha: Level of the tests.
         tau_max: Longest lag [control steps].
     """
+
+    def search(parts: list[Floats], still: Bools, _: Sequence[str]) -> tuple[Any, str]:
+        pcmci = _tigramite("pcmci", "PCMCI", parts)
+        links = _allowed_links(still, tau_max, "-")
+        return pcmci.run_pcmciplus(link_assumptions=links, tau_max=tau_max, pc_alpha=alpha), ""
+
+    return _over_time("pcmci+", search, data, seed, alpha, tau_max)
+
+
+def lpcmci(
+    data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: int = 1, rounds: int = 1
+) -> EstimatedGraph:
+    """Find a partial ancestral graph over time by tests of partial correlation (LPCMCI).
+
+    Causes may be hidden. Rows and columns that never change are used as in ``pcmci_plus``.
+
+    Args:
+        data: Rows of episodes in time.
+        seed: Not used: nothing is drawn.
+        alpha: Level of the tests.
+        tau_max: Longest lag [control steps].
+        rounds: Preliminary searches, whose ancestors later tests condition on.
+    """
+    whole_number("rounds of 'lpcmci'", rounds, least=0)
+
+    def search(parts: list[Floats], still: Bools, _: Sequence[str]) -> tuple[Any, str]:
+        result = _tigramite("lpcmci", "LPCMCI", parts).run_lpcmci(
+            link_assumptions=_allowed_links(still, tau_max, "o"), tau_max=tau_max, pc_alpha=alpha,
+            n_preliminary_iterations=rounds,
+        )  # fmt: skip
+        return result, ""
+
+    return _over_time("lpcmci", search, data, seed, alpha, tau_max, marked=True, rounds=rounds)
+
+
+def jpcmci_plus(
+    data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: int = 1
+) -> EstimatedGraph:
+    """Find a graph over time from episodes whose circumstances are partly hidden (J-PCMCI+).
+
+    What differs between episodes and is in no column stands behind one further node, which the
+    tests condition on; a note names the columns on which it acts. Columns that never change within
+    an episode are contexts: they act with lag 1 on others, and nothing acts on them.
+
+    Args:
+        data: Rows of several episodes in time.
+        seed: Not used: nothing is drawn.
+        alpha: Level of the tests.
+        tau_max: Longest lag [control steps].
+
+    Raises:
+        ModelError: There are fewer than two episodes, or too few rows.
+    """
+
+    def search(parts: list[Floats], still: Bools, names: Sequence[str]) -> tuple[Any, str]:
+        if len(parts) < 2:
+            raise ModelError(["'j-pcmci+' compares episodes; give two or more of several rows"])
+        p = len(still)
+        kinds = {i: "space_context" if still[i] else "system" for i in range(p)}
+        which = np.eye(len(parts))
+        both = [
+            np.hstack([part, np.tile(which[k], (len(part), 1))]) for k, part in enumerate(parts)
+        ]
+        vectors = {i: [(i, 0)] for i in range(p)} | {p: [(p + k, 0) for k in range(len(parts))]}
+        jpcmci = _tigramite(
+            "jpcmciplus", "JPCMCIplus", both, vectors,
+            node_classification={**kinds, p: "space_dummy"},
+        )  # fmt: skip
+        result = jpcmci.run_jpcmciplus(tau_max=tau_max, pc_alpha=alpha)
+        graph, sure = result["graph"], result["p_matrix"]
+        moved = ", ".join(names[j] for j in np.flatnonzero(graph[p, :p, 0] == "-->").tolist())
+        note = f"what is in no column acts on {moved} and differs between episodes" if moved else ""
+        graph, sure = graph[:p, :p], sure[:p, :p]
+        for matrix in (graph, sure):
+            matrix[still, :, 1] = matrix[still, :, 0]
+        sure[still, :, 0] = sure[:, still, 0] = 1.0
+        graph[still, :, 0] = graph[:, still, 0] = ""
+        return {"graph": graph, "p_matrix": sure}, note
+
+    return _over_time("j-pcmci+", search, data, seed, alpha, tau_max)
+
+
+def _over_time(
+    learner: str,
+    search: Callable[[list[Floats], Bools, Sequence[str]], tuple[Any, str]],
+    data: Dataset,
+    seed: int,
+    alpha: float,
+    tau_max: int,
+    *,
+    marked: bool = False,
+    **more: Any,
+) -> EstimatedGraph:
+    """Estimate a graph over time with tigramite; ``search`` gives its result and a note."""
     settings = {
-        "alpha": _number("alpha of 'pcmci+'", alpha, below=1.0),
-        "tau_max": whole_number("tau_max of 'pcmci+'", tau_max, least=1),
+        "alpha": _number(f"alpha of {learner!r}", alpha, below=1.0),
+        "tau_max": whole_number(f"tau_max of {learner!r}", tau_max, least=1),
+        **more,
     }
-    table, notes = usable("pcmci+", data)
+    table, notes = usable(learner, data)
     p = len(table.names)
-    edges, sure = np.zeros((tau_max + 1, p, p), bool), np.zeros((tau_max + 1, p, p))
+    graph, sure = np.full((p, p, tau_max + 1), ""), np.zeros((tau_max + 1, p, p))
     if p:
         parts = [part for part in runs(table) if len(part) > 2 * tau_max]
         whole, least = sum(len(part) - 2 * tau_max for part in parts), p * (tau_max + 1)
         if whole <= least:
             needed = f"more than {least} rows with {2 * tau_max} rows before them"
             raise ModelError(
-                [f"'pcmci+' needs {needed}, for as many columns and lags; got {whole}"]
+                [f"{learner!r} needs {needed}, for as many columns and lags; got {whole}"]
             )
-        with _quietly("pcmci+", seed):
-            result = _pcmci_plus(parts, alpha, tau_max)
-        edges = edges_of_links(result["graph"])
+        still = np.all([np.ptp(part, axis=0) < STILL for part in parts], axis=0)
+        with _quietly(learner, seed):
+            result, note = search(parts, still, table.names)
+        graph = result["graph"]
         sure = -np.log10(np.clip(np.moveaxis(result["p_matrix"], 2, 0), 1e-300, 1.0))
-        sure[0] = np.where(edges[0].T & ~edges[0], 0.0, sure[0])
-        note = _contradictions(int(np.sum(result["graph"] == "x-x")) // 2)
-        notes += (note,) * bool(note)
+        contrary = _contradictions(sum("x" in word for word in np.ravel(graph[:, :, 0])) // 2)
+        notes += tuple(said for said in (note, contrary) if said)
+    if marked:
+        about: dict[str, Any] = {"notes": notes, "settings": settings}
+        found = EstimatedGraph.of_marks(
+            table.names, marks_of_links(graph), edge_scores=sure, **about
+        )
+        return found.restricted(data.names)
+    edges = edges_of_links(graph)
+    sure[0] = np.where(edges[0].T & ~edges[0], 0.0, sure[0])
     found = EstimatedGraph.of(table.names, edges, edge_scores=sure, notes=notes, settings=settings)
     return found.restricted(data.names)
 
 
-def _pcmci_plus(parts: list[Floats], alpha: float, tau_max: int) -> dict[str, Any]:
+def _tigramite(
+    module: str, name: str, parts: list[Floats], vectors: Any = None, **more: Any
+) -> Any:
+    """Make a search of tigramite on series, by partial correlation."""
     several = len(parts) > 1
     frame = import_module("tigramite.data_processing").DataFrame(
         dict(enumerate(parts)) if several else parts[0],
         analysis_mode="multiple" if several else "single",
+        **({} if vectors is None else {"vector_vars": vectors}),
     )
     test = import_module("tigramite.independence_tests.parcorr").ParCorr()
-    search = import_module("tigramite.pcmci").PCMCI(frame, test, verbosity=0)
-    still = np.all([np.ptp(part, axis=0) < STILL for part in parts], axis=0)
-    links: dict[int, dict[tuple[int, int], str]] = {}  # by effect; cause and negative lag
+    if vectors is not None:
+        test = import_module("tigramite.independence_tests.parcorr_mult").ParCorrMult()
+    make = getattr(import_module(f"tigramite.{module}"), name)
+    return make(dataframe=frame, cond_ind_test=test, verbosity=0, **more)
+
+
+def _allowed_links(still: Bools, tau_max: int, end: str) -> dict[int, dict[tuple[int, int], str]]:
+    """Return what may act on what: by effect; cause and negative lag; ``end`` is its mark."""
+    links: dict[int, dict[tuple[int, int], str]] = {}
     for j, j_still in enumerate(still):
         links[j] = {(i, 0): "o?o" for i in np.flatnonzero(still == j_still).tolist() if i != j}
         for i, i_still in enumerate(still):
             longest = 0 if j_still else 1 if i_still else tau_max
-            links[j].update({(i, -lag): "-?>" for lag in range(1, longest + 1)})
-    result: dict[str, Any] = search.run_pcmciplus(
-        link_assumptions=links, tau_max=tau_max, pc_alpha=alpha
-    )
-    return result
+            links[j].update({(i, -lag): f"{end}?>" for lag in range(1, longest + 1)})
+    return links
 
 
 def runs(data: Dataset) -> list[Floats]:
@@ -400,6 +599,22 @@ def edges_of_links(graph: Any) -> Bools:
     """
     words = np.moveaxis(np.array(graph, dtype=str), 2, 0)
     return np.asarray((words != "") & (~np.char.startswith(words, "<") | (words == "<->")))
+
+
+def marks_of_links(graph: Any) -> Marks:
+    """Read the links of tigramite as edge marks, shape (lags + 1, p, p).
+
+    Args:
+        graph: Shape (p, p, lags + 1): at [i, j, lag] a word such as ``"o->"``, whose first sign is
+            the mark at i. An ``x``, where tests contradict each other, is a circle.
+
+    Example:
+        >>> marks_of_links([[["", "-->"], ["<-o", ""]], [["o->", ""], ["", ""]]]).tolist()
+        [[[0, 1], [2, 0]], [[-1, 0], [0, 0]]]
+    """
+    sign = {"": 0, "<": HEAD, "-": TAIL, "o": CIRCLE, "x": CIRCLE}
+    words = np.moveaxis(np.array(graph, dtype=str), 2, 0)
+    return np.array([sign[word[:1]] for word in words.ravel()], np.int8).reshape(words.shape)
 
 
 # --- data and calls -------------------------------------------------------------------------------

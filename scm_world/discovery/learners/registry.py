@@ -15,6 +15,7 @@ import numpy as np
 from scm_world.discovery.data.dataset import Dataset, Level
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
+from scm_world.graph.ancestral import CIRCLE
 
 Source = Literal["observational", "interventional", "paired"]
 SOURCES: tuple[Source, ...] = ("observational", "interventional", "paired")
@@ -42,6 +43,8 @@ class Learner:
         package: Whose version is recorded, and whose absence is reported.
         doc: In one line.
         baseline: Whether it is a trivial one, to compare others with.
+        marked: Whether it allows for hidden causes: its graphs have edge ``marks``, and are
+            compared with a partial ancestral graph.
     """
 
     name: str
@@ -54,6 +57,7 @@ class Learner:
     package: str = ""
     doc: str = ""
     baseline: bool = False
+    marked: bool = False
 
     @property
     def version(self) -> str | None:
@@ -96,7 +100,8 @@ def baselines() -> tuple[str, ...]:
 
     Example:
         >>> baselines()
-        ('empty', 'bipartite', 'roles', 'all_or_nothing', 'correlation', 'sort_regress')
+        ('empty', 'complete', 'bipartite', 'roles', 'all_or_nothing', 'correlation',
+         'sort_regress')
     """
     return tuple(name for name, known in learners().items() if known.baseline)
 
@@ -232,4 +237,19 @@ def _folded(found: EstimatedGraph, table: Dataset, level: Level) -> EstimatedGra
         np.maximum.at(edge_scores[total, at[row]], at[now], sure[lag, row, now])
     np.fill_diagonal(edges[0], False)
     np.fill_diagonal(edge_scores[0], 0.0)
-    return replace(found, names=names, edges=edges, edge_scores=edge_scores)
+    made = replace(found, names=names, edges=edges, edge_scores=edge_scores, marks=None)
+    if found.marks is None:
+        return made
+    # Edges between the same two variables have one mark at each end: a circle if they differ.
+    seen: dict[tuple[int, int, int], set[int]] = {}
+    for lag, i, j in np.argwhere(found.marks != 0).tolist():
+        steps, one, other = lag + int(lag_of[i] - lag_of[j]), int(at[i]), int(at[j])
+        if lag_of[j] == 0 and steps <= lags and (steps or one != other):
+            seen.setdefault((steps, one, other), set()).add(int(found.marks[lag, i, j]))
+    marks = np.zeros(edges.shape, np.int8)
+    for place, each in seen.items():
+        marks[place] = each.pop() if len(each) == 1 else CIRCLE
+    return replace(
+        EstimatedGraph.of_marks(names, marks, edge_scores=np.where(marks, edge_scores, 0.0)),
+        **{k: getattr(found, k) for k in ("settings", "notes", "experiments", "bound", "versions")},
+    )

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.learners.found import EstimatedGraph
+from scm_world.graph.ancestral import CIRCLE
 
 Bools = NDArray[np.bool_]
 LEVEL = 0.01
@@ -24,6 +25,11 @@ ENTERED = ("exogenous", "action")  # kinds of variables that have no causes in a
 def empty(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
     """Find no edge; use no data."""
     return EstimatedGraph.of(data.names, np.zeros((len(data.names),) * 2))
+
+
+def complete(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
+    """Join every pair by o-o, which says nothing; use no data."""
+    return EstimatedGraph.of_marks(data.names, CIRCLE * (1 - np.eye(len(data.names), dtype=int)))
 
 
 def bipartite(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
