@@ -2,8 +2,9 @@
 
 from importlib.util import find_spec
 
-collect_ignore = (
-    []
-    if find_spec("stable_baselines3")
-    else ["scm_world/training/agents.py", "scm_world/training/sb3.py"]
-)
+NEEDS = {
+    "stable_baselines3": ["scm_world/training/agents.py", "scm_world/training/sb3.py"],
+    "starlette": ["scm_world/studio/server.py"],
+}
+
+collect_ignore = [path for name, paths in NEEDS.items() if not find_spec(name) for path in paths]

@@ -18,6 +18,7 @@ from scm_world.cli.evaluation import evaluate, explain
 from scm_world.cli.inspection import graph, list_, variables
 from scm_world.cli.options import documented
 from scm_world.cli.queries import counterfactual, do, effect
+from scm_world.cli.studio import studio
 from scm_world.cli.training import clone, train
 from scm_world.errors import ScmWorldError
 
@@ -73,7 +74,7 @@ def root(
 
 COMMANDS: tuple[Callable[..., None], ...] = (
     *(discover, verify, graph, variables, do, effect, counterfactual),
-    *(collect, sweep, triplets, evaluate, explain, train, clone, list_),
+    *(collect, sweep, triplets, evaluate, explain, train, clone, studio, list_),
 )
 for _command in COMMANDS:
     app.command(_command.__name__.rstrip("_"), help=documented(_command))(_command)

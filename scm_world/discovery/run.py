@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, final
 
@@ -132,6 +132,7 @@ def discover(
     probes: int = 32,
     seed: int = 0,
     progress: Progress | None = None,
+    found: Callable[[set[EdgeKey]], object] | None = None,
     checkpoint: Location | str | None = None,
     **options: Any,
 ) -> DiscoveryReport:
@@ -146,6 +147,7 @@ def discover(
         probes: How many states to experiment in.
         seed: Of states and values.
         progress: Called with (finished, planned) after each probe state.
+        found: Called before that with all edges found so far: (cause, effect, lag).
         checkpoint: A file to write to after each probe state of a world; the same call resumes
             from there, with the same result. It is removed when all are finished.
         options: Arguments of ``World``, where ``system`` is a name.
@@ -167,11 +169,11 @@ def discover(
     started = time.perf_counter()
     if isinstance(system, SCM):
         series = Series(PairedEquations(system, seed), probes, progress)
-        series.run(range(probes))
+        series.run(range(probes), _shown(system, found))
         return _report(system, series, seed, ("model", "none", "none", ""), started)
     world = Simulation(system, **options) if isinstance(system, str) else system
     try:
-        series = _experiments(world, probes, seed, progress, checkpoint)
+        series = _experiments(world, probes, seed, progress, found, checkpoint)
         backend = world.backend
         about = (world.task.name, backend.name, world.options.preset)
         engine = f"{backend.name} {backend.version}"
@@ -186,14 +188,17 @@ def _experiments(
     probes: int,
     seed: int,
     progress: Progress | None,
+    found: Callable[[set[EdgeKey]], object] | None,
     path: Location | str | None,
 ) -> Series:
     paired = Paired(world, seed)
     saved = None if path is None else Checkpoint(path, _terms(world, seed))
     first = 0 if saved is None else min(saved.read(paired), probes)
     series = Series(paired, probes, progress, done=first)
+    show = _shown(world.model, found)
 
     def written(effects: Effects, done: int) -> bool:
+        show(effects, done)
         if saved is not None:
             saved.write(effects, done, paired)
         return False
@@ -202,6 +207,20 @@ def _experiments(
     if saved is not None and series.done == probes:
         saved.end()
     return series
+
+
+def _shown(
+    model: SCM, found: Callable[[set[EdgeKey]], object] | None
+) -> Callable[[Effects, int], bool]:
+    """Return what passes the edges on that have been found; it ends no series."""
+    declared = {edge.key for edge in model.edges}
+
+    def show(effects: Effects, done: int) -> bool:
+        if found is not None:
+            found(effects.edges(declared))
+        return False
+
+    return show
 
 
 def _terms(world: Simulation, seed: int) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from scm_world.queries.identification import (
     nature_graph,
 )
 from scm_world.queries.laboratory import Laboratory
+from scm_world.queries.live import LiveEpisode
 from scm_world.queries.outcomes import Outcome
 from scm_world.queries.plans import Plan, do
 from scm_world.queries.questions import SCM
@@ -45,6 +46,7 @@ __all__ = [
     "EpisodeDifference",
     "Identification",
     "Laboratory",
+    "LiveEpisode",
     "ObservationalEffect",
     "On",
     "Outcome",

@@ -16,6 +16,7 @@ from scm_world.queries.abduction import Counterfactuals, counterfactuals
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import Equations, System
 from scm_world.queries.estimates import Effect, effect_of
+from scm_world.queries.live import LiveEpisode
 from scm_world.queries.outcomes import Outcome, usual_outcomes
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress, part
@@ -75,6 +76,30 @@ class Questions(ABC):
                 names=as_names(record),
             )
             return Episode(twins, unit, unit.run(world))
+
+    def live(
+        self,
+        policy: Any = None,
+        *,
+        seed: int = 0,
+        episode: int = 0,
+        do: Mapping[str, Any] | None = None,
+    ) -> LiveEpisode:
+        """Begin an episode that is run by hand: ``step``, ``do``, ``split``, ``episode``.
+
+        Args:
+            policy: Acts where ``step`` is given no action; see ``rollout``.
+            seed: Of the noise.
+            episode: Number of the episode within that noise.
+            do: Interventions, with or without a time.
+
+        Raises:
+            InterventionError: An intervention was refused.
+        """
+        plan = self._with(do)
+        made = LiveEpisode(self._asked()[0], Unit(seed, episode, ((0, plan),), policy, 1))
+        made.begin()
+        return made
 
     def see(
         self,

@@ -235,11 +235,16 @@ class Running:
             pairs = (tuple(sorted(c.bodies)) for c in world.backend.contacts() if c.force > 0.0)
             trace.touching.append(frozenset((one, other) for one, other in pairs))
 
-    def act(self, step: int) -> None:
-        """Ask the policy for an action, and take a control step."""
-        action = _chosen(self.policy, self.world)
-        self.world.step(action)
-        self.trace.actions.append(action)
+    def act(self, step: int, action: Any = None) -> None:
+        """Take a control step, with the action of the policy if none is given."""
+        policy = self.policy if action is None else lambda _: action
+        chosen = _chosen(policy, self.world)
+        self.world.step(chosen)
+        self.trace.actions.append(chosen)
+
+    def forget(self) -> None:
+        """Record parameters again at the next instant, since the trace was cut."""
+        self._version = -1
 
 
 @final

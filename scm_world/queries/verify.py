@@ -57,6 +57,7 @@ def verify(
     held_out: int = HELD_OUT,
     seed: int = 0,
     progress: Progress | None = None,
+    found: Callable[[set[EdgeKey]], object] | None = None,
     **options: Any,
 ) -> Verification:
     """Check a declared graph against the physics or the equations that realise it.
@@ -86,6 +87,7 @@ def verify(
         held_out: How many further ones for effects without an edge.
         seed: Of states and values.
         progress: Called with (finished, planned) after each probe state.
+        found: Called before that with all edges observed so far: (cause, effect, lag).
         options: Arguments of ``World``, such as ``backend``, unless ``system`` is one.
 
     Raises:
@@ -103,10 +105,10 @@ def verify(
     if isinstance(system, Simulation | SCM):
         if options:
             raise UnknownOption("option for a world that is made", next(iter(options)), ())
-        return _verified(system, probes, least, held_out, seed, progress)
+        return _verified(system, probes, least, held_out, seed, progress, found)
     world = Simulation(system, **options)
     try:
-        return _verified(world, probes, least, held_out, seed, progress)
+        return _verified(world, probes, least, held_out, seed, progress, found)
     finally:
         world.close()
 
@@ -235,6 +237,7 @@ def _verified(
     held_out: int,
     seed: int,
     progress: Progress | None,
+    found: Callable[[set[EdgeKey]], object] | None,
 ) -> Verification:
     started = time.perf_counter()
     world = system if isinstance(system, Simulation) else None
@@ -243,13 +246,19 @@ def _verified(
     declared = tuple(edge.key for edge in model.edges)
     measured = {v.name for v in model.variables if isinstance(v, Measured)}
     watch = _Watch(declared, least, QUIET if generated else None)
+
+    def watched(effects: Effects, done: int) -> bool:
+        if found is not None:
+            found(effects.edges(set(declared)))
+        return watch(effects, done)
+
     paired: Any = _Experiments(world, seed) if world else PairedEquations(model, seed)
     series = Series(paired, probes, progress)
-    series.run(probe_states(world, probes, seed) if world else range(probes), watch)
+    series.run(probe_states(world, probes, seed) if world else range(probes), watched)
     effects, done = series.effects, series.done
-    found = effects.edges(set(declared))
+    observed = effects.edges(set(declared))
     interrupted = done < probes and not watch.ended
-    open_ = found.symmetric_difference(declared)
+    open_ = observed.symmetric_difference(declared)
     further: Series | None = None
     again: set[EdgeKey] | None = None
     if world and held_out and not interrupted:
@@ -261,9 +270,9 @@ def _verified(
         interrupted = further.done < held_out
         again = further.effects.edges(set(declared))
         effects.take(further.effects, done)
-        found = effects.edges(set(declared))
+        observed = effects.edges(set(declared))
     undeclared = []
-    seen = [(key, effects.largest[key], effects.settings[key]) for key in found - set(declared)]
+    seen = [(key, effects.largest[key], effects.settings[key]) for key in observed - set(declared)]
     seen += [
         (key, size, replace(where, kind=f"{where.kind}, without contact"))
         for key, (size, where) in effects.apart.items()
@@ -288,7 +297,7 @@ def _verified(
         probes=done,
         held_out=0 if further is None else further.done,
         seen_held_out=None if again is None or generated else len(again & set(declared)),
-        provenance=by_provenance(model, declared, found, [edge.key for edge in undeclared]),
+        provenance=by_provenance(model, declared, observed, [edge.key for edge in undeclared]),
         unstable=tuple(
             Unstable(variable=name, after=after, size=size)
             for (name, after), size in sorted(effects.unstable.items())
@@ -308,14 +317,14 @@ def _verified(
                 largest=effects.largest[key],
                 states=effects.states[key],
             )
-            for key in sorted(found & set(declared))
+            for key in sorted(observed & set(declared))
         ),
-        never_fired=tuple(sorted(set(declared) - found)),
+        never_fired=tuple(sorted(set(declared) - observed)),
         undeclared=tuple(undeclared),
         colors=tuple(
             sorted(
                 edge
-                for edge in {*found, *declared}
+                for edge in {*observed, *declared}
                 if edge[0].endswith("color") and edge[1] in measured
             )
         ),

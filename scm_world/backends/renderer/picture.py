@@ -44,7 +44,11 @@ class Drawing:
 
     def content(self, scene: Scene, *, shadows: bool) -> Any:
         """Gather what all pictures of a scene have in common, for any camera."""
-        return model_shapes(scene)[0] + goal_shapes(scene.goals), shadows
+        return self.shapes(scene), shadows
+
+    def shapes(self, scene: Scene) -> list[Shape]:
+        """List everything that is seen, goals last; for renderers other than this one."""
+        return model_shapes(scene)[0] + goal_shapes(scene.goals)
 
     def background(self, scene: Scene, *, obstacles: bool) -> Scene:
         """Return a scene without what moves, for pictures of goals."""

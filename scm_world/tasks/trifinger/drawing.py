@@ -12,8 +12,11 @@ from numba import njit
 
 from scm_world._types import Floats
 from scm_world.backends.renderer.bodies import (
+    BOX,
     CAPSULE,
+    CYLINDER,
     ELLIPSOID,
+    HULL,
     NOTHING,
     Bodies,
     empty_bodies,
@@ -35,10 +38,12 @@ from scm_world.backends.renderer.kernels import (
 )
 from scm_world.backends.renderer.meshes import NO_COLORS, NO_SHADOW, lamp, shadow_map
 from scm_world.backends.renderer.picture import Drawing
-from scm_world.backends.renderer.shapes import GOAL_OPACITY
+from scm_world.backends.renderer.shapes import GOAL_OPACITY, goal_shapes
+from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import rotation_kernel
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Light, Scene
+from scm_world.models.shapes import Kind, Mesh, Shape, mesh_of
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.cameras import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW
 from scm_world.tasks.trifinger.kinematics import FRAMES_PER_FINGER, link_frames
@@ -55,6 +60,10 @@ MOUNT = hardware.Capsule((0.012, 0.0, 0.0), (-0.004, 0.0, 0.0), 0.0235)
 
 BACKGROUND = (0.86, 0.89, 0.93)
 SHADOW_TEXELS = 96
+FLOOR_HALF, RING_PARTS = 1e-3, 48  # [m] half the height of the floor's disk; parts of the wall
+_KINDS: dict[int, Kind] = {
+    BOX: "box", ELLIPSOID: "ellipsoid", CAPSULE: "capsule", CYLINDER: "cylinder", HULL: "mesh"
+}  # fmt: skip
 
 Palette = tuple[tuple[float, ...], ...]
 """The colors of the floor, of the wall and of the background."""
@@ -98,6 +107,33 @@ class TriFingerDrawing(Drawing):
             return Content(bodies, None)
         return Content(bodies, shadow_map(bodies, scene.light, half=WALL_RADIUS, n=SHADOW_TEXELS))
 
+    def shapes(self, scene: Scene) -> list[Shape]:
+        """List the floor, the wall, the hub, the links, blocks, obstacles and goals."""
+        bodies, hulls = solid_bodies(scene), dict(scene.structure.hulls)
+        names = (*scene.structure.blocks, *scene.structure.obstacles)
+        floor, wall = (np.array([*color, 1.0]) for color in palette(scene)[:2])
+        flat = np.array([WALL_RADIUS, WALL_RADIUS, FLOOR_HALF])
+        below, turn = np.array([0.0, 0.0, -FLOOR_HALF]), np.eye(3)
+        found = [
+            Shape("cylinder", flat, below, turn, floor, FLOOR),
+            Shape("mesh", np.zeros(3), np.zeros(3), turn, wall, STAGE, mesh=_ring()),
+        ]
+        for i, kind in enumerate(bodies.shapes.tolist()):
+            hull = hulls.get(names[i - N_ROBOT]) if kind == HULL else None
+            found.append(
+                Shape(
+                    _KINDS[kind],
+                    bodies.halves[i],
+                    bodies.centers[i],
+                    bodies.rotations[i],
+                    np.array([*bodies.colors[i], 1.0]),
+                    int(bodies.owners[i]),
+                    bool(bodies.owners[i] < FIRST_BLOCK + len(scene.structure.blocks)),
+                    None if hull is None else _hull_mesh(hull),
+                )
+            )
+        return found + goal_shapes(scene.goals)
+
     def background(self, scene: Scene, *, obstacles: bool) -> Scene:
         """Take away the blocks, and the obstacles unless they are wanted, and park the robot."""
         state = PhysicalState(0)
@@ -137,6 +173,24 @@ class TriFingerDrawing(Drawing):
 
 
 DRAWING = TriFingerDrawing()
+
+
+@lru_cache(maxsize=1)
+def _ring() -> Mesh:
+    """Make the wall of the arena, seen from within."""
+    angles = np.linspace(0.0, 2.0 * np.pi, RING_PARTS, endpoint=False)
+    circle = WALL_RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
+    low, high = (np.column_stack([circle, np.full(RING_PARTS, z)]) for z in (0.0, WALL_HEIGHT))
+    one = np.arange(RING_PARTS)
+    other = np.roll(one, -1)
+    lower = np.column_stack([one, one + RING_PARTS, other])
+    upper = np.column_stack([other, one + RING_PARTS, other + RING_PARTS])
+    return mesh_of(np.concatenate([low, high]), np.concatenate([lower, upper]))
+
+
+@lru_cache(maxsize=128)
+def _hull_mesh(hull: Hull) -> Mesh:
+    return mesh_of(hull.vertices, hull.faces)
 
 
 def palette(scene: Scene) -> Palette:

@@ -1,0 +1,314 @@
+// The causal graph: variables grouped by entity, collapsed by default.
+
+import cytoscape from "cytoscape";
+import dagre from "cytoscape-dagre";
+
+cytoscape.use(dagre);
+cytoscape.warnings(false); // of edges between nodes that overlap while a group opens
+
+const ROW = 44, WIDE = 170, PAD = 26, MANY = 400;
+const SHAPES = { parameter: "round-rectangle", state: "ellipse", readout: "octagon", action: "diamond" };
+
+/** Colours of a theme: those of Okabe and Ito, which colour-blind people tell apart. */
+function colours() {
+  const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+  return dark
+    ? { ink: "#f2f4f7", line: "#93a1b3", group: "#2b333d", edge: "#66717f", parameter: "#12577f", state: "#7a5200",
+        readout: "#005e45", action: "#7d3a63", lit: "#ff8a3d", chosen: "#ffd24d", cause: "#56B4E9", effect: "#ffb000",
+        found: "#2ec27e", missed: "#ff6b6b", extra: "#d08be8" }
+    : { ink: "#15202b", line: "#5d6b7a", group: "#f1f4f8", edge: "#9aa6b4", parameter: "#cfe6f6", state: "#fbe3b4",
+        readout: "#c5ebdc", action: "#f4d7e8", lit: "#D55E00", chosen: "#b8860b", cause: "#0072B2", effect: "#B35900",
+        found: "#007a54", missed: "#c0262d", extra: "#8e3fae" };
+}
+
+export class Graph {
+  /** Draw into an element; `choose` is called with the name of a variable that was clicked. */
+  constructor(element, choose) {
+    this.element = element;
+    this.choose = choose;
+    this.open = new Set();
+    this.chosen = null;
+    this.lit = new Set();
+    this.marks = null;
+    this.cut = new Set();
+    this.cy = cytoscape({
+      container: element, minZoom: 0.05, maxZoom: 3, boxSelectionEnabled: false,
+      autounselectify: true, autoungrabify: true,
+    });
+    this.cy.on("tap", "node", event => {
+      const data = event.target.data();
+      if (data.group !== undefined) this.toggle(data.group);
+      else this.choose(data.id);
+    });
+    this.cy.on("tap", event => { if (event.target === this.cy) this.choose(null); });
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#style());
+    new ResizeObserver(() => {
+      this.cy.resize();
+      if (!this.touched) this.cy.fit(undefined, 14);
+    }).observe(element);
+    element.addEventListener("pointerdown", () => this.touched = true);
+    element.addEventListener("wheel", () => this.touched = true, { passive: true });
+  }
+
+  load(hello) {
+    const same = this.hello?.variables.map(v => v.name).join() === hello.variables.map(v => v.name).join();
+    this.hello = hello;
+    this.byName = new Map(hello.variables.map((v, i) => [v.name, { ...v, number: i }]));
+    this.groups = new Map();
+    for (const v of hello.variables) {
+      if (!this.groups.has(v.group)) this.groups.set(v.group, []);
+      this.groups.get(v.group).push(v.name);
+    }
+    if (!same) {
+      this.open = new Set([...this.groups].filter(([, names]) => names.length === 1).map(([name]) => name));
+      this.lit.clear();
+      this.chosen = null;
+      this.touched = false;
+    }
+    this.draw();
+  }
+
+  /** Causes or effects of a variable: name, lag, condition. */
+  neighbours(name, causes) {
+    const names = this.hello.variables, number = this.byName.get(name)?.number;
+    return this.hello.edges.filter(e => e[causes ? 1 : 0] === number)
+      .map(e => ({ name: names[e[causes ? 0 : 1]].name, lag: e[2], when: e[3] }));
+  }
+
+  toggle(group, open = !this.open.has(group)) {
+    if (open === this.open.has(group)) return;
+    this.open[open ? "add" : "delete"](group);
+    this.draw();
+  }
+
+  all(open) {
+    this.open = new Set(open ? this.groups.keys() : [...this.groups].filter(([, n]) => n.length === 1).map(([n]) => n));
+    this.touched = false;
+    this.draw();
+  }
+
+  fit() {
+    this.touched = false;
+    this.cy.fit(undefined, 14);
+  }
+
+  /** Where each group is: dagre, on groups alone; inside a group, rows. */
+  #places() {
+    const rows = new Map([...this.groups].map(([group, names]) => {
+      const open = this.open.has(group), columns = open ? Math.max(1, Math.round(Math.sqrt(names.length / 3))) : 1;
+      const count = open ? Math.ceil(names.length / columns) : 1;
+      const alone = names.length === 1;
+      return [group, { columns, w: columns * WIDE + (open && !alone ? PAD : 0), h: count * ROW + (open && !alone ? PAD + 8 : 10) }];
+    }));
+    const key = [...rows].map(([g, r]) => `${g}${r.w},${r.h}`).join();
+    if (this.placed?.key === key && this.placed.hello === this.hello) return this.placed;
+    const flat = cytoscape({ headless: true, styleEnabled: true, style: [
+      { selector: "node", style: { shape: "rectangle", width: "data(w)", height: "data(h)" } }] });
+    flat.add([...rows].map(([group, r]) => ({ data: { id: `g:${group}`, w: r.w, h: r.h } })));
+    const seen = new Set(), joined = new Set();
+    for (const [cause, effect, lag] of this.hello.edges) {
+      const a = this.hello.variables[cause].group, b = this.hello.variables[effect].group;
+      if (a === b || seen.has(`${a}→${b}`)) continue;
+      seen.add(`${a}→${b}`);
+      joined.add(a).add(b);
+      flat.add({ data: { source: `g:${a}`, target: `g:${b}`, minLen: 1, weight: lag ? 1 : 3 } });
+    }
+    const lone = [...rows.keys()].filter(group => !joined.has(group));
+    for (const group of lone) flat.getElementById(`g:${group}`).remove();
+    flat.layout({ name: "dagre", rankDir: "TB", nodeSep: 26, rankSep: 46, animate: false, fit: false,
+      ranker: "network-simplex" }).run();
+    const box = flat.elements().boundingBox(), at = new Map();
+    flat.nodes().forEach(node => at.set(node.id().slice(2), { ...node.position() }));
+    flat.destroy();
+    // A graph that is wide and low is stretched, so that it fills its place.
+    const { clientWidth, clientHeight } = this.element;
+    const wanted = Math.max(1, box.w || 1) * (clientHeight / Math.max(1, clientWidth)) * 0.75;
+    const stretch = Math.min(2.4, Math.max(1, wanted / Math.max(1, box.h || 1)));
+    for (const place of at.values()) place.y *= stretch;
+    let x = (box.x1 || 0), y = (box.y2 || 0) * stretch + 50, high = 0;
+    for (const group of lone) {  // what causes nothing and has no causes stands below, in rows
+      const { w, h } = rows.get(group);
+      if (x > (box.x1 || 0) && x + w > (box.x1 || 0) + Math.max(box.w || 0, 700)) { x = box.x1 || 0; y += high + 30; high = 0; }
+      at.set(group, { x: x + w / 2, y: y + h / 2 });
+      x += w + 26;
+      high = Math.max(high, h);
+    }
+    this.placed = { key, hello: this.hello, rows, at };
+    return this.placed;
+  }
+
+  draw() {
+    if (!this.hello) return;
+    const { rows, at } = this.#places(), elements = [], shown = [];
+    for (const [group, names] of this.groups) {
+      const place = at.get(group), open = this.open.has(group), alone = names.length === 1;
+      if (!open) {
+        elements.push({ data: { id: `g:${group}`, group, label: `${group} (${names.length})` }, position: { ...place }, classes: "closed" });
+        names.forEach(name => shown[this.byName.get(name).number] = `g:${group}`);
+        continue;
+      }
+      if (!alone) elements.push({ data: { id: `g:${group}`, group, label: group }, classes: "open" });
+      const { columns } = rows.get(group), count = Math.ceil(names.length / columns);
+      names.forEach((name, i) => {
+        const v = this.byName.get(name), column = Math.floor(i / count), row = i % count;
+        const short = !alone && name.startsWith(`${group}.`) ? name.slice(group.length + 1) : name;
+        shown[v.number] = name;
+        elements.push({
+          data: { id: name, label: short, ...(alone ? {} : { parent: `g:${group}` }) }, classes: v.role,
+          position: { x: place.x + (column - (columns - 1) / 2) * WIDE, y: place.y + (row - (count - 1) / 2) * ROW },
+        });
+      });
+    }
+    const merged = new Map();
+    this.hello.edges.forEach(([cause, effect, lag, when], number) => {
+      const a = shown[cause], b = shown[effect];
+      if (a === b && a.startsWith("g:")) return;
+      const id = `${a}→${b}→${lag ? 1 : 0}`;
+      if (!merged.has(id)) merged.set(id, { id, source: a, target: b, lag, whens: new Set(), numbers: [] });
+      merged.get(id).whens.add(when);
+      merged.get(id).numbers.push(number);
+    });
+    this.edgesOf = new Map();
+    const many = merged.size > MANY;
+    for (const edge of merged.values()) {
+      const { id, source, target, lag, whens, numbers } = edge;
+      const contact = whens.size === 1 && whens.has("contact");
+      for (const number of numbers) this.edgesOf.set(number, id);
+      elements.push({ data: { id, source, target, numbers }, classes: `${lag ? "lag1" : "lag0"}${contact ? " contact" : ""}${many ? " many" : ""}` });
+    }
+    this.cy.startBatch();
+    this.cy.elements().remove();
+    this.cy.add(elements);
+    this.cy.endBatch();
+    this.#style();
+    if (!this.touched) this.cy.fit(undefined, 14);
+    this.lit = new Set();
+    this.#highlight();
+    if (this.lastLit) this.light(this.lastLit);
+    this.hold(this.cut);
+    if (this.marks) this.found(this.marks);
+  }
+
+  #style() {
+    const c = colours();
+    const role = name => ({ selector: `node.${name}`, style: { shape: SHAPES[name], "background-color": c[name] } });
+    this.cy.style([
+      { selector: "node", style: {
+        label: "data(label)", "font-size": 11, "font-family": "system-ui, sans-serif", color: c.ink, "text-valign": "center",
+        "text-halign": "center", width: WIDE - 16, height: 24, "border-width": 1, "border-color": c.line,
+        "text-wrap": "ellipsis", "text-max-width": WIDE - 26, "background-color": c.group, "min-zoomed-font-size": 5 } },
+      role("parameter"), role("state"), role("readout"), role("action"),
+      { selector: "node.closed", style: { shape: "round-rectangle", "border-width": 2, "border-style": "double", "font-weight": 600 } },
+      { selector: "node.open", style: { shape: "round-rectangle", "text-valign": "top", "text-margin-y": 14, "font-weight": 600,
+        padding: 9, "padding-top": 22, "background-opacity": 0.6 } },
+      { selector: "edge", style: {
+        width: 1.4, "line-color": c.edge, "target-arrow-color": c.edge, "target-arrow-shape": "triangle", "arrow-scale": 0.8,
+        "curve-style": "bezier", "control-point-step-size": 26, opacity: 0.75 } },
+      { selector: "edge:loop", style: { "loop-direction": "90deg", "loop-sweep": "40deg", "control-point-step-size": 22 } },
+      { selector: "edge.lag1", style: { "line-style": "dashed" } },
+      { selector: "edge.contact", style: { "line-style": "dotted" } },
+      { selector: "edge.many", style: { "curve-style": "straight", width: 1, opacity: 0.16, "target-arrow-shape": "none" } },
+      { selector: "edge.cut", style: { "line-color": c.missed, opacity: 0.12 } },
+      { selector: "edge.lit", style: { "line-color": c.lit, "target-arrow-color": c.lit, width: 2.4, opacity: 0.9, "z-index": 5 } },
+      { selector: "edge.many.lit", style: { opacity: 0.4, width: 1.4 } },
+      { selector: "edge.missed", style: { "line-color": c.missed, "target-arrow-color": c.missed, opacity: 0.8 } },
+      { selector: "edge.found", style: { "line-color": c.found, "target-arrow-color": c.found, width: 2.6, opacity: 0.95, "z-index": 6 } },
+      { selector: "edge.many.found", style: { opacity: 0.6, width: 1.4 } },
+      { selector: "edge.extra", style: { "line-color": c.extra, "target-arrow-color": c.extra, width: 3, opacity: 1, "z-index": 7,
+        "target-arrow-shape": "triangle" } },
+      { selector: "node.held", style: { "border-width": 3, "border-color": c.lit } },
+      { selector: ".faded", style: { opacity: 0.12 } },
+      { selector: "edge.faded", style: { opacity: 0.04 } },
+      { selector: "edge.into", style: { "line-color": c.cause, "target-arrow-color": c.cause, width: 2.4, opacity: 1, "z-index": 9, "target-arrow-shape": "triangle" } },
+      { selector: "edge.out", style: { "line-color": c.effect, "target-arrow-color": c.effect, width: 2.4, opacity: 1, "z-index": 9, "target-arrow-shape": "triangle" } },
+      { selector: "node.cause", style: { "border-width": 3, "border-color": c.cause } },
+      { selector: "node.effect", style: { "border-width": 3, "border-color": c.effect } },
+      { selector: "node.chosen", style: { "border-width": 4, "border-color": c.chosen, "font-weight": 700 } },
+    ]);
+  }
+
+  /** Show one variable with its causes and effects; all others fade. */
+  select(name) {
+    this.chosen = name;
+    const group = name && this.byName.get(name)?.group;
+    if (group && !this.open.has(group)) this.toggle(group, true);
+    else this.#highlight();
+    if (name && !this.touched) return;
+    const node = name && this.cy.getElementById(name);
+    if (node?.nonempty()) {
+      const { x1, y1, x2, y2 } = this.cy.extent(), p = node.position();
+      if (p.x < x1 || p.x > x2 || p.y < y1 || p.y > y2) this.cy.center(node);
+    }
+  }
+
+  #highlight() {
+    this.cy.batch(() => {
+      this.cy.elements().removeClass("faded into out cause effect chosen");
+      const node = this.chosen && this.cy.getElementById(this.chosen);
+      if (!node?.nonempty()) return;
+      const into = node.incomers("edge"), out = node.outgoers("edge");
+      const kept = node.union(into).union(out).union(into.sources()).union(out.targets());
+      this.cy.elements().difference(kept.union(kept.parents())).not(".open").addClass("faded");
+      into.addClass("into").sources().addClass("cause");
+      out.addClass("out").targets().addClass("effect");
+      node.addClass("chosen");
+    });
+  }
+
+  #mark(numbers, name) {
+    const wanted = new Set(numbers.map(number => this.edgesOf.get(number)).filter(Boolean));
+    this.cy.batch(() => {
+      this.cy.edges(`.${name}`).forEach(edge => { if (!wanted.has(edge.id())) edge.removeClass(name); });
+      for (const id of wanted) this.cy.getElementById(id).addClass(name);
+    });
+  }
+
+  /** Light the edges along which bodies touch. */
+  light(numbers) {
+    const key = numbers.join();
+    if (this.litKey === key && this.litFor === this.edgesOf) return;
+    this.litKey = key;
+    this.litFor = this.edgesOf;
+    this.lastLit = numbers;
+    this.#mark(numbers, "lit");
+  }
+
+  /** Mark what interventions hold: the edges into it are cut. */
+  hold(names) {
+    const key = [...names].join();
+    if (this.heldKey === key && this.heldFor === this.edgesOf) return;
+    this.heldKey = key;
+    this.heldFor = this.edgesOf;
+    this.cut = names;
+    const numbers = new Set([...names].map(name => this.byName.get(name)?.number));
+    this.cy.batch(() => {
+      this.cy.nodes().removeClass("held");
+      for (const name of names) {
+        const node = this.cy.getElementById(name);
+        (node.nonempty() ? node : this.cy.getElementById(`g:${this.byName.get(name)?.group}`)).addClass("held");
+      }
+    });
+    this.#mark(this.hello.edges.flatMap((e, i) => numbers.has(e[1]) ? [i] : []), "cut");
+  }
+
+  /** Mark what experiments have found, missed, or found without an edge. */
+  found(marks) {
+    this.marks = marks;
+    const numbers = new Map(this.hello.edges.map((e, i) =>
+      [`${this.hello.variables[e[0]].name} ${this.hello.variables[e[1]].name} ${e[2]}`, i]));
+    const at = edges => edges.map(e => numbers.get(e.join(" "))).filter(n => n !== undefined);
+    this.cy.edges(".new").remove();
+    const shown = name => {
+      const v = this.byName.get(name);
+      return v && (this.open.has(v.group) ? name : `g:${v.group}`);
+    };
+    const extra = marks.found.filter(e => !numbers.has(e.join(" "))).concat(marks.extra);
+    for (const [cause, effect, lag] of extra) {
+      const id = `new ${cause} ${effect} ${lag}`, source = shown(cause), target = shown(effect);
+      if (source && target && this.cy.getElementById(id).empty())
+        this.cy.add({ data: { id, source, target }, classes: `extra new lag${lag ? 1 : 0}` });
+    }
+    this.#mark(at(marks.found), "found");
+    this.#mark(at(marks.missed), "missed");
+  }
+}

@@ -1,0 +1,119 @@
+"""What a world shows, as the page reads it: shapes once, poses at every instant."""
+
+from __future__ import annotations
+
+import struct
+from base64 import b64encode
+from collections.abc import Iterable
+from typing import Any, final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from scm_world._types import Floats
+from scm_world.backends.base import ContactPoint
+from scm_world.backends.renderer import body_names, drawing_of
+from scm_world.errors import ModelError
+from scm_world.models.scene import Scene
+from scm_world.models.shapes import Mesh, Shape
+
+FRAME = 1
+"""The first number of a binary message that is a frame."""
+
+MOST_SCENES = 64  # lists of shapes that are remembered, so that the page need not get them again
+
+
+@final
+class Shapes:
+    """Numbers for lists of shapes and for meshes, so that each is sent once."""
+
+    def __init__(self) -> None:
+        self._known: dict[Any, tuple[int, list[Shape]]] = {}
+        self._meshes: dict[int, tuple[int, Mesh]] = {}
+        self._count = 0
+
+    def place(self, scene: Scene) -> tuple[int, Floats, dict[str, Any] | None]:
+        """Return the shapes of a scene by number, and where they are.
+
+        Returns:
+            The number; for each shape position and orientation (x, y, z, w), shape (n, 7); and the
+            message that describes the shapes, if there was none of this number before.
+        """
+        try:
+            shapes = drawing_of(scene.structure).shapes(scene)
+        except ModelError:  # a step function has no shapes
+            shapes = []
+        key = tuple(
+            (s.kind, s.halves.tobytes(), s.color.tobytes(), id(s.mesh), s.body, s.tiles)
+            for s in shapes
+        )
+        message = None
+        if key not in self._known:
+            if len(self._known) >= MOST_SCENES:
+                del self._known[next(iter(self._known))]
+            self._known[key] = self._count, shapes  # keeps meshes alive, and so their ids
+            self._count += 1
+            message = self._described(self._known[key][0], shapes, scene)
+        poses = np.zeros((len(shapes), 7), dtype=np.float64)
+        if shapes:
+            poses[:, :3] = [s.position for s in shapes]
+            poses[:, 3:] = Rotation.from_matrix(np.array([s.rotation for s in shapes])).as_quat()
+        return self._known[key][0], poses, message
+
+    def _described(self, number: int, shapes: list[Shape], scene: Scene) -> dict[str, Any]:
+        try:
+            names = body_names(scene.structure) if shapes else ()
+        except ModelError:
+            names = ()
+        goals = len(shapes) - len(scene.goals)
+        sent, listed = [], []
+        for index, s in enumerate(shapes):
+            mesh = None
+            if s.mesh is not None:
+                known = self._meshes.get(id(s.mesh))
+                if known is None or known[1] is not s.mesh:
+                    known = self._meshes[id(s.mesh)] = len(self._meshes) + 1000 * number, s.mesh
+                    sent.append(_mesh(known[0], s.mesh))
+                mesh = known[0]
+            listed.append(
+                {
+                    "kind": s.kind,
+                    "halves": _short(s.halves),
+                    "color": _short(s.color),
+                    "mesh": mesh,
+                    "body": names[s.body] if 0 <= s.body < len(names) else "",
+                    "goal": scene.goals[index - goals].name if index >= goals else "",
+                    "moves": bool(s.moves),
+                    "tiles": s.tiles and [list(s.tiles.size), list(s.tiles.color)],
+                }
+            )
+        return {"type": "scene", "scene": number, "shapes": listed, "meshes": sent}
+
+
+def _short(numbers: Floats) -> list[float]:
+    return [round(float(x), 7) for x in numbers]
+
+
+def _mesh(number: int, mesh: Mesh) -> dict[str, Any]:
+    """Write a mesh: vertices as 32-bit floats, faces as 32-bit and normals as 8-bit integers."""
+    parts = {
+        "vertices": mesh.vertices.astype("<f4"),
+        "faces": mesh.faces.astype("<u4"),
+        "normals": np.round(127.0 * np.clip(mesh.normals, -1.0, 1.0)).astype("<i1"),
+    }
+    coded = {name: b64encode(part.tobytes()).decode() for name, part in parts.items()}
+    return {"mesh": number, **coded}
+
+
+def touching(contacts: Iterable[ContactPoint]) -> tuple[Floats, frozenset[tuple[str, str]]]:
+    """Return the contacts that press, position, normal and force, (k, 7), and who touches whom."""
+    found = [c for c in contacts if c.force > 0.0]
+    rows = [[*c.position, *c.normal, c.force] for c in found]
+    pairs = frozenset((min(c.bodies), max(c.bodies)) for c in found)
+    return np.array(rows, dtype=np.float64).reshape(-1, 7), pairs
+
+
+def frame(lane: int, scene: int, step: int, poses: Floats, contacts: Floats) -> bytes:
+    """Return a binary message: six 32-bit integers, then poses and contacts as 32-bit floats."""
+    head = struct.pack("<6I", FRAME, lane, scene, step, len(poses), len(contacts))
+    return head + poses.astype("<f4").tobytes() + contacts.astype("<f4").tobytes()

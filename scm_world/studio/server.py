@@ -1,0 +1,333 @@
+"""The server of the page: static files, and a websocket for each session."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import hmac
+import json
+import mimetypes
+import multiprocessing
+import re
+import secrets
+import threading
+import webbrowser
+from base64 import b64encode
+from collections import deque
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, final
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from scm_world.errors import UnknownOption
+from scm_world.studio.worker import Spec, work
+
+PAGE = Path(__file__).parent / "page"
+LOCAL = ("127.0.0.1", "localhost", "::1")
+MOST_SESSIONS = 8
+KEPT = 120.0  # [s] how long a world waits for its page to come back
+LARGEST = 1 << 20  # [bytes] of a message from a page
+GRACE = 3.0  # [s] in which a worker has to end by itself
+
+MODULES = {
+    "three": "vendor/three.js",
+    "cytoscape": "vendor/cytoscape.js",
+    "cytoscape-dagre": "vendor/cytoscape-dagre.js",
+    "studio": "main.js",
+    "studio/ask": "ask.js",
+    "studio/graph": "graph.js",
+    "studio/panel": "panel.js",
+    "studio/plots": "plots.js",
+    "studio/view": "view.js",
+}
+"""The modules of the page and their files; the only ones that are served."""
+
+
+@cache
+def read(name: str) -> str:
+    """Return a file of the page."""
+    return (PAGE / name).read_text(encoding="utf-8")
+
+
+def import_map(address: Callable[[str], str]) -> str:
+    """Return the import map of the page: the address of every module."""
+    return json.dumps({"imports": {name: address(file) for name, file in MODULES.items()}})
+
+
+def page(imports: str, data: str = "null") -> str:
+    """Return the page, with its import map, its style and what it shows without a server."""
+    parts = {"imports": imports, "style": read("studio.css"), "recording": data}
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], read("index.html"))
+
+
+def standalone(recording: dict[str, Any]) -> str:
+    """Return one file that shows graph and recorded twins without a server or a network."""
+    coded = {file: b64encode(read(file).encode()).decode() for file in MODULES.values()}
+    imports = import_map(lambda file: f"data:text/javascript;base64,{coded[file]}")
+    return page(imports, json.dumps(recording, allow_nan=False).replace("<", "\\u003c"))
+
+
+@final
+class _Session:
+    """A worker process, and the page that is connected to it.
+
+    Attributes:
+        socket: Of the page; None while it is away.
+        left: When the page went away, in the time of the event loop.
+    """
+
+    def __init__(self, spec: Spec, loop: asyncio.AbstractEventLoop) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, other = context.Pipe()
+        self._process = context.Process(target=work, args=(spec.model_dump_json(), other))
+        self._process.start()
+        other.close()
+        self._loop = loop
+        self.socket: WebSocket | None = None
+        self.left = loop.time()
+        self._texts: deque[str] = deque()
+        self._frames: dict[int, bytes] = {}  # the last one of each lane: a slow page skips some
+        self._something = asyncio.Event()
+        self._sending = threading.Lock()
+        self.ended = False
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        """Read what the worker sends, until it ends."""
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                given = self._pipe.recv()
+                self._loop.call_soon_threadsafe(self._take, given)
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            self._loop.call_soon_threadsafe(self._end)
+
+    def _take(self, given: Any) -> None:
+        if isinstance(given, bytes):
+            self._frames[given[4]] = given
+        else:
+            if given.get("type") == "reply" and "recording" in (given.get("ok") or {}):
+                given["ok"]["text"] = standalone(given["ok"].pop("recording"))
+            if self.socket is not None:
+                self._texts.append(json.dumps(given, allow_nan=False))
+        self._something.set()
+
+    def _end(self) -> None:
+        self.ended = True
+        if self.socket is not None:
+            self._texts.append(json.dumps({"type": "fatal", "error": "the world has ended"}))
+        self._something.set()
+
+    def ask(self, message: Any) -> None:
+        """Pass a message to the worker."""
+        with contextlib.suppress(OSError), self._sending:
+            self._pipe.send(message)
+
+    async def serve(self, socket: WebSocket) -> None:
+        """Carry messages between page and worker, until the page goes away."""
+        if self.socket is not None:
+            with contextlib.suppress(RuntimeError):
+                await self.socket.close(4001, "the page is open elsewhere")
+        self.socket = socket
+        self._texts.clear()
+        self._frames.clear()
+        self.ask({"op": "greet"})
+        sender = asyncio.create_task(self._send(socket))
+        try:
+            while True:
+                text = await socket.receive_text()
+                try:
+                    if len(text) > LARGEST:
+                        raise ValueError(f"it has more than {LARGEST} characters")
+                    message = json.loads(text)
+                except (ValueError, RecursionError) as error:
+                    said = {"type": "reply", "id": None, "error": f"no JSON: {error}"}
+                    self._texts.append(json.dumps(said))
+                    self._something.set()
+                    continue
+                await asyncio.to_thread(self.ask, message)
+        except (WebSocketDisconnect, RuntimeError, KeyError):
+            pass
+        finally:
+            sender.cancel()
+            if self.socket is socket:
+                self.socket, self.left = None, self._loop.time()
+                self.ask({"op": "pause"})
+
+    async def _send(self, socket: WebSocket) -> None:
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                await self._something.wait()
+                self._something.clear()
+                while self._texts or self._frames:
+                    if self._texts:
+                        await socket.send_text(self._texts.popleft())
+                    else:
+                        await socket.send_bytes(self._frames.pop(next(iter(self._frames))))
+
+    def close(self) -> None:
+        """End the worker."""
+        self.ask({"op": "end"})
+        self._process.join(GRACE)
+        if self._process.is_alive():
+            self._process.terminate()
+            self._process.join(GRACE)
+        if self._process.is_alive():
+            self._process.kill()
+        self._pipe.close()
+
+
+@final
+class Studio:
+    """The application: a page, and sessions.
+
+    Args:
+        spec: What worlds are made of.
+        host: Address it is bound to.
+        token: Has to be in the address of every request; nothing if empty.
+    """
+
+    def __init__(self, spec: Spec, host: str = "127.0.0.1", token: str = "") -> None:
+        self.spec, self.host, self.token = spec, host, token
+        self._sessions: dict[str, _Session] = {}
+        imports = import_map(lambda file: f"./{file}")
+        self._page = page(imports)
+        scripts = re.findall(r"<script[^>]*>(.*?)</script>", self._page, flags=re.DOTALL)
+        hashes = (b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts if s)
+        sources = " ".join(f"'sha256-{one}'" for one in hashes)
+        self._policy = (
+            f"default-src 'none'; script-src 'self' {sources}; style-src 'unsafe-inline'; "
+            "img-src 'self' data: blob:; media-src blob:; connect-src 'self' ws: wss:; "
+            "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        )
+        routes = [
+            Route("/", self._index),
+            Route("/{file:path}", self._file),
+            WebSocketRoute("/session/{name}", self._socket),
+        ]
+        self.app = Starlette(routes=routes, lifespan=self._life)
+
+    @contextlib.asynccontextmanager
+    async def _life(self, _: Any) -> Any:
+        watch = asyncio.create_task(self._watch())
+        yield
+        watch.cancel()
+        closing = (asyncio.to_thread(session.close) for session in self._sessions.values())
+        await asyncio.gather(*closing)
+
+    async def _watch(self) -> None:
+        """End worlds whose page does not come back."""
+        while True:
+            await asyncio.sleep(5.0)
+            now = asyncio.get_running_loop().time()
+            for name, one in [*self._sessions.items()]:
+                if one.ended or (one.socket is None and now - one.left > KEPT):
+                    del self._sessions[name]
+                    await asyncio.to_thread(one.close)
+
+    def _allowed(self, request: Request | WebSocket) -> bool:
+        """Tell whether a request comes from our page: no other page may reach this one."""
+        token = request.query_params.get("token", "")
+        if self.token and not hmac.compare_digest(token.encode(), self.token.encode()):
+            return False
+        host = request.headers.get("host", "")
+        name = re.sub(r":\d+$", "", host).strip("[]")
+        if self.host in LOCAL and name not in LOCAL:
+            return False  # the name of another site that leads here
+        origin = request.headers.get("origin")
+        return origin is None or origin.partition("://")[2] == host
+
+    async def _index(self, request: Request) -> Response:
+        if not self._allowed(request):
+            return PlainTextResponse("open the address that the command printed", 403)
+        headers = {
+            "Content-Security-Policy": self._policy,
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+            "Cache-Control": "no-store",
+        }
+        return Response(self._page, media_type="text/html", headers=headers)
+
+    async def _file(self, request: Request) -> Response:
+        name = request.path_params["file"]
+        if name not in MODULES.values():
+            return PlainTextResponse("there is no such file", 404)
+        kind = mimetypes.guess_type(name)[0] or "text/javascript"
+        return Response(read(name), media_type=kind, headers={"Cache-Control": "no-cache"})
+
+    async def _socket(self, socket: WebSocket) -> None:
+        name = socket.path_params["name"]
+        if not self._allowed(socket) or not re.fullmatch(r"[0-9a-f]{32}", name):
+            await socket.close(4003, "not allowed")
+            return
+        await socket.accept()
+        session = self._sessions.get(name)
+        if session is not None and session.ended:
+            self._sessions.pop(name)
+            session.close()
+            session = None
+        if session is None:
+            away = [key for key, one in self._sessions.items() if one.socket is None]
+            if len(self._sessions) >= MOST_SESSIONS and away:
+                oldest = min(away, key=lambda key: self._sessions[key].left)
+                await asyncio.to_thread(self._sessions.pop(oldest).close)
+            if len(self._sessions) >= MOST_SESSIONS:
+                said = f"{MOST_SESSIONS} pages are open already; close one of them"
+                await socket.send_text(json.dumps({"type": "fatal", "error": said}))
+                await socket.close(4002, said)
+                return
+            await socket.send_text(json.dumps({"type": "building", "system": self.spec.system}))
+            session = _Session(self.spec, asyncio.get_running_loop())
+            self._sessions[name] = session
+        await session.serve(socket)
+
+
+def serve(
+    spec: Spec,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8700,
+    open_: bool = False,
+    say: Callable[[str], object] = print,
+) -> None:
+    """Serve the page until Ctrl-C.
+
+    Args:
+        spec: What worlds are made of.
+        host: Address to bind; one that others can reach gets a token.
+        port: Number of the port; any free one if 0.
+        open_: Whether to open a browser.
+        say: Told the address.
+
+    Raises:
+        UnknownOption: The address is taken, or is none of this machine.
+    """
+    import uvicorn
+
+    token = "" if host in LOCAL else secrets.token_urlsafe(24)
+    studio = Studio(spec, host, token)
+    config = uvicorn.Config(
+        studio.app,
+        host=host,
+        port=port,
+        log_level="warning",
+        ws="websockets-sansio",
+        ws_max_size=LARGEST,
+    )
+    try:
+        bound = config.bind_socket()
+    except (OSError, SystemExit) as error:
+        allowed = (f"an address of this machine with a free port: {error}",)
+        raise UnknownOption("--port", f"{host}:{port}", allowed) from None
+    shown = f"[{host}]" if ":" in host else host
+    address = f"http://{shown}:{bound.getsockname()[1]}/" + (f"?token={token}" if token else "")
+    say(address)
+    if open_:
+        webbrowser.open(address)
+    uvicorn.Server(config).run(sockets=[bound])

@@ -1,0 +1,876 @@
+"""The process of a session: one world, its twin, and what the page asks of them.
+
+Messages come from a pipe as dicts with ``op`` and ``id``; replies and news go back as dicts, frames
+as bytes. What a message asks for happens completely, or it gets an error and nothing changes.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+import signal
+import tempfile
+import time
+from base64 import b64encode
+from collections.abc import Mapping
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Annotated, Any, Literal, final
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, validate_call
+
+from scm_world._types import Floats, Value
+from scm_world.backends.step import StepModel
+from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, in_one_line
+from scm_world.queries import LiveEpisode, Plan, World, save_episode
+from scm_world.queries.plans import At
+from scm_world.queries.timed import Clamp
+from scm_world.studio.scene import Shapes, frame, touching
+from scm_world.tasks import make_task
+from scm_world.variables import Draw, Natural, Scale, Shift
+from scm_world.variables.spaces import Box, Categories, Either, Integers
+
+FRAMES, NEWS = 60.0, 15.0  # most frames and reports of a second
+LATE = 0.25  # [s] by how much a world that plays may be late before it gives up catching up
+MOST_LINES = 2000
+MOST_SERIES = 12  # outcomes that are drawn over time
+FACTUAL, TWIN = 0, 1
+
+Step = Annotated[int, Field(ge=0)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Lane = Literal[0, 1]
+
+
+class Spec(BaseModel):
+    """What a world is made of.
+
+    Attributes:
+        system: A task, a model file or ``module:function``.
+        options: Arguments of the task.
+        settings: Arguments of ``World``.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+    system: str
+    options: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
+
+    def make(self) -> World:
+        """Make the world."""
+        return World(make_task(self.system, **self.options), **self.settings)
+
+    def code(self) -> list[str]:
+        """Return the lines of Python that make it."""
+        settings = "".join(f", {name}={value!r}" for name, value in self.settings.items())
+        made = repr(self.system)
+        if self.options:
+            given = ", ".join(f"{name}={value!r}" for name, value in self.options.items())
+            made = f"sw.make_task({made}, {given})"
+        return ["import scm_world as sw", "", f"world = sw.World({made}{settings})"]
+
+
+class Act(BaseModel):
+    """An intervention on one variable.
+
+    Attributes:
+        kind: What is done.
+        value: The value, or by how much it is shifted or scaled: a number, numbers, a label.
+        source: The space that is drawn from.
+        start: First control step of a window, or of what is done later; now if None.
+        stop: Where the window ends; it has no end if None.
+        window: Whether it is held during a window.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+    kind: Literal["hard", "shift", "scale", "draw"] = "hard"
+    value: Finite | list[Finite] | str | None = None
+    source: Literal["A", "B", "A|B"] = "A"
+    start: Step | None = None
+    stop: Step | None = None
+    window: bool = False
+
+    def part(self, now: int) -> tuple[Any, str]:
+        """Return it as ``do`` takes it, and as Python.
+
+        Raises:
+            UnknownOption: A value is missing.
+        """
+        act: Any
+        if self.kind == "draw":
+            act, code = Draw(self.source), f"sw.Draw({self.source!r})"
+        elif self.value is None:
+            raise UnknownOption("value", None, ("a number", "a list of numbers"))
+        elif self.kind == "hard":
+            act, code = self.value, repr(self.value)
+        else:
+            kind = Shift if self.kind == "shift" else Scale
+            act, code = kind(self.value), f"sw.{kind.__name__}({self.value!r})"
+        start = now if self.start is None else self.start
+        if self.window:
+            return Clamp(act, start, self.stop), f"sw.Clamp({code}, {start}, {self.stop})"
+        if start != now:
+            return At(start, act), f"sw.At({start}, {code})"
+        return act, code
+
+
+@final
+class _LaneState:
+    """The factual or the counterfactual episode, and what was seen of it.
+
+    Attributes:
+        live: The episode.
+        rows: Values of all variables at every instant from ``first`` on.
+        contacts: Of these instants, with who touches whom.
+        first: The instant at which the rows begin.
+    """
+
+    def __init__(self, live: LiveEpisode, first: int = 0) -> None:
+        self.live, self.first = live, first
+        self.rows: list[dict[str, Value]] = []
+        self.contacts: list[tuple[Floats, frozenset[tuple[str, str]]]] = []
+        self.look()
+
+    def look(self) -> None:
+        """Write down the present instant, once more if it was changed."""
+        at = self.live.steps - self.first
+        del self.rows[at:], self.contacts[at:]
+        self.rows.append(self.live.world.values())
+        self.contacts.append(touching(self.live.world.backend.contacts()))
+
+
+@final
+class Session:
+    """One world, and the page that looks at it.
+
+    Args:
+        spec: What the world is made of.
+        pipe: To the server.
+    """
+
+    def __init__(self, spec: Spec, pipe: Connection) -> None:
+        self._spec, self._pipe = spec, pipe
+        self.world = spec.make()
+        self._shapes = Shapes()
+        self._playing, self._speed, self._next = False, 1.0, 0.0
+        self._looking: int | None = None
+        self._watched: tuple[str, ...] = ()
+        self._plotted: tuple[str, ...] = ()
+        self._sent_rows = [0, 0]
+        self._last_frame = self._last_news = 0.0
+        self._compiled: Any = None
+        self._lit: dict[Any, list[int]] = {}
+        self._lines: list[str] = [*spec.code()]
+        self._loop: tuple[str, int] = ("", 0)
+        self._new_lines = True
+        self._policy: str | list[float] | None = None
+        self._job: _Job | None = None
+        self._seed, self._number = 0, 0
+        self._lanes: list[_LaneState] = []
+        self._begin(0, 0)
+
+    # --- the loop -------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Answer messages and play, until the server has gone."""
+        self._hello()
+        while True:
+            pause = None
+            if self._playing:
+                pause = max(0.0, self._next - time.monotonic())
+            pipes = [self._pipe, *([self._job.pipe] if self._job else [])]
+            ready = wait(pipes, pause)
+            if self._job and self._job.pipe in ready:
+                self._news_of_job()
+            if self._pipe in ready:
+                try:
+                    message = self._pipe.recv()
+                except EOFError:
+                    break
+                if message == {"op": "end"}:
+                    break
+                self._pipe.send(self._answer(message))
+                self._show(force=True)
+            elif self._playing and time.monotonic() >= self._next:
+                self._play_on()
+        if self._job:
+            self._job.end()
+        self.world.close()
+
+    def _play_on(self) -> None:
+        period = self.world.control_period / self._speed
+        now = time.monotonic()
+        self._next = self._next + period if now - self._next < LATE else now + period
+        if self._looking is not None:
+            self._looking += 1
+            if self._looking >= self._steps:
+                self._looking, self._playing = None, False
+        else:
+            try:
+                self._advance(1)
+            except ScmWorldError as error:
+                self._playing = False
+                self._pipe.send({"type": "trouble", "error": str(error)})
+            length = self.world.max_episode_length
+            if self._steps % length == 0:
+                self._playing = False
+        self._show(force=not self._playing)
+
+    def _answer(self, message: Any) -> dict[str, Any]:
+        """Do what a message asks for; return the reply."""
+        number = message.get("id") if isinstance(message, dict) else None
+        try:
+            if not isinstance(message, dict) or not isinstance(message.get("op"), str):
+                raise UnknownOption("message", type(message).__name__, ("an object with 'op'",))
+            given = {key: value for key, value in message.items() if key not in ("op", "id")}
+            if message["op"] not in OPS:
+                raise UnknownOption("op", message["op"], (*OPS,))
+            try:
+                found = OPS[message["op"]](self, **given)
+            except (TypeError, ValidationError) as error:
+                raise UnknownOption("message", message["op"], (in_one_line(error),)) from error
+        except ScmWorldError as error:
+            if isinstance(error, EngineFailure):
+                self._playing = False
+            return {"type": "reply", "id": number, "error": str(error), "nearest": nearest(error)}
+        except Exception as error:  # of a user's function; the page says so and stays
+            return {"type": "reply", "id": number, "error": in_one_line(error), "nearest": []}
+        return {"type": "reply", "id": number, "ok": found}
+
+    # --- showing --------------------------------------------------------------------------------
+
+    @property
+    def _steps(self) -> int:
+        return self._lanes[FACTUAL].live.steps
+
+    def _hello(self) -> None:
+        """Describe the system: what the page draws before anything moves."""
+        live = self._lanes[FACTUAL].live
+        self._compiled = live.world.compiled
+        self._lit.clear()
+        self._pipe.send({"type": "hello", **described(self._spec, self.world, live.world)})
+
+    def _show(self, *, force: bool = False) -> None:
+        """Send frames and news, not more often than a page can show."""
+        now = time.monotonic()
+        if force or now - self._last_frame >= 1.0 / FRAMES:
+            self._last_frame = now
+            for number in range(len(self._lanes)):
+                self._send_frame(number)
+        if force or now - self._last_news >= 1.0 / NEWS:
+            self._last_news = now
+            self._send_news()
+
+    def _scene(self, number: int, step: int) -> Any:
+        """Describe an instant for a picture: that of the episode, never one drawn again."""
+        live = self._lanes[number].live
+        return live.world.scene() if step >= live.steps else live.episode().scene(step)[0]
+
+    def _send_frame(self, number: int) -> None:
+        lane = self._lanes[number]
+        step = lane.live.steps if self._looking is None else self._looking
+        shapes, poses, message = self._shapes.place(self._scene(number, step))
+        if message is not None:
+            self._pipe.send(message)
+        contacts = lane.contacts[step - lane.first][0] if step >= lane.first else np.zeros((0, 7))
+        self._pipe.send(frame(number, shapes, step, poses, contacts))
+
+    def _send_news(self) -> None:
+        live = self._lanes[FACTUAL].live
+        if live.world.compiled is not self._compiled:
+            self._hello()
+        step = self._steps if self._looking is None else self._looking
+        values, rows = [], []
+        for number, lane in enumerate(self._lanes):
+            row = self._row(lane, step)
+            shown = {*self._watched, *self._plotted}
+            values.append({name: plain(row[name]) for name in shown if name in row})
+            first, end = self._sent_rows[number], lane.live.steps + 1
+            rows.append({"first": first, "values": self._series(lane, first, end)})
+            self._sent_rows[number] = max(first, end - 1)  # the present may still change
+        news: dict[str, Any] = {
+            "type": "news",
+            "step": step,
+            "steps": self._steps,
+            "time": step * self.world.control_period,
+            "playing": self._playing,
+            "past": self._looking is not None,
+            "held": [
+                [[name, told(act)] for name, act in lane.live.held.items()] for lane in self._lanes
+            ],
+            "twin": self._lanes[TWIN].first if len(self._lanes) > 1 else None,
+            "values": values,
+            "rows": rows,
+            "lit": self._touched(step),
+        }
+        if self._new_lines:
+            news["python"], self._new_lines = self._code(), False
+        self._pipe.send(news)
+
+    def _row(self, lane: _LaneState, step: int) -> Mapping[str, Value]:
+        """Return all values at an instant; before the split, those of the factual episode."""
+        lane = lane if step >= lane.first else self._lanes[FACTUAL]
+        return lane.rows[step - lane.first]
+
+    def _series(self, lane: _LaneState, first: int, end: int) -> dict[str, list[Any]]:
+        rows = [self._row(lane, step) for step in range(first, end)]
+        return {
+            name: [plain(row[name]) if name in row else None for row in rows]
+            for name in self._plotted
+        }
+
+    def _touched(self, step: int) -> list[int]:
+        """Number the edges by contact along which bodies act on one another at an instant."""
+        pairs = self._lanes[FACTUAL].contacts[step][1]
+        if pairs not in self._lit:
+            self._lit[pairs] = lit_edges(self._lanes[FACTUAL].live.world.model, pairs)
+        return self._lit[pairs]
+
+    # --- Python ---------------------------------------------------------------------------------
+
+    def _note(self, *lines: str) -> None:
+        """Add lines of Python; a step that follows an equal one becomes a loop."""
+        self._end_loop()
+        self._lines += lines
+        del self._lines[:-MOST_LINES]
+        self._new_lines = True
+
+    def _note_steps(self, line: str, count: int) -> None:
+        if self._loop[0] != line:
+            self._end_loop()
+        self._loop = line, self._loop[1] + count
+        self._new_lines = True
+
+    def _end_loop(self) -> None:
+        self._lines += loop(*self._loop)
+        self._loop = ("", 0)
+
+    def _code(self) -> list[str]:
+        return [*self._lines, *loop(*self._loop)]
+
+    # --- what the page asks for -----------------------------------------------------------------
+
+    def _begin(self, seed: int, number: int) -> None:
+        live = self.world.live(self._policy, seed=seed, episode=number)
+        for lane in self._lanes:
+            lane.live.close()
+        self._seed, self._number, self._looking, self._playing = seed, number, None, False
+        self._lanes, self._sent_rows = [_LaneState(live)], [0, 0]
+        of = "" if not number else f", episode={number}"
+        policy = "" if self._policy is None else f"{self._policy!r}, "
+        self._note(f"live = world.live({policy}seed={seed}{of})")
+
+    def _advance(self, count: int) -> None:
+        factual = self._lanes[FACTUAL]
+        for _ in range(count):
+            twin = self._lanes[TWIN] if len(self._lanes) > 1 else None
+            before = self._steps
+            try:
+                action = factual.live.step()
+            finally:
+                if self._steps > before:
+                    factual.look()
+            if twin is not None:
+                try:
+                    twin.live.step(action)
+                finally:
+                    twin.look() if twin.live.steps > before else self._drop_twin()
+            self._note_steps("live.step()" if twin is None else "twin.step(live.step())", 1)
+
+    def _drop_twin(self) -> None:
+        if len(self._lanes) > 1:
+            self._lanes.pop().live.close()
+            self._sent_rows[TWIN] = 0
+            self._note("twin.close()")
+
+    @validate_call
+    def play(self, speed: Annotated[float, Field(gt=0.0, le=100.0)] = 1.0) -> None:
+        """Go on in real time, times a factor: with what is recorded, or with the world."""
+        self._speed, self._playing, self._next = speed, True, time.monotonic()
+
+    @validate_call
+    def pause(self) -> None:
+        """Stay at this instant."""
+        self._playing = False
+
+    @validate_call
+    def step(self, n: Annotated[int, Field(ge=1, le=1000)] = 1) -> None:
+        """Take control steps; in the past, go forward over what is recorded."""
+        self._playing = False
+        if self._looking is not None:
+            return self.look(min(self._looking + n, self._steps))
+        self._advance(n)
+        return None
+
+    @validate_call
+    def look(self, step: Step | None = None) -> None:
+        """Look at an instant of the episode; at the present one if None."""
+        if step is not None and step > self._steps:
+            raise UnknownOption("step", step, (f"a control step from 0 to {self._steps}",))
+        self._playing = False
+        self._looking = None if step == self._steps else step
+
+    @validate_call
+    def reset(self, seed: Step = 0, number: Step = 0) -> None:
+        """Begin an episode; the twin ends."""
+        self._begin(seed, number)
+
+    @validate_call
+    def policy(self, name: str | None = None, action: list[Finite] | None = None) -> None:
+        """Choose who acts: nobody, a policy by its name, or an action that is kept."""
+        chosen: Any = name if action is None else action
+        self._lanes[FACTUAL].live.policy = chosen
+        self._policy = chosen
+        self._note(f"live.policy = {chosen!r}")
+
+    @validate_call
+    def watch(self, names: list[str]) -> None:
+        """Choose the variables whose present value is shown."""
+        for name in names:
+            self.world.model.declared(name)
+        self._watched = tuple(names)
+
+    @validate_call
+    def plot(self, names: list[str]) -> None:
+        """Choose the outcomes that are drawn over time."""
+        if len(names) > MOST_SERIES:
+            raise UnknownOption("number of outcomes", len(names), (f"at most {MOST_SERIES}",))
+        for name in names:
+            self.world.model.declared(name)
+        self._plotted, self._sent_rows = tuple(names), [0, 0]
+
+    @validate_call
+    def inspect(self, name: str) -> dict[str, Any]:
+        """Describe a variable as it is now: value, bounds, spaces."""
+        world = self._lanes[FACTUAL].live.world
+        step = self._steps if self._looking is None else self._looking
+        values = self._row(self._lanes[FACTUAL], step)
+        variable = world.model.declared(name)
+        spaces = {"bounds": variable.bounds, "a": variable.a, "b": variable.b}
+        return {
+            "name": variable.name,
+            "value": plain(values[variable.name]),
+            **{key: marks(space, variable.shape, values) for key, space in spaces.items()},
+        }
+
+    @validate_call
+    def do(self, name: str, act: Act, lane: Lane = 0) -> dict[str, Any]:
+        """Intervene at the present instant, and audit it."""
+        chosen = self._lane(lane)
+        if self._looking is not None:
+            past = "the present instant; at an earlier one, split the episode"
+            raise UnknownOption("instant of do", self._looking, (past,))
+        part, code = act.part(chosen.live.steps)
+        audit = chosen.live.do({name: part})
+        chosen.look()
+        self._note(f"{('live', 'twin')[lane]}.do({{{name!r}: {code}}})")
+        return audited(audit)
+
+    @validate_call
+    def release(self, name: str, lane: Lane = 0) -> dict[str, Any]:
+        """Hand a variable back to its own mechanism."""
+        chosen = self._lane(lane)
+        if name not in chosen.live.held:
+            raise UnknownOption("what is in force", name, tuple(chosen.live.held) or ("nothing",))
+        audit = chosen.live.do({name: Natural()})
+        chosen.look()
+        self._note(f"{('live', 'twin')[lane]}.do({{{name!r}: sw.Natural()}})")
+        return audited(audit)
+
+    def _lane(self, lane: int) -> _LaneState:
+        if lane >= len(self._lanes):
+            raise UnknownOption("lane", lane, ("0: there is no twin; split the episode first",))
+        return self._lanes[lane]
+
+    @validate_call
+    def split(self, at: Step | None = None, do: dict[str, Act] | None = None) -> None:
+        """Run the counterfactual beside the episode: same noise and actions, from an instant on."""
+        factual = self._lanes[FACTUAL]
+        here = self._steps if self._looking is None else self._looking
+        place = here if at is None else at
+        parts = {name: act.part(place) for name, act in (do or {}).items()}
+        live = factual.live.split({n: part for n, (part, _) in parts.items()}, at=place)
+        twin, actions = _LaneState(live, place), factual.live.actions[place:]
+        try:
+            for action in actions:
+                live.step(action)
+                twin.look()
+        except ScmWorldError:
+            live.close()
+            raise
+        self._drop_twin()
+        self._lanes.append(twin)
+        code = ", ".join(f"{name!r}: {code}" for name, (_, code) in parts.items())
+        replay = [f"for action in live.actions[{place}:]:", "    twin.step(action)"]
+        self._note(f"twin = live.split({{{code}}}, at={place})", *(replay if actions else ()))
+
+    @validate_call
+    def join(self) -> None:
+        """End the twin."""
+        self._drop_twin()
+
+    @validate_call
+    def greet(self) -> None:
+        """Send everything once more, to a page that has come back."""
+        self._shapes, self._sent_rows, self._new_lines = Shapes(), [0, 0], True
+        self._hello()
+
+    # --- jobs -----------------------------------------------------------------------------------
+
+    @validate_call
+    def discover(self, probes: Annotated[int, Field(ge=1, le=10_000)] = 16, seed: Step = 0) -> None:
+        """Recover the graph from experiments, in another process."""
+        self._start("discover", probes, seed)
+
+    @validate_call
+    def verify(self, probes: Annotated[int, Field(ge=1, le=10_000)] = 16, seed: Step = 0) -> None:
+        """Test the declared graph by experiments, in another process."""
+        self._start("verify", probes, seed)
+
+    def _start(self, kind: str, probes: int, seed: int) -> None:
+        if self._job is not None:
+            raise UnknownOption("job", kind, (f"cancel {self._job.kind} first",))
+        self._job = _Job(self._spec, kind, probes, seed)
+        made = "sw.discover(world, " if kind == "discover" else "sw.verify(world, "
+        self._note(f"report = {made}probes={probes}, seed={seed})")
+
+    @validate_call
+    def cancel(self) -> None:
+        """Interrupt discovery or verification; the report covers what was finished."""
+        if self._job is None:
+            raise UnknownOption("job", None, ("one that runs",))
+        self._job.interrupt()
+
+    def _news_of_job(self) -> None:
+        job = self._job
+        assert job is not None  # noqa: S101 # it is what sent something
+        try:
+            self._pipe.send(job.pipe.recv())
+        except EOFError:
+            self._job = None
+            job.end()
+            self._pipe.send({"type": "job", "kind": job.kind, "ended": True})
+
+    # --- files ----------------------------------------------------------------------------------
+
+    @validate_call
+    def save(self, what: Literal["episode", "plan", "recording"], lane: Lane = 0) -> dict[str, Any]:
+        """Return a file: an episode, the plan of interventions, or all that a page shows of both.
+
+        Raises:
+            UnknownOption: There is no such lane, or no step was taken.
+        """
+        live = self._lane(lane).live
+        stem = f"{Path(self._spec.system.rpartition(':')[2]).stem}-{('factual', 'twin')[lane]}"
+        if what == "plan":
+            return {"name": f"{stem}-plan.json", "text": live.plan().to_json()}
+        if what == "episode":
+            with tempfile.TemporaryDirectory(prefix="scm-world-") as folder:
+                content = save_episode(live.episode(), Path(folder) / "episode.npz").read_bytes()
+            return {"name": f"{stem}.npz", "base64": b64encode(content).decode()}
+        return {"name": f"{stem}.html", "recording": self._recording()}
+
+    def _recording(self) -> dict[str, Any]:
+        """Collect graph, shapes, frames and series of all instants."""
+        shapes, scenes, frames, rows = Shapes(), [], [], []
+        for number, lane in enumerate(self._lanes):
+            for step in range(lane.live.steps + 1):
+                shape, poses, message = shapes.place(self._scene(number, step))
+                scenes += [] if message is None else [message]
+                known = step >= lane.first
+                contacts = lane.contacts[step - lane.first][0] if known else np.zeros((0, 7))
+                made = frame(number, shape, step, poses, contacts)
+                frames.append(b64encode(made).decode())
+            values = self._series(lane, 0, lane.live.steps + 1)
+            rows.append({"first": 0, "values": values})
+        live = self._lanes[FACTUAL].live
+        held = [[[n, told(a)] for n, a in lane.live.held.items()] for lane in self._lanes]
+        return {
+            "hello": described(self._spec, self.world, live.world),
+            "scenes": scenes,
+            "frames": frames,
+            "rows": rows,
+            "held": held,
+            "steps": self._steps,
+            "twin": self._lanes[TWIN].first if len(self._lanes) > 1 else None,
+            "lit": [self._touched(step) for step in range(self._steps + 1)],
+            "python": self._code(),
+        }
+
+
+OPS = {
+    name: getattr(Session, name)
+    for name in (
+        *("play", "pause", "step", "look", "reset", "policy", "watch", "plot", "inspect", "do"),
+        *("release", "split", "join", "greet", "discover", "verify", "cancel", "save"),
+    )
+}
+"""What a message may ask for."""
+
+
+# --- plain data -----------------------------------------------------------------------------------
+
+
+def plain(value: Any) -> Any:
+    """Return numbers as JSON can hold them; what is not finite becomes None."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [plain(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def told(act: Any) -> str:
+    """Say what an intervention does in a few words."""
+    return str(Plan({"x": act}))[len("do(x = ") : -1]
+
+
+def audited(audit: Any) -> dict[str, Any]:
+    """Write an audit as plain data."""
+    if audit is None:
+        return {"targets": [], "followed": [], "came": [], "went": []}
+    changes = [*audit.followed.items(), *audit.engine.items()]
+    return {
+        "targets": [
+            {
+                "name": name,
+                "requested": told(one.requested),
+                "applied": plain(one.applied),
+                "read_back": plain(one.read_back),
+            }
+            for name, one in audit.targets.items()
+        ],
+        "followed": [[name, plain(old), plain(new)] for name, (old, new) in changes],
+        "came": list(audit.came),
+        "went": list(audit.went),
+    }
+
+
+def nearest(error: Any) -> list[dict[str, Any]]:
+    """List the nearest possible values that an error names."""
+    found = [one for part in getattr(error, "problems", ()) if not isinstance(part, str)
+             for one in nearest(part)]  # fmt: skip
+    value = getattr(error, "nearest", None)
+    if value is not None and not callable(value):
+        found.append({"name": error.variable, "value": plain(np.asarray(value))})
+    return found
+
+
+def marks(space: Any, shape: tuple[int, ...], values: Any) -> list[dict[str, Any]] | None:
+    """Return the parts of a space as plain data, for marks on a scale; None where it has none."""
+    match space:
+        case Box():
+            low, high = space.bounds(shape, values)
+            return [{"low": plain(np.ravel(low)), "high": plain(np.ravel(high))}]
+        case Integers(low=low, high=high):
+            return [{"low": [low], "high": [high], "whole": True}]
+        case Categories(members=members, labels=labels):
+            return [{"members": list(members), "labels": list(labels)}]
+        case Either(first=first, second=second):
+            parts = (marks(part, shape, values) for part in (first, second))
+            return [one for part in parts for one in part or ()]
+    return None
+
+
+def group_of(world: World) -> dict[str, str]:
+    """Name the entity of every variable: what declared it, or the beginning of its name."""
+    owners: dict[str, str] = {}
+    for entity in world.composition.entities:
+        for one in (part for parts in entity.declared for part in parts):
+            owners[one.name] = entity.name
+    found = {}
+    for name in world.model:
+        variable = world.model.declared(name)
+        first = name.rpartition(".")[0]
+        outcome = "outcomes" if variable.role == "readout" else "world"
+        found[name] = (
+            owners.get(name) or first or ("actions" if variable.role == "action" else outcome)
+        )
+    return found
+
+
+def described(spec: Spec, world: World, live: Any) -> dict[str, Any]:
+    """Describe a world: variables, edges, actions, policies."""
+    model, groups = live.model, group_of(live)
+    names = list(model)
+    place = {name: index for index, name in enumerate(names)}
+    variables = []
+    for name in names:
+        variable = model.declared(name)
+        category = variable.bounds if isinstance(variable.bounds, Categories) else None
+        variables.append(
+            {
+                "name": name,
+                "group": groups[name],
+                "kind": variable.kind,
+                "role": variable.role,
+                "unit": variable.unit,
+                "shape": list(variable.shape),
+                "dtype": variable.dtype,
+                "doc": " ".join(variable.doc.split()),
+                "settable": bool(variable.settable),
+                "state": variable.role == "state",
+                "categories": category
+                and [list(category.members), list(category.labels) or list(category.members)],
+            }
+        )
+    low, high = plain(world.action_low), plain(world.action_high)
+    actions = [
+        {"name": f"{name}[{i}]" if part.stop - part.start > 1 else name, "low": low[k],
+         "high": high[k], "unit": model.declared(name).unit}
+        for name, part in live.compiled.actions.items()
+        for i, k in enumerate(range(part.start, part.stop))
+    ]  # fmt: skip
+    return {
+        "system": spec.system,
+        "backend": world.engine,
+        "dt": world.control_period,
+        "length": world.max_episode_length,
+        "variables": variables,
+        "edges": [[place[e.cause], place[e.effect], e.lag, e.when] for e in model.edges],
+        "actions": actions,
+        "policies": ["random", *world.task.policies],
+        "has_shapes": not isinstance(live.structure, StepModel),
+    }
+
+
+def lit_edges(model: Any, pairs: frozenset[tuple[str, str]]) -> list[int]:
+    """Number the edges by contact that join what touches.
+
+    The states of a body are those named after it, and those on which a parameter of it acts
+    in every step. A parameter of what has no states, such as a floor, counts wherever bodies touch.
+    """
+    edges, moves, acts = list(model.edges), dict[str, set[str]](), dict[str, set[str]]()
+    for name in model:
+        if model.declared(name).role == "state":
+            moves.setdefault(name.rpartition(".")[0], set()).add(name)
+    for edge in edges:
+        if edge.lag and edge.when is None:
+            acts.setdefault(edge.cause, set()).add(edge.effect)
+            if model.declared(edge.cause).role == "parameter":
+                moves.setdefault(edge.cause.rpartition(".")[0], set()).add(edge.effect)
+    moves.pop("", None)
+    islands: list[set[str]] = []
+    for pair in pairs:
+        moved = set[str]().union(*(moves.get(body, set()) for body in pair))
+        joined = [island for island in islands if island & moved]
+        islands = [island for island in islands if not island & moved]
+        islands.append(moved.union(*joined))
+    found = []
+    for number, edge in enumerate(edges):
+        island = next((one for one in islands if edge.effect in one), None)
+        if edge.when == "contact" and island is not None:
+            is_state = model.declared(edge.cause).role == "state"
+            mine = {edge.cause} if is_state else acts.get(edge.cause, set())
+            mine = mine or moves.get(edge.cause.rpartition(".")[0], set())
+            if not mine or mine & island:
+                found.append(number)
+    return found
+
+
+def loop(line: str, count: int) -> list[str]:
+    """Write a line that is done several times."""
+    if count < 2:
+        return [line] * count
+    return [f"for _ in range({count}):", f"    {line}"]
+
+
+# --- discovery and verification -------------------------------------------------------------------
+
+
+@final
+class _Job:
+    """Discovery or verification in a process of its own.
+
+    Attributes:
+        kind: ``"discover"`` or ``"verify"``.
+        pipe: What comes out of it; it is closed at the end.
+    """
+
+    def __init__(self, spec: Spec, kind: str, probes: int, seed: int) -> None:
+        self.kind = kind
+        context = multiprocessing.get_context("spawn")
+        self.pipe, other = context.Pipe(duplex=False)
+        given = spec.model_dump_json(), kind, probes, seed, other
+        self._process = context.Process(target=_experiment, args=given, daemon=True)
+        self._process.start()
+        other.close()
+
+    def interrupt(self) -> None:
+        """Ask it to report what is finished, and to end."""
+        if self._process.pid is not None and self._process.is_alive():
+            os.kill(self._process.pid, signal.SIGINT)
+
+    def end(self) -> None:
+        """End it, finished or not."""
+        self._process.terminate()
+        self._process.join()
+        self.pipe.close()
+
+
+def _experiment(spec: str, kind: str, probes: int, seed: int, pipe: Connection) -> None:
+    """Run experiments and report what they find."""
+    from scm_world.discovery import discover
+    from scm_world.queries import verify
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # the session ignores it
+    about = {"type": "job", "kind": kind}
+    edges: set[Any] = set()
+
+    def found(now: set[Any]) -> None:
+        new = sorted(now - edges)
+        edges.update(new)
+        pipe.send({**about, "edges": [list(edge) for edge in new]})
+
+    def progress(done: int, planned: int) -> None:
+        pipe.send({**about, "done": done, "planned": planned})
+
+    try:
+        with Spec.model_validate_json(spec).make() as world:
+            common: dict[str, Any] = {"probes": probes, "seed": seed, "found": found}
+            if kind == "discover":
+                report = discover(world, progress=progress, **common)
+                score = report.score
+                facts: dict[str, Any] = {
+                    "probe states": report.probes,
+                    "precision": score.precision,
+                    "recall": score.recall,
+                    "F1": score.f1,
+                    "SHD": score.shd,
+                    "noise floor": report.floor,
+                }
+                missed, extra = score.missed, score.undeclared
+            else:
+                checked = verify(world, progress=progress, least=min(16, probes), **common)
+                facts = {name: said for name, said, _ in checked.rows()}
+                missed = checked.never_fired
+                extra = tuple((u.cause, u.effect, u.lag) for u in checked.undeclared)
+            pipe.send(
+                {
+                    **about,
+                    "facts": facts,
+                    "missed": [list(edge) for edge in missed],
+                    "extra": [list(edge) for edge in extra],
+                }
+            )
+    except KeyboardInterrupt:
+        pipe.send({**about, "error": "cancelled before the first probe state was finished"})
+    except Exception as error:
+        pipe.send({**about, "error": in_one_line(error)})
+    finally:
+        pipe.close()
+
+
+def work(spec: str, pipe: Connection) -> None:
+    """Run a session: what the server starts in a new process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which closes the pipe
+    try:
+        session = Session(Spec.model_validate_json(spec), pipe)
+    except Exception as error:
+        pipe.send({"type": "fatal", "error": in_one_line(error)})
+        return
+    try:
+        session.run()
+    except (BrokenPipeError, EOFError):
+        return
