@@ -47,7 +47,8 @@ def evaluate(
     Example: scm-world evaluate zoo:pushing,random --protocols P0,P5 -n 100
 
     Args:
-        policy: A file (.safetensors, .onnx, .zip, .npz, .parquet), the folder of a training run,
+        policy: A file (.safetensors, .onnx, .zip, .npz, .parquet; a .zip of Stable-Baselines3 with
+            --trust stable_baselines3), the folder of a training run,
             zoo:NAME, random, still, sweep, grasp, or module:function; several with commas;
             NAME=POLICY names one, and A+B are its runs.
         task: A task (see 'scm-world list'), a model.xml or model.urdf, or module:function; by
@@ -114,6 +115,7 @@ def evaluate(
             env=settings,
             engine=pool,
             out=folder,
+            trusted=_trusted(agents, trust),
             progress=tell,
             tell=partial(console.say, stderr=True),
         )
@@ -146,6 +148,12 @@ def evaluate(
             whole=(0,),
         )
     console.written(*files, *more)
+
+
+def _trusted(agents: dict[str, list[str]], trust: list[str] | None) -> tuple[str, ...] | None:
+    """Return what is trusted by name, and what the command itself names."""
+    named = (text.partition(":")[0] for runs in agents.values() for text in runs if ":" in text)
+    return None if not trust else (*trust, *(name.partition(".")[0] for name in named))
 
 
 def policies_of(text: str) -> dict[str, list[str]]:

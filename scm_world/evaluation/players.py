@@ -15,6 +15,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._arguments import load
 from scm_world.env import ScmWorldEnv
 from scm_world.env.arguments import action_scale
 from scm_world.env.delta import PREFIX as RELATIVE_MODE
@@ -38,7 +39,7 @@ About = dict[str, Any]
 Actor = Callable[[Any], Any]
 """Gives an action for an observation, within one episode."""
 
-PACKAGE = "scm_world"
+PACKAGE, SB3 = "scm_world", "stable_baselines3"
 SUFFIXES = (".safetensors", ".onnx", ".zip", ".npz", ".parquet")
 _ADVICE = "give the path of a policy"
 _FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
@@ -68,8 +69,8 @@ FORMS = (
     "an object with the method predict",
     "an array of actions",
     "an episode",
-    "a file (.safetensors, .onnx, .zip of Stable-Baselines 2, .npz of an episode, .parquet of a "
-    "recording)",
+    "a file (.safetensors, .onnx, .zip of Stable-Baselines 2 or 3, .npz of an episode, .parquet of "
+    "a recording)",
     "the folder of a training run",
     "'zoo:name'",
     "'module:function'",
@@ -304,6 +305,7 @@ def as_player(policy: Any, *, trusted: Sequence[str] | None = None) -> Player:
             (steps, n); an episode of ``World.rollout`` or of a recording; the path of a policy
             file, of an ONNX network, an archive of Stable-Baselines 2, a saved episode or a
             recording (``"runs.parquet#3"`` for its fourth episode); the folder of a training run;
+            an archive of Stable-Baselines3, if ``"stable_baselines3"`` is among ``trusted``;
             ``"zoo:pushing"``, one that comes with this package; or
             ``"package.module:function"``.
         trusted: Packages whose functions may be named. None: any, as the caller named it.
@@ -392,21 +394,44 @@ def _of_text(text: str, trusted: Sequence[str] | None) -> Player:
             network = OnnxPolicy(path)
             return _of_network(network, {**about, "library": network.library})
         case ".zip":
-            return _of_network(_archived(path), about)
+            found = _archived(path, trusted or ())
+            if isinstance(found, MlpPolicy):
+                return _of_network(found, about)
+            return Player({**about, **_library(SB3)}, partial(_model, found))
         case ".npz":
             return _of_episode(load_episode(path, trusted=trusted or ()), about)
     return _of_episode(_recorded(path, number, trusted or ()), about)
 
 
-def _archived(path: Path) -> MlpPolicy:
+def _archived(path: Path, trusted: Sequence[str]) -> Any:
+    """Read an archive of Stable-Baselines 2, or the policy of one of Stable-Baselines3.
+
+    Raises:
+        UnreadableFile: It is neither, or one of Stable-Baselines3, and that is not trusted.
+        MissingExtra: Stable-Baselines3 is not installed.
+    """
     try:
         return load_sb2(path)
     except UnreadableFile as error:
         if b"_stable_baselines3_version" not in read_bytes(path):
             raise
-        advice = "load it if you trust it, and give the model: as_player(PPO.load(path))"
-        reason = "it is one of Stable-Baselines3, whose reading may run any code in it"
-        raise UnreadableFile(str(path), reason, advice) from error
+        if SB3 not in trusted:
+            advice = (
+                f"if you trust it, say so by trusted=({SB3!r},), or --trust {SB3}, or give the "
+                "model: as_player(PPO.load(path))"
+            )
+            reason = "it is one of Stable-Baselines3, whose reading may run any code in it"
+            raise UnreadableFile(str(path), reason, advice) from error
+    library: Any = load(SB3, "stable-baselines3", "train")
+    try:
+        saved: Any = load(f"{SB3}.common.save_util", "stable-baselines3", "train")
+        data, _, _ = saved.load_from_zip_file(path)
+        kind = {"SACPolicy": "SAC", "TD3Policy": "TD3"}.get(data["policy_class"].__name__)
+        kind = kind or ("PPO" if "clip_range" in data else "A2C")
+        return getattr(library, kind).load(path, device="cpu").policy
+    except Exception as error:  # of many kinds: torch, pickle, zip, Stable-Baselines3
+        advice = "load it yourself, and give the model: as_player(PPO.load(path))"
+        raise UnreadableFile(str(path), f"it cannot be loaded ({error})", advice) from error
 
 
 def _recorded(path: Path, number: str, trusted: Sequence[str]) -> Recorded:
@@ -465,8 +490,16 @@ def _of_object(policy: Any, about: About) -> Player:
     if isinstance(policy, MlpPolicy):
         return _of_network(policy, {**about, "sha256": policy.sha256})
     if hasattr(policy, "predict"):
-        return Player(about, partial(_model, policy))
+        return Player(about, partial(_model, policy), made_for=_env_of(policy))
     return Player(about, partial(_function, policy))
+
+
+def _env_of(model: Any) -> PolicyAbout | None:
+    """Say what a model was trained for that still has an environment of this package."""
+    try:
+        return PolicyAbout.in_env(model.get_env())
+    except (AttributeError, UnknownOption):
+        return None
 
 
 def _description(policy: Any) -> About:

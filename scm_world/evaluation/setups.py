@@ -10,6 +10,7 @@ from functools import cached_property
 from hashlib import blake2b
 from typing import Any, final
 
+import gymnasium
 import numpy as np
 
 from scm_world._arguments import one_of, whole_number
@@ -27,6 +28,7 @@ from scm_world.evaluation.agents import (
 from scm_world.evaluation.episodes import EpisodeRunner, unrelated
 from scm_world.evaluation.protocols import Protocol, chosen, protocols_of
 from scm_world.models import Model
+from scm_world.policies.cards import FORM
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import PACKAGE
 from scm_world.tasks import TASKS, Task, make_task, tasks
@@ -245,6 +247,16 @@ def prepare(
         ScmWorldError: What is wrong, by name.
     """
     loaded = load_agents(policy, trusted)
+    for agent in loaded:
+        about, path = agent.about, str(agent.about.get("path", ""))
+        learned = path.endswith(".onnx") or (path.endswith(".zip") and "library" in about)
+        learned = learned or (hasattr(agent.player.policy, "predict") and "sha256" not in about)
+        if learned and agent.player.made_for is None and not {*FORM} & {*(env or {})}:
+            gymnasium.logger.warn(
+                f"{agent.agent!r} does not say how it observes and acts; it acts here with the "
+                "defaults of gymnasium.make, and recipes train with other actions: give "
+                "env={'action_mode': …} as in its training, or a file that export_sb3 has written"
+            )
     trained = [(agent.agent, agent.player.made_for) for agent in loaded]
     task = task_for(task, trained, trusted or ())
     if not isinstance(task, Task | str):

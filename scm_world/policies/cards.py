@@ -125,6 +125,30 @@ class PolicyAbout(Frozen):
             raise ValueError(f"parts of an observation, each once; got {inputs}")
         return inputs
 
+    @classmethod
+    def in_env(cls, env: Any, **more: Any) -> Self:
+        """Say that a policy was trained in an environment.
+
+        Args:
+            env: Of this package, in any wrappers, or many of them.
+            more: Further fields.
+
+        Raises:
+            UnknownOption: It is none of this package.
+        """
+        try:
+            (made_with, *_) = (
+                env.get_attr("made_with")
+                if hasattr(env, "get_attr")
+                else (env.unwrapped.made_with,)
+            )
+        except AttributeError:
+            given = type(getattr(env, "unwrapped", env)).__name__
+            raise UnknownOption("environment of a policy", given, ("ScmWorldEnv",)) from None
+        task = made_with["task"]
+        name = task if isinstance(task, str) else getattr(task, "name", str(task))
+        return cls(task=name, env={option: made_with[option] for option in OPTIONS}, **more)
+
     def option(self, name: str) -> Any:
         """Return an option of the environment, as JSON has it; None is the task's own."""
         return self.env.get(name, usual(name, self.task))

@@ -307,12 +307,15 @@ def load_policy(path: Path | str) -> MlpPolicy:
     """Read a trained policy. Nothing in the file is executed.
 
     Args:
-        path: Of the file.
+        path: Of the file; ``"zoo:pushing"``; or the folder of a training run, see ``file_of``.
 
     Raises:
+        UnknownOption: The zoo has none of this name.
         UnreadableFile: It is damaged, of another kind, too large, or not there.
     """
-    name = str(path)
+    from scm_world.policies.zoo import file_of  # which reads cards by this function
+
+    name = str(file_of(path))
     try:
         with safetensors.safe_open(regular(Path(name), LARGEST), framework="np") as file:
             text = (file.metadata() or {}).get(KEY)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from scm_world._arguments import load
-from scm_world.errors import UnreadableFile
+from scm_world.errors import ModelError, ScmWorldError, UnknownOption, UnreadableFile
 from scm_world.evaluation import evaluate
 from scm_world.output.durable import write_durably
-from scm_world.policies import MlpPolicy, PolicyAbout, load_policy
+from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
 from scm_world.policies.cards import FORM, KEY, OPTIONS
 from scm_world.training.recipe import Recipe
 from scm_world.training.settings import Trials
@@ -29,21 +30,81 @@ def exported(model: Any, recipe: Recipe, card: Mapping[str, Any]) -> MlpPolicy:
         recipe: How it was trained.
         card: What is said of it, as plain data.
     """
+    env = {name: value for name, value in recipe.options.items() if name in OPTIONS}
+    return _network(model, PolicyAbout(task=recipe.task, env=env, card=dict(card)))
+
+
+def _network(model: Any, about: PolicyAbout) -> MlpPolicy:
+    """Read the network of a model; what it was trained for is known."""
     spaces = getattr(model.observation_space, "spaces", None)
-    about = PolicyAbout(
-        task=recipe.task,
-        env={name: value for name, value in recipe.options.items() if name in OPTIONS},
-        activation=recipe.network.activation,
-        output="clip" if recipe.algo == "ppo" else "tanh",
-        inputs=None if spaces is None else tuple(spaces),
-        card=dict(card),
-    )
+    squashes = getattr(model.policy, "actor", None) is not None
+    form = {
+        "activation": model.policy.activation_fn.__name__.lower(),
+        "output": "tanh" if squashes else "clip",
+        "inputs": None if spaces is None else tuple(spaces),
+    }
     tensors = {
         name: tensor.detach().cpu().numpy().copy() for name, tensor in _tensors(model).items()
     }
     for name in _first(tensors):
         tensors[name] *= _scale(model)
-    return MlpPolicy.of(tensors, about)
+    return MlpPolicy.of(tensors, {**about.model_dump(), **form})
+
+
+def export_sb3(model: Any, env: Any, path: Path | str, **card: Any) -> Path:
+    """Write a model of Stable-Baselines3 as a policy file.
+
+    ``evaluate``, ``load_policy``, ``to_onnx`` and ``--start`` take it, with the options of its
+    environment, and without torch. Actions are compared before anything is written.
+
+    Args:
+        model: PPO, A2C, SAC, TD3 or DDPG with a multilayer perceptron of ``Tanh`` or ``ReLU``.
+        env: In which it was trained: an environment, many, or a ``VecEnv`` of either.
+        path: Of the file; it ends in ``.safetensors``.
+        card: What else is said of it, as plain data.
+
+    Returns:
+        The path.
+
+    Raises:
+        UnknownOption: The environment is none of this package, or shows something else than the
+            model observes; actions are not in [-1, 1]; or the path has another ending.
+        ModelError: The network is of another kind, or observations are normalised beside it.
+        UnwritableFolder: There is no room, or no permission.
+
+    Example:
+        >>> model = stable_baselines3.PPO("MlpPolicy", env).learn(100_000)  # doctest: +SKIP
+        >>> export_sb3(model, env, "mine.safetensors")  # doctest: +SKIP
+    """
+    about = PolicyAbout.in_env(env, card=card)
+    space = getattr(env, "single_observation_space", env.observation_space)
+    if space != model.observation_space:
+        allowed = (f"one that shows {model.observation_space}, as the model observes",)
+        raise UnknownOption("environment of the model", space, allowed)
+    if not (np.all(model.action_space.low == -1.0) and np.all(model.action_space.high == 1.0)):
+        raise UnknownOption("actions of the model", model.action_space, ("those in [-1, 1]",))
+    beside = model.get_vec_normalize_env()
+    if beside is not None and beside.norm_obs:
+        raise ModelError(
+            [
+                "VecNormalize changes what the network observes, and is no part of it; train with "
+                "norm_obs=False: observations are in [-1, 1] already"
+            ]
+        )
+    try:
+        policy = _network(model, about)
+        sampled = copy.deepcopy(space)
+        sampled.seed(0)
+        for _ in range(10):
+            seen = sampled.sample()
+            wanted = model.predict(seen, deterministic=True)[0]
+            if not np.allclose(policy(seen), wanted, rtol=1e-3, atol=1e-4):
+                raise ValueError("its actions are not those of its linear layers")
+    except (AttributeError, KeyError, ValueError, ScmWorldError) as error:
+        kinds = "PPO, A2C, SAC, TD3 or DDPG with a multilayer perceptron of Tanh or ReLU"
+        problem = f"the network of the model cannot be written ({error}): give {kinds}"
+        raise ModelError([problem]) from error
+    return Path(str(save_policy(path, policy)))
 
 
 def begin_with(model: Any, recipe: Recipe, start: Path | str) -> None:

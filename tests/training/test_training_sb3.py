@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import scm_world  # noqa: F401 # registers the environments
-from scm_world.errors import UnknownOption
+from scm_world.cli import app
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.evaluation import evaluate
+from scm_world.policies import load_policy, save_policy
 
 sb3 = pytest.importorskip("stable_baselines3")
+torch = pytest.importorskip("torch")
 
+from scm_world.training.export import export_sb3  # noqa: E402 # needs the library
 from scm_world.training.sb3 import Sb3VecEnv, make_sb3  # noqa: E402 # needs the library
 
 PUSHING = "scm_world/Pushing-v0"
@@ -132,3 +139,92 @@ def test_it_learns_and_counts_episodes() -> None:
     sac = sb3.SAC("MultiInputPolicy", envs, replay_buffer_class=replay, learning_starts=40, seed=0)
     sac.learn(56)
     assert sac.replay_buffer.size() == 14
+
+
+# --- what others can use ----------------------------------------------------------------------
+
+RELATIVE: dict[str, Any] = {
+    "backend": "fake",
+    "action_mode": "delta_joint_positions",
+    "delta_scale": 0.1,
+    "max_episode_length": 4,
+}
+
+
+def small(**network: Any) -> dict[str, Any]:
+    """Give arguments of a small model, which algorithms change."""
+    return {"policy_kwargs": {"net_arch": [8], **network}, "device": "cpu", "seed": 0}
+
+
+@pytest.mark.parametrize("algo", ["PPO", "A2C", "SAC", "TD3"])
+def test_models_become_policy_files(algo: str, tmp_path: Path) -> None:
+    """They act as the models, in the environment of the training, wherever they are named."""
+    env = gymnasium.make("scm_world/Pushing-v0", **RELATIVE)
+    model = getattr(sb3, algo)("MlpPolicy", env, **small())
+    path = export_sb3(model, env, tmp_path / "mine.safetensors", note="random")
+    policy = load_policy(path)
+    assert policy.about.option("action_mode") == "delta_joint_positions"
+    assert (policy.about.task, policy.about.card["note"]) == ("pushing", "random")
+    seen = np.stack([env.observation_space.sample() for _ in range(5)])
+    np.testing.assert_allclose(policy(seen), model.predict(seen, deterministic=True)[0], atol=1e-5)
+    scores = [
+        evaluate(one, "P5", n=2, backend="fake", env={"max_episode_length": 4}).columns["return"]
+        for one in (model, path)
+    ]
+    np.testing.assert_allclose(*scores, rtol=1e-3)
+
+
+def test_models_that_are_no_policy_file_are_refused(tmp_path: Path) -> None:
+    """With what to do; nothing is written."""
+    env = gymnasium.make("scm_world/Pushing-v0", **RELATIVE)
+    model = sb3.PPO("MlpPolicy", env, **small())
+    other = gymnasium.make("scm_world/Pushing-v0", backend="fake", keypoints=True)
+    with pytest.raises(UnknownOption, match="as the model observes"):
+        export_sb3(model, other, tmp_path / "mine.safetensors")
+    with pytest.raises(UnknownOption, match="environment of a policy"):
+        export_sb3(model, gymnasium.make("CartPole-v1"), tmp_path / "mine.safetensors")
+    odd = sb3.PPO("MlpPolicy", env, **small(activation_fn=torch.nn.ELU))
+    with pytest.raises(ModelError, match="Tanh or ReLU"):
+        export_sb3(odd, env, tmp_path / "mine.safetensors")
+    vector = sb3.common.vec_env.DummyVecEnv([lambda: env])
+    scaled = sb3.common.vec_env.VecNormalize(vector)
+    with pytest.raises(ModelError, match="norm_obs=False"):
+        export_sb3(sb3.PPO("MlpPolicy", scaled, **small()), scaled, tmp_path / "mine.safetensors")
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("algo", ["PPO", "SAC"])
+def test_archives_are_loaded_where_that_is_trusted(algo: str, tmp_path: Path) -> None:
+    """By name alone; they do not say how they act, which is told unless the user says it."""
+    env = gymnasium.make("scm_world/Pushing-v0", **RELATIVE)
+    model = getattr(sb3, algo)("MlpPolicy", env, **small())
+    model.save(tmp_path / "model.zip")
+    path = str(tmp_path / "model.zip")
+    with pytest.raises(UnreadableFile, match="--trust stable_baselines3"):
+        evaluate(path, "P0", n=1, backend="fake")
+    given: dict[str, Any] = {"n": 1, "trusted": ("stable_baselines3",)}
+    form = {name: value for name, value in RELATIVE.items() if name != "backend"}
+    found = evaluate(path, "P0", backend="fake", env=form, **given)
+    whole = evaluate(model, "P0", n=1, backend="fake", env={"max_episode_length": 4})
+    assert found.columns["return"] == whole.columns["return"]
+    with pytest.warns(UserWarning, match="does not say how it observes and acts"):
+        evaluate(path, "P0", backend="fake", env={"max_episode_length": 4}, **given)
+    done = CliRunner().invoke(
+        app,
+        [
+            *("evaluate", path, "pushing", "--protocols=P0", "-n1", "--backend=fake"),
+            *("--env=max_episode_length=2", "--trust=stable_baselines3", "--workers=1"),
+            *("--env=action_mode=delta_joint_positions", f"--out={tmp_path / 'out'}"),
+        ],
+    )
+    assert done.exit_code == 0, done.output
+
+
+def test_policies_of_the_zoo_are_loaded_by_name(tmp_path: Path) -> None:
+    """As in every other place where a policy is named; also a folder."""
+    policy = load_policy("zoo:reaching")
+    assert policy.about.task == "reaching"
+    save_policy(tmp_path / "best.safetensors", policy)
+    assert load_policy(tmp_path).sha256 == policy.sha256
+    with pytest.raises(UnknownOption, match="zoo:reaching"):
+        load_policy("zoo:reeching")

@@ -35,7 +35,7 @@ def card(name: str) -> PolicyAbout:
     Raises:
         UnknownOption: There is none of this name.
     """
-    return load_policy(file_of(f"{PREFIX}{name.removeprefix(PREFIX)}")).about
+    return load_policy(f"{PREFIX}{name.removeprefix(PREFIX)}").about
 
 
 def file_of(policy: Path | str) -> Path:
