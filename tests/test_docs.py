@@ -98,6 +98,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it sho
     "augmentation": ("24", "60"),
     "cartpole_swing_up": (),
     "curricula": (),
+    "demonstrations": ("1", "10"),
     "discovery": (),
     "environments": (),
     "evaluation": (),
@@ -127,6 +128,7 @@ SHORT = (
 LEARNING = {  # they need the extra "train", which few machines have
     "train_and_evaluate": ("stable_baselines3",),
     "representations": ("torch", "sklearn", "pyarrow", "PIL"),
+    "demonstrations": ("torch",),
 }
 MODELS = {"panda_reach": "robosuite"}  # where the model comes from; importing it takes seconds
 

@@ -28,6 +28,7 @@ from scm_world.env.arguments import (
 from scm_world.env.copies import Copied
 from scm_world.env.delta import COMMAND, PREFIX, Delta, checked_mode
 from scm_world.env.observer import (
+    STACKS,
     Goals,
     Observation,
     Observer,
@@ -101,6 +102,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         cameras: Names (``"60"``, ``"120"``, ``"300"``, ``"overview"``) or cameras, for
             ``"pixel"``; the three of the robot if None.
         image_size: Height and width of pictures, or both in one [pixels].
+        stack: Of the pictures of ``"pixel"``: ``"cameras"``: one after another, shape
+            (2 n, 3, h, w); ``"channels"``: as convolutional networks take them, (6 n, h, w).
         normalize_observations: Give numbers in [-1, 1] instead of SI units.
         goal_env: Give a dictionary with ``observation``, ``achieved_goal``, ``desired_goal``, and
             have a method ``compute_reward``: see ``GoalReward``.
@@ -116,6 +119,10 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             what Gymnasium's ``TimeLimit`` does; never if None or -1.
         conventions: ``"scm_world"`` or ``"causal_world"``.
         render_mode: None, ``"rgb_array"`` or ``"human"``.
+        render_camera: Of ``render``: a camera or its name, as in ``cameras``; of a model also one
+            in its file. ``"overview"``, or of a model ``"automatic"``, if None.
+        render_size: Height and width of what ``render`` gives, or both in one [pixels]; if None
+            480 and 640, or those of a camera that is given.
 
     Raises:
         UnknownOption: An option does not exist, or does not go with the others.
@@ -157,6 +164,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         keypoints: bool = False,
         cameras: Sequence[str | Camera] | None = None,
         image_size: int | tuple[int, int] | None = None,
+        stack: str = STACKS[0],
         normalize_observations: bool = True,
         goal_env: bool = False,
         start: Mapping[str, Any] | None = None,
@@ -167,6 +175,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         max_episode_steps: int | None = None,
         conventions: str = "scm_world",
         render_mode: str | None = None,
+        render_camera: str | Camera | Mapping[str, Any] | None = None,
+        render_size: int | tuple[int, int] | None = None,
     ) -> None:
         made_with = {name: value for name, value in locals().items() if name not in _NOT_GIVEN}
         self._how = Observing(
@@ -177,6 +187,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             keypoints=keypoints,
             cameras=cameras,
             image_size=image_size,
+            stack=stack,
             normalize=normalize_observations,
             goals=goal_env,
         )
@@ -205,6 +216,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._attempts = whole_number("attempts", attempts, least=1)
         one_of("render_mode", render_mode, (None, *RENDER_MODES))
         self.render_mode = render_mode
+        self._choose_view(render_camera, render_size)
         self._window = Window() if render_mode == "human" else None
         modes = [one for one in RENDER_MODES if one != "human" or Window.is_possible()]
         fps = round(1 / self.world.control_period)
@@ -423,7 +435,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         return info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Draw the scene, shape (480, 640, 3); None without ``render_mode="rgb_array"``.
+        """Draw the scene, shape (h, w, 3); None without ``render_mode="rgb_array"``.
 
         With ``render_mode="human"`` the window shows every step by itself. A model is drawn by
         MuJoCo where it can, and its camera follows what moves.
@@ -438,7 +450,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         from scm_world.backends.renderer import picture
 
         scene = self.world.scene()
-        return picture(scene, self._camera_of(scene))
+        return picture(scene, self._camera_of(scene), self._size)
 
     def close(self) -> None:
         """Free the backend and the window."""

@@ -35,6 +35,9 @@ from scm_world.world.mechanisms import places
 BOUND = 10.0
 """Goals that saturate are positions [m], sizes [m] and unit quaternions; beyond they saturate."""
 
+STACKS = ("cameras", "channels")
+"""How the pictures of several cameras are put together."""
+
 TERMS: dict[str, Callable[[Task, Floats, Floats], Any]] = {
     FRACTION: lambda task, have, want: task.fraction(have, want),
     SUCCESS: lambda task, have, want: task.fulfilled(task.fraction(have, want)),
@@ -173,6 +176,7 @@ class Observing:
     keypoints: bool = False
     cameras: Sequence[str | Camera] | None = None
     image_size: int | tuple[int, int] | None = None
+    stack: str = STACKS[0]
     normalize: bool = True
     goals: bool = False
 
@@ -186,9 +190,11 @@ class Observing:
         appended = self.include or self.keypoints or self.context == "observation"
         if pictures and appended:
             raise UnknownOption("appendix of a picture", "numbers", ("context='privileged'",))
-        for option, value in (("cameras", self.cameras), ("image_size", self.image_size)):
-            if value is not None and not pictures:
-                allowed = ("any with observation_mode='pixel'", "None in the other modes")
+        one_of("stack", self.stack, STACKS)
+        for option, usual in (("cameras", None), ("image_size", None), ("stack", STACKS[0])):
+            value = getattr(self, option)
+            if value != usual and not pictures:
+                allowed = ("any with observation_mode='pixel'", f"{usual} in the other modes")
                 raise UnknownOption(option, value, allowed)
 
 
@@ -243,7 +249,7 @@ def observer(
     if how.mode == "pixel":
         from scm_world.env.pixels import Pixels
 
-        main = Pixels(world, how.cameras, how.image_size)
+        main = Pixels(world, how.cameras, how.image_size, how.stack)
     else:
         main = _vector(world, declaration, how)
     parts: dict[str, Observer] = {"observation": main}

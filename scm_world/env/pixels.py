@@ -20,6 +20,7 @@ from scm_world.backends.renderer import (
     now_pixels,
     scene_camera,
 )
+from scm_world.env.observer import STACKS
 from scm_world.env.vector import Layouts
 from scm_world.errors import UnknownOption
 from scm_world.models import Scene
@@ -35,7 +36,7 @@ AUTOMATIC = "automatic"
 def _sized(found: Sequence[Camera], size: Size | None) -> tuple[Camera, ...]:
     """Give cameras pictures of one size."""
     if size is not None:
-        height, width = _height_and_width(size)
+        height, width = height_and_width("image_size", size)
         found = [replace(camera, height=height, width=width) for camera in found]
     sizes = {(camera.height, camera.width) for camera in found}
     if len(sizes) != 1 or min(min(sizes)) < 1:
@@ -43,7 +44,7 @@ def _sized(found: Sequence[Camera], size: Size | None) -> tuple[Camera, ...]:
     return tuple(found)
 
 
-def _camera(camera: Any, known: Mapping[str, Camera] | None) -> Any:
+def read_camera(camera: Any, known: Mapping[str, Camera] | None) -> Any:
     """Look up a camera, or read one that was written down as a dictionary; others are not known."""
     if isinstance(camera, Camera):
         return camera
@@ -66,10 +67,15 @@ def _camera(camera: Any, known: Mapping[str, Camera] | None) -> Any:
     return known[camera]
 
 
-def _height_and_width(size: Any) -> tuple[int, int]:
+def height_and_width(option: str, size: Any) -> tuple[int, int]:
+    """Read the size of pictures: height and width, or both in one [pixels].
+
+    Raises:
+        UnknownOption: It is something else.
+    """
     numbers = np.asarray(size)
     if numbers.shape not in ((), (2,)) or not np.issubdtype(numbers.dtype, np.integer):
-        raise UnknownOption("image_size", size, ("a whole number", "(height, width)"))
+        raise UnknownOption(option, size, ("a whole number", "(height, width)"))
     height, width = np.broadcast_to(numbers, (2,)).tolist()
     return height, width
 
@@ -85,12 +91,15 @@ class Pixels:
             where they stand now.
         size: Height and width of the pictures, or both in one [pixels]; if None those of the
             cameras, or of a model 128.
+        stack: ``"cameras"``: pictures one after another; ``"channels"``: their channels, as
+            convolutional networks take them.
 
     Attributes:
         names: The variables that have to be computed: none.
         layouts: Where variables stand in vectors: there are none.
         space: uint8, shape (n, 3, h, w), with goals (2 n, 3, h, w); under the predecessor's
-            conventions (2 n, h, w, 3).
+            conventions (2 n, h, w, 3). With ``stack="channels"`` all channels of the first
+            picture, then those of the next ones: (6 n, h, w), or (h, w, 6 n).
 
     Raises:
         UnknownOption: There is no such camera, or the sizes are none or differ.
@@ -100,7 +109,11 @@ class Pixels:
     names: tuple[str, ...] = ()
 
     def __init__(
-        self, world: Simulation, cameras: Sequence[str | Camera] | None, size: Size | None
+        self,
+        world: Simulation,
+        cameras: Sequence[str | Camera] | None,
+        size: Size | None,
+        stack: str = STACKS[0],
     ) -> None:
         drawing, published = drawing_of(world.structure), world.conventions.published_observation
         self._world, self._shows_goals = world, drawing.overview is not None
@@ -112,12 +125,12 @@ class Pixels:
         self._given = tuple(given)
         if drawing.overview is not None:
             known = {camera.name: camera for camera in (*own, drawing.overview)}
-            found = [_camera(camera, known) for camera in given]
+            found = [read_camera(camera, known) for camera in given]
         else:
             plain = Camera("", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
             scene, shape = world.structure.default_scene(), (plain.height, plain.width)
             found = [
-                scene_camera(scene, _camera(c, None), shape if isinstance(c, str) else None)
+                scene_camera(scene, read_camera(c, None), shape if isinstance(c, str) else None)
                 for c in given
             ]
         self._follows = [not published and isinstance(c, str) and c in usual for c in given]
@@ -127,10 +140,20 @@ class Pixels:
         one, n = self._convention.shape(self._cameras[0]), len(given)
         self._goals: NDArray[np.uint8] = np.empty((n, *one), dtype=np.uint8)
         self._shape = (2 * n if self._shows_goals else n, *one)
+        self._stacks = stack == "channels"
+        shown = self._stacked(np.empty(self._shape, dtype=np.uint8)).shape
         self.space: gymnasium.Space[NDArray[np.uint8]] = gymnasium.spaces.Box(
-            0, 255, self._shape, np.uint8
+            0, 255, shown, np.uint8
         )
         self._version = -1
+
+    def _stacked(self, pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Put the channels of all pictures together, if that is asked for."""
+        if not self._stacks:
+            return pictures
+        if self._convention.channels_last:
+            return np.concatenate(pictures, axis=-1)
+        return pictures.reshape(-1, *self._shape[2:])
 
     def observe(self, now: Values) -> NDArray[np.uint8]:
         """Draw; pictures of the goals are kept until someone intervenes."""
@@ -141,7 +164,7 @@ class Pixels:
             pairs = zip(self._given, self._cameras, strict=True)
             cameras = [placed(scene, given, camera) for given, camera in pairs]
             now_pixels(scene, cameras, pictures, convention=layout)
-            return pictures
+            return self._stacked(pictures)
         if self._version != self._world.version:
             self._version = self._world.version
             present = {camera.name: camera for camera in self._world.cameras()}
@@ -154,7 +177,7 @@ class Pixels:
             goal_pixels(scene, self._cameras, self._goals, convention=layout)
         now_pixels(scene, self._cameras, pictures[:n], convention=layout)
         pictures[n:] = self._goals
-        return pictures
+        return self._stacked(pictures)
 
 
 def placed(scene: Scene, given: str | Camera, camera: Camera) -> Camera:

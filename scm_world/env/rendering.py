@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import one_of
+from scm_world._arguments import one_of, whole_number
 from scm_world.env.observer import Observer
 from scm_world.errors import EngineError
 from scm_world.models import Scene
@@ -69,6 +69,8 @@ class Looks:
     _observer: Observer
     _modes: tuple[str, str]
     _automatic: Camera | None = None
+    _view: Camera | str | None = None
+    _size: tuple[int, int] | None = None
 
     @property
     def observation_mode(self) -> str:
@@ -89,6 +91,24 @@ class Looks:
     def context_layout(self) -> dict[str, slice]:
         """Where each variable stands in the privileged context; empty without one."""
         return dict(self._observer.layouts.get("context", {}))
+
+    def _choose_view(self, camera: Any, size: Any) -> None:
+        """Choose camera and size of the pictures for people.
+
+        Raises:
+            UnknownOption: There is no such camera, or the size is none.
+            ModelError: There is nothing to draw.
+        """
+        from scm_world.env.pixels import height_and_width, read_camera
+
+        if camera is not None:
+            from scm_world.backends.renderer import scene_camera
+
+            self._view = read_camera(camera, None)
+            scene_camera(self.world.structure.default_scene(), self._view)
+        if size is not None:
+            self._size = height_and_width("render_size", size)
+            whole_number("render_size", min(self._size), least=1)
 
     def _camera(self, camera: Camera | str | None) -> Camera:
         from scm_world.backends.renderer import drawing_of, scene_camera
@@ -120,8 +140,11 @@ class Looks:
     def _camera_of(self, scene: Scene) -> Camera:
         """Give the camera of pictures for people: of a model it follows what moves."""
         from scm_world.backends.renderer import drawing_of, following_camera, scene_camera
+        from scm_world.env.pixels import AUTOMATIC
 
         overview = drawing_of(self.world.structure).overview
+        if self._view is not None and (overview is not None or self._view != AUTOMATIC):
+            return self._camera(self._view)
         if overview is not None:
             return overview
         if self._automatic is None:

@@ -58,6 +58,8 @@ _UNUSED: Mapping[str, Any] = {
     "attempts": 1,
     "variables_space": None,
     "render_mode": None,
+    "render_camera": None,
+    "render_size": None,
 }
 """Arguments of an environment that repeats recorded interventions, and makes none itself."""
 

@@ -11,9 +11,11 @@ import gymnasium
 import numpy as np
 import pytest
 from envs import BACKENDS, REACHING, make
+from model_tasks import Balance
 
+from scm_world.env import MODEL_ID
 from scm_world.env.rendering import Window
-from scm_world.errors import EngineError
+from scm_world.errors import EngineError, UnknownOption
 from scm_world.tasks.trifinger.cameras import CAMERAS
 
 
@@ -122,3 +124,45 @@ def test_frames_can_be_collected() -> None:
     frames = env.render()
     assert [frame.shape for frame in frames] == [(480, 640, 3)] * 2
     assert SimpleNamespace(**env.metadata).render_fps == 25
+
+
+@pytest.mark.parametrize("size", [(30, 40), 24])
+def test_pictures_for_people_have_the_camera_and_the_size_that_were_asked_for(size: Any) -> None:
+    """Of the robot's tasks and of models; what does not exist is refused at once."""
+    given = {"render_mode": "rgb_array", "render_size": size}
+    shape = np.broadcast_to(size, 2).tolist()
+    pictures = []
+    for camera in ("60", "120", None, CAMERAS[1]):
+        env = make(render_camera=camera, **given)
+        env.reset(seed=0)
+        pictures.append(env.render())
+        assert [*pictures[-1].shape] == [*shape, 3]
+    assert not np.array_equal(pictures[0], pictures[1])
+    np.testing.assert_array_equal(pictures[1], pictures[3])
+    for camera in ("side", "automatic", None):
+        model = gymnasium.make(MODEL_ID, model=Balance(), render_camera=camera, **given)
+        model.reset(seed=0)
+        assert [*model.render().shape] == [*shape, 3]
+    with pytest.raises(UnknownOption, match="camera"):
+        make(render_camera="61")
+    with pytest.raises(UnknownOption, match="render_size"):
+        make(render_size=(10.5, 4))
+    with pytest.raises(UnknownOption, match="render_size"):
+        make(render_size=0)
+
+
+@pytest.mark.parametrize("conventions", ["scm_world", "causal_world"])
+def test_channels_of_all_pictures_are_one_image(conventions: str) -> None:
+    """The same pixels as one picture after another, in one environment and in many."""
+    options = {"observation_mode": "pixel", "image_size": 16, "conventions": conventions}
+    apart, together = (make(stack=stack, **options) for stack in ("cameras", "channels"))
+    pictures, channels = apart.reset(seed=0)[0], together.reset(seed=0)[0]
+    assert channels.shape == together.observation_space.shape
+    axis = -1 if conventions == "causal_world" else 0
+    np.testing.assert_array_equal(channels, np.concatenate(pictures, axis=axis))
+    envs = gymnasium.make_vec(REACHING, 2, backend="fake", stack="channels", **options)
+    assert envs.reset(seed=0)[0].shape == (2, *channels.shape)
+    with pytest.raises(UnknownOption, match="stack"):
+        make(stack="channels")
+    with pytest.raises(UnknownOption, match="did you mean 'channels'"):
+        make(stack="channel", **options)

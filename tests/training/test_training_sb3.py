@@ -228,3 +228,13 @@ def test_policies_of_the_zoo_are_loaded_by_name(tmp_path: Path) -> None:
     assert load_policy(tmp_path).sha256 == policy.sha256
     with pytest.raises(UnknownOption, match="zoo:reaching"):
         load_policy("zoo:reeching")
+
+
+def test_a_network_of_convolutions_takes_stacked_channels() -> None:
+    """The checker of Stable-Baselines3 has nothing to say, and its network learns."""
+    from stable_baselines3.common.env_checker import check_env
+
+    options: dict[str, Any] = {"observation_mode": "pixel", "stack": "channels", "image_size": 36}
+    env = gymnasium.make(PUSHING, backend="fake", max_episode_length=4, **options)
+    check_env(env, skip_render_check=True)
+    sb3.PPO("CnnPolicy", env, n_steps=4, batch_size=4, device="cpu").learn(4)
