@@ -161,6 +161,20 @@ def _check_categories(variable: Variable, value: Value) -> None:
         raise ModelError([said])
 
 
+def first_value(variable: Variable) -> Value:
+    """Return the value that lagged children of a variable see before the first step."""
+    match variable:
+        case Derived():
+            first: Any = variable.start
+        case Fixed():
+            first = variable.value
+        case Exogenous():
+            first = variable.default
+        case _:
+            first = 0.0
+    return variable.array(np.broadcast_to(first, variable.shape) if np.ndim(first) == 0 else first)
+
+
 @final
 class Evaluator:
     """The mechanisms of a model, with their functions looked up once.
@@ -316,19 +330,7 @@ class Evaluator:
 
     def first(self, name: str) -> Value:
         """Return the value that lagged children see before the first step."""
-        variable = self._declared[name]
-        match variable:
-            case Derived():
-                first: Any = variable.start
-            case Fixed():
-                first = variable.value
-            case Exogenous():
-                first = variable.default
-            case _:
-                first = 0.0
-        return variable.array(
-            np.broadcast_to(first, variable.shape) if np.ndim(first) == 0 else first
-        )
+        return first_value(self._declared[name])
 
     def _bound(self, variable: Any, *, inverse: bool = False) -> Callable[..., Any]:
         key = f"{variable.name}|inverse" if inverse else variable.name

@@ -9,49 +9,46 @@ is solved again under the intervention, with the same noise.
 Source:
     Pearl, *Causality*, 2nd edition, 2009, theorem 7.1.7 (abduction, action, prediction).
     Doucet, de Freitas, Gordon, *Sequential Monte Carlo Methods in Practice*, 2001, section 1.3.
+    Kitagawa, *Monte Carlo filter and smoother for non-Gaussian nonlinear state space models*,
+    Journal of Computational and Graphical Statistics 1996, for paths and systematic resampling.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import product
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Value, Values
+from scm_world._types import Integers as Numbers
 from scm_world.errors import ImpossibleObservation, ModelError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.evaluate import earlier, noise_of
+from scm_world.graph.evaluate import earlier, first_value, noise_of
 from scm_world.queries.equations import Layout
+from scm_world.queries.inversion import Inverse, law_of, summed
+from scm_world.queries.plans import Plan, numbered
+from scm_world.queries.timed import At
 from scm_world.variables import (
     Action,
     Box,
     Categories,
-    Continuous,
-    Discrete,
     Draw,
     Exogenous,
-    Integers,
-    Linear,
     Measured,
+    Mechanism,
     Noise,
-    Normal,
     Scale,
     Shift,
-    Table,
 )
 
 DRAWS = 1000
 """How many draws of its noise there are for each unit, where it does not follow exactly."""
 
-QUANTILES = 257
-"""Between how many quantiles of the noise solutions are looked for."""
-
-JOINT = 4096
-"""How many values a discrete noise may have in all."""
+MOST = 20_000_000
+"""How many draws there can be of all units together."""
 
 
 @final
@@ -69,6 +66,9 @@ class Counterfactuals(Mapping[str, Floats]):
         weights: Of the draws, shape (rows, n); each row sums to 1.
         exact: Whether everything followed from the observations, without draws: then n is 1.
         one: Whether a single unit was observed.
+        ancestors: Of which of the first draws each comes, shape (rows, n), where draws were drawn
+            again.
+        model: That was asked.
     """
 
     factual: dict[str, Floats]
@@ -76,6 +76,8 @@ class Counterfactuals(Mapping[str, Floats]):
     weights: Floats
     exact: bool
     one: bool
+    ancestors: Numbers
+    model: SCM
 
     def __getitem__(self, name: str) -> Floats:
         return self._mean(self.counterfactual[name])
@@ -88,8 +90,13 @@ class Counterfactuals(Mapping[str, Floats]):
 
     @property
     def effective(self) -> Floats:
-        """Effective number of draws of each unit, shape (rows,): 1 / Σ w² (Kish 1965)."""
-        return np.asarray(1.0 / (self.weights**2).sum(axis=1))
+        """Effective number of draws of each unit, shape (rows,): 1 / Σ w² (Kish 1965).
+
+        Draws that come from one of the first instant count as one.
+        """
+        mass = np.zeros_like(self.weights)
+        np.add.at(mass, (np.arange(len(mass))[:, None], self.ancestors), self.weights)
+        return np.asarray(1.0 / (mass**2).sum(axis=1))
 
     def difference(self, name: str) -> Floats:
         """Give the expected difference from what was: the effect on each unit."""
@@ -118,6 +125,14 @@ class Counterfactuals(Mapping[str, Floats]):
         low, high = (end[0] if self.one else end for end in ends)
         return low, high
 
+    def probability(self, name: str, value: Any) -> Floats:
+        """Give the probability of a value or a label under the intervention, for each unit."""
+        bounds = self.model.declared(name).bounds
+        if isinstance(value, str) and isinstance(bounds, Categories):
+            value = bounds.numbers(value)
+        found = self.counterfactual[name] == np.asarray(value)
+        return self._mean(found.astype(float))
+
     def _mean(self, values: Floats) -> Floats:
         weights = self.weights.reshape(self.weights.shape + (1,) * (values.ndim - 2))
         mean = np.asarray((weights * values).sum(axis=1))
@@ -139,29 +154,89 @@ def counterfactuals(
     tolerance: float = 1e-6,
 ) -> Counterfactuals:
     """Say what observed units would have been under an intervention; see ``SCM.counterfactual``."""
-    columns = _columns(observed)
-    if n is not None:
-        return _Abduction(model, columns, whole_number("n", n, least=1), seed, tolerance).answer(do)
-    found = _Abduction(model, columns, 1, seed, tolerance, certain=True)
-    if not found.sampled:
-        return found.answer(do)
-    return _Abduction(model, columns, DRAWS, seed, tolerance).answer(do)
+    given = (model, _columns(model, observed))
+    if n is None:
+        sure = _Abduction(*given, 1, seed, tolerance, certain=True)
+        answer = None if sure.sampled else sure.answer(do)
+        if answer is not None and answer.exact:
+            return answer
+    count = DRAWS if n is None else whole_number("n", n, least=1)
+    return _Abduction(*given, count, seed, tolerance).answer(do)
 
 
-def _columns(observed: Any) -> dict[str, Any]:
-    """Read a row or a table: a mapping, or a data frame with a column for each component."""
-    if not isinstance(observed, Mapping) and not hasattr(observed, "columns"):
-        raise UnknownOption("observed", observed, ("values by name", "a table by name"))
-    names = observed if isinstance(observed, Mapping) else observed.columns
-    found: dict[str, Any] = {}
-    parts: dict[str, list[Floats]] = {}
-    for name in names:
-        values = np.asarray(observed[name], dtype=float)
-        if str(name).endswith("]"):
-            parts.setdefault(str(name).rpartition("[")[0], []).append(values)
+RECORDED = ("episode", "step", "regime", "intervention_targets")
+"""Columns of a frame of a ``Dataset`` besides its variables."""
+
+
+def _columns(model: SCM, observed: Any) -> dict[str, Value]:
+    """Read a row or a table as numbers by variable, shape (..., *shape); NaN where there is none.
+
+    Args:
+        model: Whose variables were observed.
+        observed: Values by name, a data frame, or a ``Dataset``. Names of components, such as
+            ``"v[2]"``, are put together. Rows of several control steps are put side by side.
+    """
+    if hasattr(observed, "regimes"):  # a Dataset
+        found = dict(zip(observed.names, observed.values.T, strict=True))
+        found |= {"episode": observed.episode, "step": observed.step}
+        found["intervention_targets"] = np.array([bool(names) for names in observed.targets])
+    elif isinstance(observed, Mapping) or hasattr(observed, "columns"):
+        names = observed if isinstance(observed, Mapping) else observed.columns
+        found = {str(name): np.asarray(observed[name]) for name in names}
+    else:
+        allowed = ("values by name", "a table by name", "a data frame", "a Dataset")
+        raise UnknownOption("observed", observed, allowed)
+    apart = {name: found.pop(name) for name in RECORDED if name in found and name not in model}
+    if any(target is not None and target is not np.False_ for target in apart.get(RECORDED[3], ())):
+        advice = "take its rows without (table.observational), or ask model.do({…}) of the others"
+        raise ModelError([f"the table has rows in which something was done: {advice}"])
+    parts: dict[str, dict[int, Value]] = {}
+    columns: dict[str, Value] = {}
+    for name, values in found.items():
+        whole, _, place = name.removesuffix("]").rpartition("[")
+        if name not in model and name.endswith("]") and whole in model and place.isdecimal():
+            parts.setdefault(whole, {})[int(place)] = _numbers(model, whole, values)
+        elif name not in model:
+            raise UnknownVariable(name, model)
         else:
-            found[str(name)] = values
-    return found | {name: np.stack(each, axis=-1) for name, each in parts.items()}
+            columns[name] = _numbers(model, name, values)
+    for name, each in parts.items():
+        shape = model.declared(name).shape
+        lost = sorted(set(range(int(np.prod(shape)))) - set(each))
+        if lost:
+            said = f"{name!r} was observed in part: there is no '{name}[{lost[0]}]'"
+            raise ModelError([f"{said}; give all of its numbers, or none"])
+        stacked = np.stack([each[place] for place in sorted(each)], axis=-1)
+        columns[name] = stacked.reshape(*stacked.shape[:-1], *shape)
+    if model.is_temporal and "step" in apart:
+        order = np.lexsort((apart["step"], apart["episode"]))
+        _, counts = np.unique(apart["episode"], return_counts=True)
+        if len(set(counts.tolist())) != 1:
+            raise ModelError(["the episodes of the table have different lengths; give one at once"])
+        columns = {
+            name: values[order].reshape(len(counts), counts[0], *values.shape[1:])
+            for name, values in columns.items()
+        }
+    return columns
+
+
+def _numbers(model: SCM, name: str, values: Value) -> Value:
+    """Read numbers or labels of a variable; None is NaN.
+
+    Raises:
+        ImpossibleObservation: Something is neither.
+    """
+    bounds = model.declared(name).bounds
+    known = {}
+    if isinstance(bounds, Categories) and bounds.labels:
+        known = dict(zip(bounds.labels, bounds.members, strict=True))
+    if values.dtype.kind in "OUS":
+        values = np.array([known.get(v, v) for v in values.ravel().tolist()]).reshape(values.shape)
+    try:
+        return values.astype(float)
+    except (TypeError, ValueError) as error:
+        allowed = f", and labels are {', '.join(known)}" if known else ""
+        raise ImpossibleObservation(name, f"observations are numbers{allowed}: {error}") from None
 
 
 @final
@@ -193,16 +268,21 @@ class _Abduction:
         self.steps = 1
         self._observed = self._read(columns)
         self._size = self._rows * n
+        if self._size * self.steps > MOST:
+            said = f"{self._rows} units with {n} draws each of {self.steps} instants are too many"
+            raise ModelError([f"{said}: give fewer rows at once, or a smaller n"])
         self.log_weights = np.zeros(self._size)
+        self._ancestors = np.tile(np.arange(n), self._rows)
         self.sampled = False
         self._unsure: set[str] = set()
         self.given: list[dict[str, Value]] = []
         self.values: list[dict[str, Value]] = []
-        before = self._solved(model, {}, {}, 0, starts=True) if model.is_temporal else {}
+        before: Values = self._solved(model, {}, {}, 0, starts=True) if model.is_temporal else {}
         for step in range(self.steps):
             if certain and self.sampled:
                 return
             before = model.remembered(self._abduct(step, before), before)
+            before = self._drawn_again(step, before)
 
     # --- what was observed ----------------------------------------------------------------------
 
@@ -238,6 +318,9 @@ class _Abduction:
             raise ImpossibleObservation(
                 name, "an observation is finite, or NaN where there is none"
             )
+        unknown = np.isnan(table).reshape(self._rows, self.steps, -1)
+        if (unknown.any(axis=2) & ~unknown.all(axis=2)).any():
+            raise ModelError([f"{name!r} was observed in part: give all of its numbers, or none"])
         return np.repeat(np.moveaxis(table, 1, 0), self.n, axis=1)
 
     # --- abduction ------------------------------------------------------------------------------
@@ -258,6 +341,30 @@ class _Abduction:
             if self._certain and self.sampled:
                 break
         return values
+
+    def _drawn_again(self, step: int, before: Values) -> Values:
+        """Draw the draws of a unit again by their weights, where fewer than half count."""
+        weights = self._weights()
+        few = 1.0 / (weights**2).sum(axis=1) < 0.5 * self.n
+        if step == self.steps - 1 or not few.any():
+            return before
+        start = self._noise.uniforms("|again", n=1, step=step, count=self._rows)
+        chosen = np.tile(np.arange(self.n), (self._rows, 1))
+        for row in np.flatnonzero(few).tolist():
+            points = (start[row] + np.arange(self.n)) / self.n
+            chosen[row] = np.searchsorted(np.cumsum(weights[row]), points).clip(max=self.n - 1)
+        self.log_weights.reshape(self._rows, self.n)[few] = 0.0
+        where = (chosen + self.n * np.arange(self._rows)[:, None]).ravel()
+        self._ancestors = self._ancestors[where]
+        for instant in (*self.given, *self.values):
+            instant.update({name: np.asarray(value)[where] for name, value in instant.items()})
+        return {name: np.asarray(value)[where] for name, value in before.items()}
+
+    def _weights(self) -> Floats:
+        """Give the weights of the draws, shape (rows, n); each row sums to 1."""
+        logs = self.log_weights.reshape(self._rows, self.n)
+        weights = np.exp(logs - logs.max(axis=1, keepdims=True))
+        return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
     def _kept(self) -> Iterator[tuple[str, Value]]:
         """Give what was drawn once for the episode."""
@@ -334,6 +441,9 @@ class _Abduction:
             case Shift(by=by):
                 return np.asarray(value - np.asarray(by))
             case Scale(by=by):
+                if not np.all(by):
+                    said = f"{name!r} was observed under Scale(0), which tells nothing of it"
+                    raise ModelError([f"{said}: leave it out, or give NaN"])
                 return np.asarray(value / np.asarray(by))
         return value
 
@@ -352,21 +462,23 @@ class _Abduction:
         if isinstance(variable, Exogenous):
             bounded = bool(source.parents())
             try:
-                log = _law(source, variable.shape, values).log_density(value)
+                log = law_of(source, variable.shape, values).log_density(value)
             except ModelError:
                 if bounded:
                     raise
                 log = np.zeros(len(value))  # of no account, but that it is possible
+            log = summed(log)
             return value, np.where(np.isfinite(log), log, 0.0) * bounded, np.isfinite(log), False
-        start = self.model.begin()
-        parents = [
-            before.get(earlier(p.name, p.lag), np.broadcast_to(start[p.name], (self._size,)))
-            if p.lag
-            else values[p.name]
-            for p in variable.all_parents
-        ]
+        parents: list[Value] = []
+        for parent in variable.all_parents:
+            found = values if not parent.lag else before
+            where = parent.name if not parent.lag else earlier(parent.name, parent.lag)
+            if where not in found:
+                first = first_value(self.model.declared(parent.name))
+                found = {where: np.broadcast_to(first, (self._size, *first.shape))}
+            parents.append(found[where])
         each = 1 if weigh else self.n
-        return _Inverse(self, variable, source, parents, step, each).solve(value, weigh=weigh)
+        return Inverse(self, variable, source, parents, step, each).solve(value, weigh=weigh)
 
     def _weigh(self, name: str, there: Value, possible: Value, *, unsure: bool) -> None:
         """Leave out draws that contradict an observation; refuse what no draw gives."""
@@ -388,40 +500,90 @@ class _Abduction:
 
     def answer(self, do: Mapping[str, Any]) -> Counterfactuals:
         """Solve the model again under an intervention, with the same noise."""
-        before_it, after_it = self.model.interventions, self.model.do(do).interventions
-        own = {
-            name: act.model_copy(update={"stream": "counterfactual"})
-            if isinstance(act, Draw) and act.stream is None  # nothing of what was abducted
-            else act
-            for name, act in after_it.items()
-            if before_it.get(name) != act
-        }
-        model = self.model.with_interventions(own)
-        targets = {target for name in own for target in self.model.targets(name)}
-        follow = targets.union(*(model.descendants(target) for target in targets))
+        models = self._models(do)
+        changes = [self._changed(model) for model in models]
+        follow = set[str]().union(*changes)
+        follow |= {n for m in models for name in follow for n in m.descendants(name)}
         before: Values = {}
-        if model.is_temporal:
-            before = self._solved(model, {}, {}, 0, starts=True)
+        if self.model.is_temporal:
+            before = self._solved(models[0], {}, {}, 0, starts=True)
         found: list[dict[str, Value]] = []
         for step, was in enumerate(self.values):
-            values: dict[str, Value] = {}
+            model, targets, values = models[step], changes[step], dict[str, Value]()
             for name in model.structure.order:
-                if name not in follow:
+                bounds = getattr(self.model[name], "distribution", None)
+                moves = bounds is not None and bounds.parents()
+                if name not in follow or (
+                    name not in targets and _is_free(self.model[name]) and not moves
+                ):
                     values[name] = was[name]
                     continue
-                if name not in targets and isinstance(self.model[name], Exogenous):
+                if name in targets:
+                    self._renew(model, name, values, step)
+                elif moves:
                     self._follow_bounds(name, was, values, step)
                 values[name] = self._computed(model, name, values, before, step)
             found.append(values)
             before = model.remembered(values, before)
-        logs = self.log_weights.reshape(self._rows, self.n)
-        weights = np.exp(logs - logs.max(axis=1, keepdims=True))
         return Counterfactuals(
             factual=self._stacked(self.values),
             counterfactual=self._stacked(found),
-            weights=weights / weights.sum(axis=1, keepdims=True),
+            weights=self._weights(),
             exact=not self.sampled,
             one=self.one,
+            ancestors=self._ancestors.reshape(self._rows, self.n),
+            model=self.model,
+        )
+
+    def _models(self, do: Mapping[str, Any]) -> list[SCM]:
+        """Give the model under what is done, for each control step.
+
+        Raises:
+            InterventionError: An intervention was refused.
+            UnknownOption: One is due after the last step, or waits for an event.
+        """
+        plan, found = Plan(numbered(self.model, do)), []
+        for name, part in plan.timed():
+            begin = getattr(part, "step", getattr(part, "start", None))
+            if begin is None or begin >= self.steps:
+                allowed = (f"At and Clamp from control step 0 to {self.steps - 1}",)
+                raise UnknownOption(f"time of an intervention on {name}", part, allowed)
+        for step in range(self.steps):
+            now = plan.at_start()
+            for name, part in plan.timed():
+                start, stop = (part.step, None) if isinstance(part, At) else (part.start, part.stop)
+                if start <= step and (stop is None or step < stop):
+                    now[name] = part.act
+            model = self.model.do(now)
+            new = {  # it has nothing in common with what was abducted
+                name: act.model_copy(update={"stream": "counterfactual"})
+                for name, act in model.interventions.items()
+                if isinstance(act, Draw) and not act.stream
+                if self.model.interventions.get(name) != act
+            }
+            found.append(model.with_interventions(new) if new else model)
+        return found
+
+    def _changed(self, model: SCM) -> set[str]:
+        """List the variables on which is done something else than when they were observed."""
+        was, now = self.model.interventions, model.interventions
+        other = {name for name in {**was, **now} if was.get(name) != now.get(name)}
+        return {target for name in other for target in self.model.targets(name)}
+
+    def _renew(self, model: SCM, name: str, values: Values, step: int) -> None:
+        """Draw what an intervention draws anew: a value, another noise, or one that was cut off."""
+        variable, act = model[name], model.act_on(name)
+        done = None if act is None else act.intervention
+        self.sampled |= isinstance(done, Draw)
+        source = getattr(variable, "distribution", None) or getattr(variable, "noise", None)
+        other = isinstance(done, Mechanism) and done.noise is not None
+        if isinstance(done, Draw) or source is None or (name in self.given[step] and not other):
+            return
+        self.sampled = True
+        once = getattr(variable, "per", "step") == "episode"
+        shape = getattr(self.model.declared(name), "noise_shape", None)
+        self.given[step][name] = self._key(0 if once else step).draw(
+            source, name, variable.shape if shape is None else shape, values, "counterfactual"
         )
 
     def _follow_bounds(self, name: str, was: Values, values: Values, step: int) -> None:
@@ -497,7 +659,7 @@ class _Abduction:
     def uniforms(self, name: str, step: int, shape: tuple[int, ...]) -> Floats:
         """Give uniform numbers to choose among solutions with, shape (units, *shape)."""
         n = int(np.prod(shape))
-        drawn = self._noise.uniforms(f"{name}|abduction", n=n, step=step, count=self._size)
+        drawn = self._noise.uniforms(name, n=n, step=step, count=self._size)
         return drawn.reshape(self._size, *shape)
 
 
@@ -510,262 +672,3 @@ def _is_free(variable: Any) -> bool:
     return isinstance(variable, Exogenous | Action) or (
         isinstance(variable, Measured) and variable.mechanism is None
     )
-
-
-# --- inverting a mechanism ------------------------------------------------------------------------
-
-Found = tuple[Value, Floats, Value, bool]
-"""Noise; log density of the observation given its causes, shape (units,), up to a summand that is
-the same for all draws of a unit; for which units there is such noise; whether there are several."""
-
-
-@final
-class _Inverse:
-    """The noise of a variable, given its value and its causes.
-
-    Args:
-        units: That were observed.
-        variable: One with noise.
-        source: Distribution of its noise.
-        parents: Values of its causes.
-        step: Number of the instant.
-        each: How many draws in a row have the same causes, so that they are inverted once.
-    """
-
-    def __init__(
-        self,
-        units: _Abduction,
-        variable: Any,
-        source: Any,
-        parents: list[Value],
-        step: int,
-        each: int,
-    ) -> None:
-        self._units, self._variable, self._each = units, variable, each
-        self._parents = [parent[::each] for parent in parents]
-        own = variable.noise_shape
-        self._shape: tuple[int, ...] = variable.shape if own is None else own
-        self._law = _law(source, self._shape, {})
-        self._function, self._step = variable.mechanism.bind(), step
-
-    def _gives(self, noise: Value) -> Value:
-        return self._units.apply(self._function, self._parents, {"noise": noise})
-
-    def _at(self, shape: tuple[int, ...]) -> Floats:
-        return self._units.uniforms(self._variable.name, self._step, shape)
-
-    def solve(self, value: Value, *, weigh: bool) -> Found:
-        """Find the noise.
-
-        Args:
-            value: Of the variable, shape (units, *shape).
-            weigh: Whether the density counts: some causes were drawn.
-
-        Raises:
-            ModelError: It cannot be inverted.
-        """
-        variable, alike = self._variable, self._shape == self._variable.shape
-        value = value[:: self._each]
-        if variable.inverse_noise is not None:
-            inverse = variable.inverse_noise.bind()
-            return self._unique(
-                self._units.apply(inverse, [value, *self._parents], {}), value, weigh
-            )
-        if isinstance(variable.mechanism, Table):
-            return self._in_table(value, variable.mechanism)
-        if self._law.support is not None:
-            return self._enumerated(value, alike=alike)
-        if not alike:
-            said = f"the noise of {variable.name!r} has shape {self._shape}, its value "
-            said += f"{variable.shape}: give it inverse_noise, so that it follows from the value"
-            raise ModelError([said])
-        if variable.dtype != "real":
-            return self._in_plateaus(value)
-        noise = np.asarray(value - self._gives(np.zeros(np.shape(value))), dtype=float)
-        if isinstance(variable.mechanism, Linear) or self._is_added(noise, value):
-            return self._unique(noise, value, weigh)
-        return self._roots(value)
-
-    def _is_added(self, noise: Value, value: Value) -> bool:
-        """Tell whether other noise moves the value by as much."""
-        scale = self._law.quantile(0.75) - self._law.quantile(0.25)
-        with np.errstate(all="ignore"):
-            return all(
-                np.allclose(self._gives(noise + by) - value, by, rtol=1e-6, atol=1e-9)
-                for by in (scale, -0.4 * scale)
-            )
-
-    def _unique(self, noise: Value, value: Value, weigh: bool) -> Found:
-        """Check a noise that is the only one that gives the value."""
-        log = _summed(self._law.log_density(noise))
-        possible = np.isfinite(log) & self._units.near(self._gives(noise), value, whole=True)
-        if not weigh:
-            log = np.zeros(len(log))
-        elif self._law.support is None:
-            log = log - _summed(self._log_slope(noise))
-        log = np.where(possible, log, 0.0)
-        return self._all(noise), self._all(log), self._all(possible), False
-
-    def _all(self, values: Value) -> Value:
-        """Repeat what is the same for several draws."""
-        return np.repeat(values, self._each, axis=0)
-
-    def _log_slope(self, noise: Value) -> Floats:
-        """Differentiate by the noise, component by component; the logarithm of the size."""
-        step = 1e-6 * (1.0 + np.abs(noise))
-        with np.errstate(all="ignore"):
-            rise = (self._gives(noise + step) - self._gives(noise - step)) / (2.0 * step)
-            return np.asarray(np.log(np.abs(rise)))
-
-    def _in_table(self, value: Value, table: Table) -> Found:
-        """Draw the uniform noise within the range that gives the category."""
-        chances = table.row(*self._parents)
-        members = np.asarray(table.values or range(table.shape[-1]))
-        hit = members == np.asarray(value)[..., None]
-        width = (hit * chances).sum(axis=-1)
-        start = (hit * (np.cumsum(chances, axis=-1) - chances)).sum(axis=-1)
-        with np.errstate(divide="ignore"):
-            log = _summed(np.log(width))
-        possible = np.isfinite(log)
-        noise = self._all(start) + self._at(np.shape(value)[1:]) * self._all(width)
-        several = not (width.reshape(len(width), -1)[possible] == 1.0).all()
-        return noise, self._all(np.where(possible, log, 0.0)), self._all(possible), several
-
-    def _enumerated(self, value: Value, *, alike: bool) -> Found:
-        """Try every value of a discrete noise: of each component by itself, or of all together."""
-        support, chances = self._law.support, self._law.chances
-        count = 1 if alike else int(np.prod(self._shape))
-        if len(support) ** count > JOINT:
-            said = (
-                f"the noise of {self._variable.name!r} has {len(support) ** count} values, of which"
-            )
-            raise ModelError([f"{said} {JOINT} can be tried; give it inverse_noise"])
-        picks = np.array(list(product(range(len(support)), repeat=count)))
-        shape = (len(value), *self._shape)
-        mass = []
-        for pick in picks:
-            noise = np.broadcast_to(np.reshape(support[pick], () if alike else self._shape), shape)
-            near = self._units.near(self._gives(noise), value, whole=not alike)
-            mass.append(near * float(np.prod(chances[pick])))
-        place, log, possible, several = self._chosen(np.stack(mass))
-        noise = support[picks[place]]
-        noise = noise[..., 0] if alike else noise.reshape(-1, *self._shape)
-        return noise, log, possible, several
-
-    def _chosen(self, mass: Floats) -> tuple[Value, Floats, Value, bool]:
-        """Choose among solutions, shape (solutions, units, …), in proportion to their mass."""
-        mass = np.repeat(mass, self._each, axis=1)
-        total = mass.sum(axis=0)
-        passed = np.cumsum(mass, axis=0) <= self._at(mass.shape[2:]) * total
-        with np.errstate(divide="ignore"):
-            log = _summed(np.log(total))
-        possible, several = np.isfinite(log), bool(((mass > 0.0).sum(axis=0) > 1).any())
-        place = np.minimum(passed.sum(axis=0), len(mass) - 1)
-        return place, np.where(possible, log, 0.0), possible, several
-
-    def _roots(self, value: Value) -> Found:
-        """Look for every solution between quantiles of the noise, component by component."""
-        tails = np.array([1e-12, 1e-9, 1e-6])
-        shares = np.concatenate(
-            [tails, np.linspace(1e-4, 1.0 - 1e-4, QUANTILES), 1.0 - tails[::-1]]
-        )
-        points = np.array([np.broadcast_to(self._law.quantile(s), np.shape(value)) for s in shares])
-        signs = np.array([np.sign(self._gives(point) - value) for point in points])
-        crossing = (signs[:-1] * signs[1:] < 0) | (signs[:-1] == 0)
-        roots, densities = [], []
-        for turn in range(int(crossing.sum(axis=0).max(initial=0))):
-            here = crossing & (np.cumsum(crossing, axis=0) == turn + 1)
-            first = here.argmax(axis=0)[None]
-            low, high = (np.take_along_axis(p, first, 0)[0] for p in (points[:-1], points[1:]))
-            start = np.take_along_axis(signs, first, axis=0)[0]
-            high = np.where(start == 0, low, high)
-            for _ in range(80):
-                middle = 0.5 * (low + high)
-                same = np.sign(self._gives(middle) - value) == start
-                low, high = np.where(same, middle, low), np.where(same, high, middle)
-            root = 0.5 * (low + high)
-            log = self._law.log_density(root) - self._log_slope(root)
-            real = here.any(axis=0) & self._units.near(self._gives(root), value) & np.isfinite(log)
-            roots.append(root)
-            densities.append(np.where(real, log, -np.inf))
-        if not roots:
-            nothing = self._all(np.zeros(np.shape(value)))
-            return nothing, _summed(nothing), np.zeros(len(nothing), dtype=bool), False
-        top = np.max(densities, axis=0)
-        scale = np.where(np.isfinite(top), top, 0.0)
-        place, log, possible, several = self._chosen(np.exp(np.array(densities) - scale))
-        solutions = np.repeat(roots, self._each, axis=1)
-        noise = np.take_along_axis(solutions, place[None], axis=0)[0]
-        log = log + np.where(possible, self._all(_summed(scale)), 0.0)
-        return noise, log, possible, several
-
-    def _in_plateaus(self, value: Value) -> Found:
-        """Draw among noises that give a whole number, of a continuous noise."""
-        many = 4 * QUANTILES
-        shares = (np.arange(many) + 0.5) / many
-        points = np.array([np.broadcast_to(self._law.quantile(s), np.shape(value)) for s in shares])
-        hits = np.array([self._gives(point) == value for point in points]) / many
-        place, log, possible, _ = self._chosen(hits)
-        solutions = np.repeat(points, self._each, axis=1)
-        return np.take_along_axis(solutions, place[None], axis=0)[0], log, possible, True
-
-
-def _summed(log: Floats) -> Floats:
-    """Add up the components of each unit, shape (units,)."""
-    return np.asarray(log.reshape(len(log), -1).sum(axis=1))
-
-
-@final
-@dataclass(frozen=True)
-class _Law:
-    """Density and quantiles of a distribution, component by component.
-
-    Attributes:
-        frozen: A distribution of scipy; None of a discrete one.
-        support: The values of a discrete distribution; None of a continuous one.
-        chances: The probability of each.
-    """
-
-    frozen: Any = None
-    support: Any = None
-    chances: Any = None
-
-    def log_density(self, value: Value) -> Floats:
-        """Give the logarithm of the density, or of the probability."""
-        if self.support is None:
-            return np.asarray(self.frozen.logpdf(value), dtype=float)
-        hit = np.abs(np.asarray(value)[..., None] - self.support) <= 1e-9
-        with np.errstate(divide="ignore"):
-            return np.asarray(np.log((hit * self.chances).sum(axis=-1)))
-
-    def quantile(self, share: float) -> Floats:
-        """Give a quantile of a continuous distribution."""
-        return np.asarray(self.frozen.ppf(share))
-
-
-def _law(source: Any, shape: tuple[int, ...], values: Values) -> _Law:
-    """Give density and quantiles of a distribution.
-
-    Raises:
-        ModelError: They are not known.
-    """
-    from scipy import stats
-
-    match source:
-        case Normal(mean=mean, std=std) if std > 0.0:
-            return _Law(stats.norm(mean, std))
-        case Continuous():
-            return _Law(source.frozen)
-        case Box():
-            low, high = (np.asarray(end) for end in source.bounds(shape, values))
-            if (high > low).all():
-                return _Law(stats.uniform(low, high - low))
-        case Normal(mean=mean):
-            return _Law(None, np.array([mean]), np.ones(1))
-        case Discrete():
-            return _Law(None, np.asarray(source.values, dtype=float), source.chances)
-        case Categories(members=members):
-            return _law(Discrete(members), shape, values)
-        case Integers(low=low, high=high):
-            return _law(Discrete(range(low, high + 1)), shape, values)
-    raise ModelError([f"the density of {source!r} is not known, so it cannot be abducted"])

@@ -10,10 +10,11 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from scm_world.errors import DAMAGED, InterventionError, ModelError
-from scm_world.graph import flatten
+from scm_world.graph import SCM, flatten
 from scm_world.queries.equations import System
 from scm_world.queries.timed import ACTS, TIMED, At, Clamp, On, Timed, as_act
 from scm_world.variables import (
+    Categories,
     Draw,
     Function,
     Hard,
@@ -209,6 +210,16 @@ def do(request: Mapping[str, Any]) -> Plan:
         Plan({'floor_friction': (Hard(kind='hard', value=0.4),)})
     """
     return Plan(request)
+
+
+def numbered(model: SCM, request: Mapping[str, Any]) -> dict[str, Any]:
+    """Put the numbers of categories in the place of their labels."""
+    found = dict(request)
+    for name, value in found.items():
+        bounds = model.declared(name).bounds if isinstance(value, str) and name in model else None
+        if isinstance(bounds, Categories) and value in bounds.labels:
+            found[name] = int(bounds.numbers(value))
+    return found
 
 
 __all__ = ["At", "Clamp", "On", "Plan", "do"]

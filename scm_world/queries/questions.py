@@ -9,6 +9,7 @@ from typing import Any, Self, final
 import numpy as np
 
 from scm_world._arguments import whole_number
+from scm_world._types import Floats, Integers
 from scm_world.errors import UnknownOption
 from scm_world.graph import scm as graph
 from scm_world.queries import samples
@@ -18,7 +19,7 @@ from scm_world.queries.equations import Equations, System
 from scm_world.queries.estimates import Effect, effect_of
 from scm_world.queries.live import LiveEpisode
 from scm_world.queries.outcomes import Outcome, usual_outcomes
-from scm_world.queries.plans import Plan
+from scm_world.queries.plans import Plan, numbered
 from scm_world.queries.progress import Progress, part
 from scm_world.queries.rollouts import Unit, as_names, length
 from scm_world.queries.samples import Samples, Setting
@@ -299,7 +300,8 @@ class Questions(ABC):
             do: What is done.
             versus: The intervention it is compared with; none if None.
             by: The covariate: like an outcome, one number; read off the world of ``versus``.
-            bins: Into how many groups of equal size the units are sorted.
+            bins: Into how many groups of equal size the units are sorted. Units with one value are
+                in one group: of a covariate with no more values than that, each has its own.
             n: How many units, over all groups.
             progress: Called after each episode.
             setting: See ``sample``.
@@ -319,7 +321,7 @@ class Questions(ABC):
         if place.ndim != 1:
             allowed = ("one number for each unit, such as Outcome(name, 'first', 0)",)
             raise UnknownOption("by", by, allowed)
-        groups = np.array_split(np.argsort(place, kind="stable"), bins)
+        groups = _alike(place, bins)
         return tuple(
             (
                 (float(place[group].min()), float(place[group].max())),
@@ -327,6 +329,20 @@ class Questions(ABC):
             )
             for group in groups
         )
+
+
+def _alike(place: Floats, bins: int) -> list[Integers]:
+    """Sort units into groups by their middle rank; a single unit joins the group before it."""
+    values, which, counts = np.unique(place, return_inverse=True, return_counts=True)
+    middle = np.cumsum(counts) - 0.5 * counts
+    number = np.arange(len(values)) if len(values) <= bins else middle * bins // len(place)
+    groups: list[Integers] = []
+    for each in np.unique(number):
+        units = np.flatnonzero(number[which.reshape(-1)] == each)
+        if groups and min(len(units), len(groups[-1])) < 2:
+            units = np.concatenate([groups.pop(), units])
+        groups.append(units)
+    return groups
 
 
 @final
@@ -395,12 +411,14 @@ class SCM(Questions, graph.SCM):
         noise is known, is ``rollout(…).counterfactual(do)``.
 
         Args:
-            observed: Values by name, of some or all variables: a row (values of the shape of the
-                variable), or a table (with a leading axis, or a data frame); NaN where there is
-                none. With lagged edges, a column has the control steps before the shape.
-            do: The intervention; the observations were made without it.
-            n: How many draws of what is not known of each unit; 1 where everything follows
-                exactly, and 1000 elsewhere, if None.
+            observed: Values or labels by name, of some or all variables: a row (values of the shape
+                of the variable), or a table (with a leading axis, a data frame, or a ``Dataset``);
+                NaN where there is none. With lagged edges, a column has the control steps before
+                the shape; a frame or a dataset has a row for each.
+            do: The intervention; the observations were made without it. With lagged edges it may
+                have times: ``At`` and ``Clamp``, in control steps of the observations.
+            n: How many draws of what is not known of each unit, or is drawn by the intervention; 1
+                where everything follows exactly, and 1000 elsewhere, if None.
             seed: Of the draws.
             tolerance: How far a value may lie from what follows of its causes, relative to one plus
                 its size.
@@ -448,4 +466,4 @@ class SCM(Questions, graph.SCM):
         return self._twins, Equations(self._twins.layout)
 
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
-        return Plan(do)
+        return do if isinstance(do, Plan) else Plan(numbered(self, do or {}))

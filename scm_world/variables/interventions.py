@@ -82,8 +82,8 @@ class Draw(Frozen):
 
     Attributes:
         source: Where from.
-        stream: Name of a noise of its own, so that it has nothing in common with other draws of
-            the variable; None for the variable's own noise.
+        stream: Name of its noise: draws of the variable with one name give the same numbers. If
+            None, what a model draws has nothing in common with the variable's own noise.
         of: A bundle that is drawn as a whole; the variable gets its part of it. ``do`` on the
             bundle gives this to each of its parts.
 

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from scm_world import SCM
+from scm_world.discovery.data import Design, as_frame, collect
 from scm_world.errors import ImpossibleObservation, ModelError, UnknownOption, UnknownVariable
+from scm_world.queries import At, Clamp, Counterfactuals
 from scm_world.variables import (
     Bernoulli,
     Box,
@@ -22,8 +24,10 @@ from scm_world.variables import (
     Laplace,
     Linear,
     Mechanism,
+    Natural,
     Normal,
     Parent,
+    Scale,
     Shift,
     Table,
 )
@@ -317,3 +321,274 @@ def test_a_declared_inverse_is_used() -> None:
     model = SCM([Exogenous(name="x"), two])
     found = model.counterfactual({"x": 0.0, "y": 1.0}, do={"x": 5.0})
     assert (found.exact, found["y"]) == (True, 6.0)
+
+
+# --- closed forms that an examiner would try -----------------------------------------------------
+
+ONE = Linear(weights=(1.0,))
+
+
+def believed(found: Counterfactuals, name: str) -> Any:
+    """Give the mean of what a variable was, shape (rows, ...)."""
+    weights = found.weights.reshape(found.weights.shape + (1,) * (found.factual[name].ndim - 2))
+    return (weights * found.factual[name]).sum(axis=1)
+
+
+def line(*, weight: float = 2.0, mechanism: Any = None, **more: Any) -> SCM:
+    """A root, and an effect with normal noise."""
+    made = Linear(weights=(weight,)) if mechanism is None else mechanism
+    y = Derived(name="y", parents=("x",), mechanism=made, noise=Normal(), **more)
+    return SCM([Exogenous(name="x", distribution=Normal()), y])
+
+
+def test_noise_that_is_added_on_one_side_only_is_not_unique() -> None:
+    """|e| + x e at x = 0: e is 1 or -1, so that y is 2 or 0 at x = 1."""
+    model = line(mechanism=lambda x, noise: np.abs(noise) + x * noise)
+    found = model.counterfactual({"x": 0.0, "y": 1.0}, do={"x": 1.0}, n=20_000)
+    assert not found.exact
+    assert found["y"] == pytest.approx(1.0, abs=0.03)
+    assert set(np.round(found.counterfactual["y"].ravel(), 6)) == {0.0, 2.0}
+    assert not model.counterfactual({"x": 0.0, "y": 1.0}, do={"x": 1.0}).exact
+
+
+def test_a_value_that_many_noises_give_has_their_range() -> None:
+    """A floor at 0, a sign, a whole number far out: truncated normal distributions."""
+    e = np.linspace(-9.0, 9.0, 400_001)
+    density = np.exp(-0.5 * e**2)
+
+    def wanted(told: Any, then: Any) -> float:
+        weight = density * told
+        return float((weight * then).sum() / weight.sum())
+
+    floor = line(mechanism=lambda x, noise: np.maximum(x + noise, 0.0))
+    found = floor.counterfactual({"x": [0.0, 0.0], "y": [0.0, 0.7]}, do={"x": 1.0}, n=20_000)
+    assert found["y"] == pytest.approx([wanted(e <= 0.0, np.maximum(1.0 + e, 0.0)), 1.7], abs=0.02)
+    hidden = floor.counterfactual({"y": 0.0}, do={"x": 1.0}, n=40_000)
+    assert believed(hidden, "x")[0] == pytest.approx(-1.0 / math.sqrt(math.pi), abs=0.03)
+    sign = line(mechanism=lambda x, noise: np.sign(x + noise) * 1.0)
+    found = sign.counterfactual({"x": 0.5, "y": 1.0}, do={"x": -1.0}, n=20_000)
+    assert found["y"] == pytest.approx(wanted(e > -0.5, np.sign(e - 1.0)), abs=0.03)
+    whole = line(mechanism=lambda x, noise: np.rint(x + noise), dtype="integer")
+    found = whole.counterfactual({"x": [0.0, 0.0], "y": [1, 6]}, do={"x": 0.3}, n=20_000)
+    for row, seen in enumerate((1, 6)):
+        there = np.abs(e - seen) < 0.5
+        assert found["y"][row] == pytest.approx(wanted(there, np.rint(0.3 + e)), abs=0.03)
+
+
+def test_labels_and_their_probabilities() -> None:
+    """Three categories with a hidden one: posterior and counterfactual by enumeration."""
+    kind: dict[str, Any] = {"dtype": "categorical", "bounds": Categories(labels=("a", "b", "c"))}
+    prior = np.array([0.5, 0.3, 0.2])
+    table = np.array([[0.7, 0.2, 0.1], [0.1, 0.8, 0.1], [0.2, 0.3, 0.5]])
+    model = SCM(
+        [
+            Exogenous(name="c", distribution=Categorical(prior), **kind),
+            Derived(name="g", parents=("c",), mechanism=Table(table), **kind),
+        ]
+    )
+    found = model.counterfactual({"g": "b"}, do={"c": "c"}, n=40_000)
+    posterior = prior * table[:, 1] / (prior @ table[:, 1])
+    told = [(found.weights * (found.factual["c"] == k)).sum() for k in range(3)]
+    np.testing.assert_allclose(told, posterior, atol=0.01)
+    ends = np.hstack([np.zeros((3, 1)), np.cumsum(table, axis=1)])
+    both = np.array(
+        [
+            [
+                max(0.0, min(ends[c, 2], ends[2, k + 1]) - max(ends[c, 1], ends[2, k]))
+                for k in range(3)
+            ]
+            for c in range(3)
+        ]
+    )
+    wanted = (posterior / table[:, 1]) @ both
+    np.testing.assert_allclose([found.probability("g", k) for k in "abc"], wanted, atol=0.01)
+    rows = model.counterfactual({"c": ["a", "c"], "g": ["b", "c"]}, do={})
+    assert [*rows["c"], *rows["g"]] == pytest.approx([0.0, 2.0, 1.0, 2.0])
+    with pytest.raises(ImpossibleObservation, match="labels are a, b, c") as problem:
+        model.counterfactual({"c": "d"}, do={"g": "a"})
+    assert problem.value.variable == "c"
+    effect = model.effect("g", do={"c": "b"}, versus={"c": "a"}, n=20_000)
+    assert effect.mean == pytest.approx(1.0 - 0.4, abs=0.02)
+
+
+def test_tables_of_this_package_are_observed() -> None:
+    """A dataset, its frame with the columns in any order, and rows of control steps."""
+    model = SCM(
+        [
+            Exogenous(name="v", shape=(2, 2), default=np.zeros((2, 2)), distribution=Normal()),
+            Derived(
+                name="s",
+                parents=("v",),
+                mechanism=lambda v, noise: np.asarray(v).sum(axis=(-1, -2)) + noise,
+                noise=Normal(),
+            ),
+        ]
+    )
+    table = collect(model, Design(), 5)
+    wanted = model.counterfactual(model.draw(5, seed=0), do={"v": np.ones((2, 2))})
+    frame = as_frame(table)
+    for given in (table, frame, frame[frame.columns[::-1]]):
+        found = model.counterfactual(given, do={"v": np.ones((2, 2))})
+        assert found["s"].tobytes() == wanted["s"].tobytes()
+    with pytest.raises(ModelError, match=r"there is no 'v\[3\]'"):
+        model.counterfactual(frame.drop(columns="v[3]"), do={"s": 0.0})
+    partly = model.draw(2, seed=0)["v"].copy()
+    partly[1, 0, 1] = np.nan
+    with pytest.raises(ModelError, match="observed in part"):
+        model.counterfactual({"v": partly}, do={"s": 0.0})
+    done = collect(model, Design("single", ("v",), {"v": Normal()}, 0.5), 6)
+    with pytest.raises(ModelError, match=r"table\.observational"):
+        model.counterfactual(done, do={"s": 0.0})
+    assert len(model.counterfactual(done.observational, do={"s": 0.0})["s"]) == 3
+    series = SCM(
+        [Derived(name="a", parents=(Parent("a", 2),), mechanism=ONE, noise=Normal(), start=1.0)]
+    )
+    steps, plain = collect(series, Design(), 3, steps=4), series.draw(3, seed=0, steps=4)
+    for given in (steps, as_frame(steps).sample(frac=1.0, random_state=0), plain):
+        found = series.counterfactual(given, do={"a": Shift(1.0)})
+        np.testing.assert_allclose(
+            found["a"], series.do({"a": Shift(1.0)}).draw(3, seed=0, steps=4)["a"]
+        )
+    with pytest.raises(ModelError, match="different lengths"):
+        series.counterfactual(steps.rows(slice(0, 7)), do={"a": 0.0})
+
+
+def lagged() -> SCM:
+    """A model with memory, lags of two steps, and a constant of each episode."""
+    weights = Linear(weights=(0.5, 1.0))
+    return SCM(
+        [
+            Exogenous(name="k", distribution=Normal()),
+            Derived(name="a", parents=(Parent("a", 1), Parent("k")), mechanism=weights,
+                    noise=Normal(), start=1.0),
+            Derived(name="b", parents=(Parent("b", 1), Parent("a", 2)), mechanism=weights,
+                    noise=Normal()),
+        ]
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("do", "replayed"),
+    [
+        ({"a": At(2, 5.0)}, {"a": At(3, 5.0)}),
+        ({"a": Clamp(5.0, 2, 4)}, {"a": Clamp(5.0, 3, 5)}),
+        ({"a": Clamp(Shift(1.0), 2, 4)}, {"a": Clamp(Shift(1.0), 3, 5)}),
+        ({"k": Clamp(2.0, 3, 5)}, {"k": Clamp(2.0, 4, 6)}),
+        ({"a": (At(1, 0.0), At(4, 3.0))}, {"a": (At(2, 0.0), At(5, 3.0))}),
+    ],
+)
+def test_interventions_with_times_are_those_of_a_replay(do: Any, replayed: Any) -> None:
+    """The instant that a replay begins with comes before the first observed control step."""
+    model = lagged()
+    found = model.counterfactual(model.draw(2, seed=0, steps=8), do=do)
+    assert found.exact
+    for episode in range(2):
+        other = model.rollout(seed=0, episode=episode, steps=8, do=replayed)
+        for name in model:
+            np.testing.assert_allclose(found[name][episode], other[name][1:], atol=1e-12)
+    with pytest.raises(UnknownOption, match="from control step 0 to 7"):
+        model.counterfactual(model.draw(2, seed=0, steps=8), do={"a": At(8, 1.0)})
+
+
+def test_a_hidden_series_has_the_posterior_of_the_smoother() -> None:
+    """Linear and normal: the smoothing distribution; forty steps do not end in one draw."""
+    model = SCM(
+        [
+            Derived(name="x", parents=(Parent("x", 1),), mechanism=Linear(weights=(0.8,)),
+                    noise=Normal()),
+            Derived(name="y", parents=("x",), mechanism=ONE, noise=Normal(0.0, 0.7)),
+        ]
+    )  # fmt: skip
+    for steps, n, close in ((5, 20_000, 0.03), (40, 4_000, 0.5)):
+        seen = model.draw(1, seed=3, steps=steps)["y"][0]
+        memory = np.linalg.inv(np.eye(steps) - 0.8 * np.eye(steps, k=-1))
+        prior = memory @ memory.T
+        gain = prior @ np.linalg.inv(prior + 0.49 * np.eye(steps))
+        found = model.counterfactual({"y": seen}, do={"y": 0.0}, n=n)
+        np.testing.assert_allclose(believed(found, "x")[0], gain @ seen, atol=close)
+        assert found.effective[0] > 5.0
+        again = model.counterfactual({"y": seen}, do={"y": 0.0}, n=n)
+        assert again.factual["x"].tobytes() == found.factual["x"].tobytes()
+
+
+def test_what_was_set_tells_nothing_of_its_causes() -> None:
+    """Observed under interventions: a value that was set, one that was drawn, and their release."""
+    model = line()
+    found = model.do({"y": 1.0}).counterfactual({"y": 1.0}, do={"x": 3.0}, n=20_000)
+    assert believed(found, "x")[0] == pytest.approx(0.0, abs=0.03)
+    drawn = model.do({"y": Draw(Box(5.0, 6.0))})
+    found = drawn.counterfactual({"x": 1.0}, do={"x": 3.0}, n=20_000)
+    assert found["y"] == pytest.approx(5.5, abs=0.02)
+    with pytest.raises(ImpossibleObservation, match="'y'"):
+        drawn.counterfactual({"x": 1.0, "y": 7.0}, do={"x": 3.0})
+    seen = {"x": [1.0] * 50, "y": [1.0] * 50}
+    for released, wanted in ((Natural(), 2.0), (Shift(1.0), 3.0)):
+        found = model.do({"y": 1.0}).counterfactual(seen, do={"y": released})
+        assert not found.exact
+        assert found["y"].mean() == pytest.approx(wanted, abs=0.03)
+        assert np.std(found.counterfactual["y"]) == pytest.approx(1.0, abs=0.05)
+    with pytest.raises(ModelError, match=r"Scale\(0\)"):
+        model.do({"y": Scale(0.0)}).counterfactual({"x": 1.0, "y": 0.0}, do={"x": 2.0})
+
+
+def test_another_noise_is_drawn_and_not_the_one_that_was_found() -> None:
+    """An intervention on the noise alone, one on the mechanism alone, and a drawn value."""
+    model, seen = line(), {"x": [1.0, 2.0], "y": [3.0, 2.0]}
+    other = model.counterfactual(seen, do={"y": Mechanism(noise=Normal(5.0, 0.1))})
+    assert not other.exact
+    assert other["y"] == pytest.approx([7.0, 9.0], abs=0.02)
+    same = model.counterfactual(seen, do={"y": Mechanism(lambda x, noise: 10 * x + noise, ["x"])})
+    assert (same.exact, same["y"].tolist()) == (True, [11.0, 18.0])
+    drawn = model.counterfactual(seen, do={"x": Draw(Normal(10.0, 1.0))})
+    assert not drawn.exact
+    assert drawn["y"] == pytest.approx([21.0, 18.0], abs=0.3)
+
+
+def test_vectors_that_are_roots_or_have_lags() -> None:
+    """Their components have a density each; before the first step stand their starts."""
+    model = SCM(
+        [
+            Exogenous(name="w", shape=(2,), default=(0.0, 0.0), distribution=Normal()),
+            Derived(name="a", shape=(2,), parents=(Parent("a", 2), Parent("w")),
+                    mechanism=lambda a, w, noise: 0.5 * np.asarray(a) + w + noise, noise=Normal(),
+                    start=(1.0, 2.0)),
+        ]
+    )  # fmt: skip
+    for done in ({"w": (0.0, 1.0)}, {"a": (1.0, -1.0)}):
+        seen, wanted = (m.draw(3, seed=4, steps=5) for m in (model, model.do(done)))
+        found = model.counterfactual(seen, do=done)
+        assert found.exact
+        np.testing.assert_allclose(found["a"], wanted["a"], atol=1e-12)
+
+
+def test_too_many_draws_are_refused() -> None:
+    """Before memory ends, with what to do; a smaller n goes."""
+    seen = {"y": np.zeros(30_000)}
+    with pytest.raises(ModelError, match="fewer rows at once, or a smaller n"):
+        line().counterfactual(seen, do={"x": 0.0})
+    assert line().counterfactual(seen, do={"x": 0.0}, n=2)["y"].shape == (30_000,)
+
+
+def test_effects_by_a_covariate_do_not_split_its_values() -> None:
+    """A bit has two groups, and the effect of each is exact; other groups have equal sizes."""
+    bit: dict[str, Any] = {"dtype": "integer", "bounds": Integers(0, 1)}
+
+    def product(x: Any, z: Any, noise: Any) -> Any:
+        return x * (1 + 3 * z) + noise
+
+    model = SCM(
+        [
+            Exogenous(name="z", distribution=Bernoulli(0.3), **bit),
+            Exogenous(name="x", distribution=Normal()),
+            Derived(name="y", parents=("x", "z"), mechanism=product, noise=Normal()),
+        ]
+    )
+    asked: dict[str, Any] = {"do": {"x": 1.0}, "versus": {"x": 0.0}, "n": 400}
+    for bins in (2, 4):
+        groups = model.effect_by("y", by="z", bins=bins, **asked)
+        assert [ends for ends, _ in groups] == [(0.0, 0.0), (1.0, 1.0)]
+        assert [round(float(effect.mean), 9) for _, effect in groups] == [1.0, 4.0]
+        assert sum(effect.n for _, effect in groups) == 400
+    quarters = model.effect_by("y", by="x", bins=4, **asked | {"do": {"z": 1}, "versus": {"z": 0}})
+    assert [effect.n for _, effect in quarters] == [100] * 4
+    assert [ends[1] for ends, _ in quarters] == sorted(ends[1] for ends, _ in quarters)
