@@ -1,0 +1,263 @@
+"""The TriFinger Pro, through the interface of the real robot, as a backend for evaluation.
+
+``trifinger_simulation.TriFingerPlatform`` has the methods of the real robot's front end: desired
+actions are appended, observations are read by time index, and the pose of the cube comes from
+cameras, ten times a second and late. The bodies are those of the TriFinger Pro, with other
+shapes, limits and links than the robot of this package. What both have in common are the
+fingertips: a command is sent as the joint positions that bring the tips of the Pro to where those
+of this package's robot would be, and its joints are reported as those of this package's robot with
+the same tips.
+
+Source:
+    Wüthrich et al., *TriFinger: An Open-Source Robot for Learning Dexterity*, CoRL 2020;
+    ``trifinger_simulation`` 2.0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from importlib.metadata import version
+from importlib.util import find_spec
+from typing import Any, ClassVar, final
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.backends.base import Capabilities, EngineSnapshot, InMemory
+from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
+from scm_world.geometry.rotations import quaternion_product, to_rotation_vector
+from scm_world.models.scene import ControlMode, Difference, ParameterKey, Parameters, Scene, State
+from scm_world.tasks.trifinger import fake, hardware
+from scm_world.tasks.trifinger.kinematics import forward, inverse
+from scm_world.tasks.trifinger.state import PhysicalState
+from scm_world.tasks.trifinger.structure import (
+    CONTROLLER,
+    TriFingerStructure,
+    controller_spec,
+    default_parameters,
+)
+
+CUBE = 0.065  # [m] edge of the platform's cube
+TURN = math.radians(-48.0)  # of this package's world about z, so that the fingers lie alike
+NEAR, SMALL = 1e-4, 1e-6  # [m] of inverse kinematics, [rad] of derivatives
+WRITTEN = ("mass", "friction")
+"""Of the cube. Friction of floor, stage and fingers, gravity and the controller are written, too."""
+
+OWN: Mapping[str, Any] = {
+    "tool_block.mass": 0.094,
+    "position_gains": (15.0, 15.0, 9.0),
+    "velocity_gains": (0.5, 1.0, 0.5),
+    "torque_limit": 0.396,
+    "finger_friction": 0.1,
+}
+"""Values of variables that the platform has by itself: an intervention that sets them, on any
+backend, tells how much of a gap they explain."""
+
+
+@final
+class TriFingerPlatform(InMemory):
+    """One cube and the TriFinger Pro, for playing policies.
+
+    It takes joint positions only. Parameters that the platform cannot change must keep their
+    defaults, among them the size of the cube (65 mm) and masses of links; they are reported as
+    such, though links differ. States can be set, as an experimenter does by hand: the platform
+    begins anew then. Torques are mapped by the Jacobians of both robots. Velocities of the cube
+    are differences of the poses that the cameras saw. No contacts are reported.
+    """
+
+    name: ClassVar[str] = "trifinger_platform"
+    capabilities: ClassVar[Capabilities] = Capabilities(snapshot="replay")
+
+    def __init__(self) -> None:
+        if find_spec("trifinger_simulation") is None:
+            raise MissingEngine(self.name, "pip install 'scm-world[trifinger]'", "not installed")
+
+    @property
+    def version(self) -> str:
+        """Version of the platform's simulation."""
+        return version("trifinger_simulation")
+
+    def build(self, scene: Scene) -> None:
+        """Keep the scene; the platform is started with the first step.
+
+        Raises:
+            UnknownOption: It is no scene with one cube, or a value is not the platform's.
+        """
+        structure = scene.structure
+        if not isinstance(structure, TriFingerStructure) or (
+            len(structure.blocks), structure.obstacles, structure.hulls
+        ) != (1, (), ()):  # fmt: skip
+            raise UnknownOption("scene of the TriFinger platform", structure, ("one cube",))
+        self._fits(scene.structure, scene.parameters)
+        super().build(scene)
+        self._begin()
+
+    def apply(self, difference: Difference) -> None:
+        """Change parameters and state; the platform begins anew.
+
+        Raises:
+            UnknownOption: The platform cannot have a value. Nothing has changed.
+        """
+        if difference.structure is not None:
+            raise UnknownOption("scene of the TriFinger platform", "another one", ("one cube",))
+        self._fits(self._structure, difference.parameters)
+        super().apply(difference)
+        if difference:
+            self._begin()
+
+    def inertia(self, body: str) -> Floats:
+        """Compute the principal moments of inertia of a solid cube, shape (3,) [kg m²]."""
+        return fake.inertia(self._structure, self._parameters, body)
+
+    def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
+        """Let the fingertips follow where the robot of this package would be commanded to have them.
+
+        Raises:
+            EngineFailure: Torques are commanded, or a number is not finite.
+        """
+        if mode is not ControlMode.JOINT_POSITIONS:
+            raise EngineFailure("the platform takes joint positions only", self.name)
+        if self._platform is None:
+            self._start()
+            for earlier in self._played:
+                self._play(*earlier)
+        self._played.append((np.array(command), substeps))
+        self._play(command, substeps)
+        if not np.isfinite(self._state.vector).all():
+            raise EngineFailure("a number is not finite", self.name)
+
+    def snapshot(self) -> EngineSnapshot:
+        """Save where the platform began, and all commands since."""
+        scene = Scene(self._structure, dict(self._parameters), self._state.copy())
+        return self.sealed((scene, self._first.copy(), list(self._played)))
+
+    def restore(self, snapshot: EngineSnapshot) -> None:
+        """Go back to a snapshot; the commands before it are repeated with the next step."""
+        scene, first, played = self.opened(snapshot)
+        super().restore(self.sealed(scene))
+        self._first, self._played, self._platform = first.copy(), list(played), None
+
+    # --- the platform ------------------------------------------------------------------------
+
+    def _fits(self, structure: TriFingerStructure, parameters: Parameters) -> None:
+        """Refuse values of parameters that the platform cannot change."""
+        usual = default_parameters(structure)
+        for key, value in parameters.items():
+            body, name = key
+            free = name == "color" or body == "controller" or key == ("world", "gravity")
+            free |= body in structure.blocks and name in WRITTEN
+            free |= name == "friction" and body in ("floor", "stage", "robot")
+            if not free and not np.array_equal(value, usual[key]):
+                asked, only = f"{body}.{name} on the TriFinger platform", usual[key].tolist()
+                raise UnknownOption(asked, np.asarray(value).tolist(), (str(only),))
+
+    def _begin(self) -> None:
+        self._platform: Any = None
+        self._first = self._state.copy()
+        self._played: list[tuple[Floats, int]] = []
+
+    def _start(self) -> None:
+        """Make the platform as the first state and the parameters say."""
+        from trifinger_simulation import TriFingerPlatform as Platform
+        from trifinger_simulation.tasks.move_cube import Pose
+
+        first: PhysicalState = self._first  # type: ignore[assignment] # a TriFinger's
+        pose = Pose(_turned(first.positions[0], 1), _facing(first.orientations[0], 1))
+        usual = np.array(Platform.spaces.robot_position.default, dtype=np.float64)
+        self._platform = Platform(initial_object_pose=pose)
+        robot = self._platform.simfinger
+        self._joints = self._posed(first.joint_positions, usual)
+        robot.reset_finger_positions_and_velocities(self._joints)
+        self._write(robot)
+        self._seen: tuple[float, Floats, Floats] | None = None
+
+    def _write(self, robot: Any) -> None:
+        """Write the parameters that the platform's simulation can have."""
+        import pybullet
+
+        found, client = self._parameters, robot._pybullet_client_id
+        block, cube = self._structure.blocks[0], self._platform.cube._object_id
+        change: dict[str, float] = {name: float(found[block, name]) for name in WRITTEN}
+        pybullet.changeDynamics(
+            cube, -1, mass=change["mass"], lateralFriction=change["friction"],
+            physicsClientId=client,
+        )  # fmt: skip
+        surfaces = {
+            "floor": [(getattr(robot._table_id, "_object_id", robot._table_id), -1)],
+            "stage": [(robot._containment_id, -1)],
+            "robot": [(robot.finger_id, link) for link in robot.pybullet_link_indices],
+        }
+        for name, parts in surfaces.items():
+            for body, link in parts:
+                pybullet.changeDynamics(
+                    body, link, lateralFriction=float(found[name, "friction"]),
+                    physicsClientId=client,
+                )  # fmt: skip
+        pybullet.setGravity(*_turned(found["world", "gravity"], 1), physicsClientId=client)
+        spec = controller_spec(found)
+        robot.position_gains, robot.velocity_gains = np.tile(spec.kp, 3), np.tile(spec.kd, 3)
+        robot.safety_kd, robot.max_motor_torque = np.tile(spec.safety, 3), spec.limit
+
+    def _play(self, command: Floats, substeps: int) -> None:
+        """Hold a command, and read what the platform observes then."""
+        platform = self._platform
+        wanted = platform.Action(position=self._posed(command, self._joints))
+        for _ in range(round(substeps * self._structure.timestep / platform.get_time_step())):
+            at = platform.append_desired_action(wanted)
+        robot, seen = platform.get_robot_observation(at), platform.get_camera_observation(at)
+        self._joints = np.array(robot.position)
+        state: Any = self._state
+        here = self._ours(self._joints, state.joint_positions)
+        slopes = np.zeros((hardware.N_JOINTS, hardware.N_JOINTS))
+        for joint in range(hardware.N_JOINTS):
+            other = self._joints.copy()
+            other[joint] += SMALL
+            slopes[:, joint] = (self._ours(other, here) - here) / SMALL
+        state.joint_positions[:] = here
+        state.joint_velocities[:] = slopes @ np.array(robot.velocity)
+        state.joint_torques[:] = np.linalg.lstsq(slopes.T, np.array(robot.torque), rcond=None)[0]
+        pose, time = seen.filtered_object_pose, 1e-3 * seen.cameras[0].timestamp
+        place, facing = _turned(pose.position, -1), _facing(pose.orientation, -1)
+        if self._seen is not None and time > self._seen[0]:
+            elapsed, undone = time - self._seen[0], self._seen[2] * (-1.0, -1.0, -1.0, 1.0)
+            state.linear_velocities[0] = (place - self._seen[1]) / elapsed
+            turn = to_rotation_vector(quaternion_product(facing, undone))
+            state.angular_velocities[0] = turn / elapsed
+        if self._seen is None or time > self._seen[0]:
+            self._seen = (time, place, facing)
+        state.positions[0], state.orientations[0] = place, facing
+
+    def _posed(self, joints: Floats, near: Floats) -> Floats:
+        """Give the platform's joint positions with the tips of those of this package's robot."""
+        from trifinger_simulation.trifingerpro_limits import robot_position as limits
+
+        kinematics = self._platform.simfinger.kinematics
+        found = np.array(near, dtype=np.float64)
+        tips = forward(joints, float(self._parameters["robot", "height"])).reshape(3, 3)
+        for finger, tip in enumerate(tips):
+            part = slice(3 * finger, 3 * finger + 3)
+            near_, _ = kinematics.inverse_kinematics_one_finger(
+                finger, _turned(tip, 1), found, tolerance=NEAR, max_iterations=100
+            )
+            found[part] = np.clip(near_[part], limits.low[part], limits.high[part])
+        return found
+
+    def _ours(self, joints: Floats, near: Floats) -> Floats:
+        """Give the joint positions of this package's robot with the tips of the platform."""
+        tips = np.array(self._platform.forward_kinematics(joints))
+        height = float(self._parameters["robot", "height"])
+        return inverse(_turned(tips, -1).ravel(), height, near).joint_positions
+
+
+def _turned(points: Any, sign: int) -> Floats:
+    """Turn points about z: 1 to the platform's world, -1 back."""
+    cos, sin = math.cos(TURN), sign * math.sin(TURN)
+    return np.asarray(points) @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _facing(orientation: Any, sign: int) -> Floats:
+    """Turn an orientation about z, with w >= 0."""
+    turn = np.array([0.0, 0.0, sign * math.sin(TURN / 2), math.cos(TURN / 2)])
+    found = quaternion_product(turn, np.asarray(orientation, dtype=np.float64))
+    return found if found[3] >= 0.0 else -found
