@@ -26,7 +26,9 @@ _CLASSES = {
     "step": ("scm_world.backends.step", "StepFunction", "scm-world"),
     "fake": ("scm_world.backends.fake", "FakeBackend", "scm-world"),
     "trifinger_platform": (
-        "scm_world.tasks.trifinger.platform", "TriFingerPlatform", "scm-world[trifinger]"
+        "scm_world.tasks.trifinger.platform",
+        "TriFingerPlatform",
+        "scm-world[trifinger]",
     ),
 }
 

@@ -16,7 +16,7 @@ Source:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from importlib.metadata import version
 from importlib.util import find_spec
 from typing import Any, ClassVar, final
@@ -27,12 +27,11 @@ from scm_world._types import Floats
 from scm_world.backends.base import Capabilities, EngineSnapshot, InMemory
 from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
 from scm_world.geometry.rotations import quaternion_product, to_rotation_vector
-from scm_world.models.scene import ControlMode, Difference, ParameterKey, Parameters, Scene, State
+from scm_world.models.scene import ControlMode, Difference, Parameters, Scene
 from scm_world.tasks.trifinger import fake, hardware
 from scm_world.tasks.trifinger.kinematics import forward, inverse
 from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.tasks.trifinger.structure import (
-    CONTROLLER,
     TriFingerStructure,
     controller_spec,
     default_parameters,
@@ -42,17 +41,17 @@ CUBE = 0.065  # [m] edge of the platform's cube
 TURN = math.radians(-48.0)  # of this package's world about z, so that the fingers lie alike
 NEAR, SMALL = 1e-4, 1e-6  # [m] of inverse kinematics, [rad] of derivatives
 WRITTEN = ("mass", "friction")
-"""Of the cube. Friction of floor, stage and fingers, gravity and the controller are written, too."""
+"""Of the cube. Other frictions, gravity and the controller are written, too."""
 
 OWN: Mapping[str, Any] = {
     "tool_block.mass": 0.094,
     "position_gains": (15.0, 15.0, 9.0),
-    "velocity_gains": (0.5, 1.0, 0.5),
+    "velocity_gains": (0.5, 0.5, 0.5),
     "torque_limit": 0.396,
     "finger_friction": 0.1,
 }
-"""Values of variables that the platform has by itself: an intervention that sets them, on any
-backend, tells how much of a gap they explain."""
+"""Values of variables that the platform has by itself (its second velocity gain is 1, which is out
+of bounds here): an intervention that sets them, on any backend, tells how much they matter."""
 
 
 @final
@@ -68,6 +67,7 @@ class TriFingerPlatform(InMemory):
 
     name: ClassVar[str] = "trifinger_platform"
     capabilities: ClassVar[Capabilities] = Capabilities(snapshot="replay")
+    _platform: Any
 
     def __init__(self) -> None:
         if find_spec("trifinger_simulation") is None:
@@ -111,7 +111,7 @@ class TriFingerPlatform(InMemory):
         return fake.inertia(self._structure, self._parameters, body)
 
     def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
-        """Let the fingertips follow where the robot of this package would be commanded to have them.
+        """Let the fingertips go where a command would bring those of this package's robot.
 
         Raises:
             EngineFailure: Torques are commanded, or a number is not finite.
@@ -136,7 +136,8 @@ class TriFingerPlatform(InMemory):
         """Go back to a snapshot; the commands before it are repeated with the next step."""
         scene, first, played = self.opened(snapshot)
         super().restore(self.sealed(scene))
-        self._first, self._played, self._platform = first.copy(), list(played), None
+        self._begin()
+        self._first, self._played[:] = first.copy(), played
 
     # --- the platform ------------------------------------------------------------------------
 
@@ -153,7 +154,7 @@ class TriFingerPlatform(InMemory):
                 raise UnknownOption(asked, np.asarray(value).tolist(), (str(only),))
 
     def _begin(self) -> None:
-        self._platform: Any = None
+        self._platform = None
         self._first = self._state.copy()
         self._played: list[tuple[Floats, int]] = []
 
@@ -162,7 +163,7 @@ class TriFingerPlatform(InMemory):
         from trifinger_simulation import TriFingerPlatform as Platform
         from trifinger_simulation.tasks.move_cube import Pose
 
-        first: PhysicalState = self._first  # type: ignore[assignment] # a TriFinger's
+        first: PhysicalState = self._first
         pose = Pose(_turned(first.positions[0], 1), _facing(first.orientations[0], 1))
         usual = np.array(Platform.spaces.robot_position.default, dtype=np.float64)
         self._platform = Platform(initial_object_pose=pose)
@@ -253,7 +254,10 @@ class TriFingerPlatform(InMemory):
 def _turned(points: Any, sign: int) -> Floats:
     """Turn points about z: 1 to the platform's world, -1 back."""
     cos, sin = math.cos(TURN), sign * math.sin(TURN)
-    return np.asarray(points) @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    turned: Floats = np.asarray(points) @ np.array(
+        [[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]
+    )
+    return turned
 
 
 def _facing(orientation: Any, sign: int) -> Floats:
