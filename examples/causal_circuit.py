@@ -45,7 +45,10 @@ def noise_of(brightness, *causes):
 
 
 def circuit() -> SCM:
-    """The arm presses buttons, which make lights bright; green and blue light cause red light."""
+    """The arm presses buttons, which make lights bright; green and blue light cause red light.
+
+    This is the graph of the paper as we read it; the published files do not state one.
+    """
     unit = Box(0.0, 1.0)
     lit = {"mechanism": light, "noise": unit, "inverse_noise": noise_of, "a": unit}
     variables = [Exogenous(name="arm", distribution=unit, a=unit)]

@@ -24,11 +24,12 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world._types import Integers as Numbers
-from scm_world.errors import ImpossibleObservation, ModelError, UnknownOption, UnknownVariable
+from scm_world.errors import ImpossibleObservation, ModelError, UnknownOption
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier, first_value, noise_of
 from scm_world.queries.equations import Layout
 from scm_world.queries.inversion import Inverse, law_of, summed
+from scm_world.queries.observations import Observations, observations
 from scm_world.queries.plans import Plan, numbered
 from scm_world.queries.timed import At
 from scm_world.variables import (
@@ -154,89 +155,14 @@ def counterfactuals(
     tolerance: float = 1e-6,
 ) -> Counterfactuals:
     """Say what observed units would have been under an intervention; see ``SCM.counterfactual``."""
-    given = (model, _columns(model, observed))
+    seen = observations(model, observed)
     if n is None:
-        sure = _Abduction(*given, 1, seed, tolerance, certain=True)
+        sure = _Abduction(model, seen, 1, seed, tolerance, certain=True)
         answer = None if sure.sampled else sure.answer(do)
         if answer is not None and answer.exact:
             return answer
     count = DRAWS if n is None else whole_number("n", n, least=1)
-    return _Abduction(*given, count, seed, tolerance).answer(do)
-
-
-RECORDED = ("episode", "step", "regime", "intervention_targets")
-"""Columns of a frame of a ``Dataset`` besides its variables."""
-
-
-def _columns(model: SCM, observed: Any) -> dict[str, Value]:
-    """Read a row or a table as numbers by variable, shape (..., *shape); NaN where there is none.
-
-    Args:
-        model: Whose variables were observed.
-        observed: Values by name, a data frame, or a ``Dataset``. Names of components, such as
-            ``"v[2]"``, are put together. Rows of several control steps are put side by side.
-    """
-    if hasattr(observed, "regimes"):  # a Dataset
-        found = dict(zip(observed.names, observed.values.T, strict=True))
-        found |= {"episode": observed.episode, "step": observed.step}
-        found["intervention_targets"] = np.array([bool(names) for names in observed.targets])
-    elif isinstance(observed, Mapping) or hasattr(observed, "columns"):
-        names = observed if isinstance(observed, Mapping) else observed.columns
-        found = {str(name): np.asarray(observed[name]) for name in names}
-    else:
-        allowed = ("values by name", "a table by name", "a data frame", "a Dataset")
-        raise UnknownOption("observed", observed, allowed)
-    apart = {name: found.pop(name) for name in RECORDED if name in found and name not in model}
-    if any(target is not None and target is not np.False_ for target in apart.get(RECORDED[3], ())):
-        advice = "take its rows without (table.observational), or ask model.do({…}) of the others"
-        raise ModelError([f"the table has rows in which something was done: {advice}"])
-    parts: dict[str, dict[int, Value]] = {}
-    columns: dict[str, Value] = {}
-    for name, values in found.items():
-        whole, _, place = name.removesuffix("]").rpartition("[")
-        if name not in model and name.endswith("]") and whole in model and place.isdecimal():
-            parts.setdefault(whole, {})[int(place)] = _numbers(model, whole, values)
-        elif name not in model:
-            raise UnknownVariable(name, model)
-        else:
-            columns[name] = _numbers(model, name, values)
-    for name, each in parts.items():
-        shape = model.declared(name).shape
-        lost = sorted(set(range(int(np.prod(shape)))) - set(each))
-        if lost:
-            said = f"{name!r} was observed in part: there is no '{name}[{lost[0]}]'"
-            raise ModelError([f"{said}; give all of its numbers, or none"])
-        stacked = np.stack([each[place] for place in sorted(each)], axis=-1)
-        columns[name] = stacked.reshape(*stacked.shape[:-1], *shape)
-    if model.is_temporal and "step" in apart:
-        order = np.lexsort((apart["step"], apart["episode"]))
-        _, counts = np.unique(apart["episode"], return_counts=True)
-        if len(set(counts.tolist())) != 1:
-            raise ModelError(["the episodes of the table have different lengths; give one at once"])
-        columns = {
-            name: values[order].reshape(len(counts), counts[0], *values.shape[1:])
-            for name, values in columns.items()
-        }
-    return columns
-
-
-def _numbers(model: SCM, name: str, values: Value) -> Value:
-    """Read numbers or labels of a variable; None is NaN.
-
-    Raises:
-        ImpossibleObservation: Something is neither.
-    """
-    bounds = model.declared(name).bounds
-    known = {}
-    if isinstance(bounds, Categories) and bounds.labels:
-        known = dict(zip(bounds.labels, bounds.members, strict=True))
-    if values.dtype.kind in "OUS":
-        values = np.array([known.get(v, v) for v in values.ravel().tolist()]).reshape(values.shape)
-    try:
-        return values.astype(float)
-    except (TypeError, ValueError) as error:
-        allowed = f", and labels are {', '.join(known)}" if known else ""
-        raise ImpossibleObservation(name, f"observations are numbers{allowed}: {error}") from None
+    return _Abduction(model, seen, count, seed, tolerance).answer(do)
 
 
 @final
@@ -245,7 +171,7 @@ class _Abduction:
 
     Args:
         model: With the interventions under which was observed.
-        columns: Observed values, by name; NaN where something was not observed.
+        seen: What was observed.
         n: How many draws of what was not observed.
         seed: Of the draws.
         tolerance: How far a value may lie from what follows, as a share of 1 and of its size.
@@ -255,7 +181,7 @@ class _Abduction:
     def __init__(
         self,
         model: SCM,
-        columns: Mapping[str, Any],
+        seen: Observations,
         n: int,
         seed: int,
         tolerance: float,
@@ -265,12 +191,15 @@ class _Abduction:
         self.model, self.n, self._tolerance = model, n, tolerance
         self._noise, self._certain = Noise(whole_number("seed", seed, least=0)), certain
         self._together = Layout(model).is_vectorised
-        self.steps = 1
-        self._observed = self._read(columns)
+        self.one, self._rows, self.steps = seen.one, seen.rows, seen.steps
         self._size = self._rows * n
         if self._size * self.steps > MOST:
             said = f"{self._rows} units with {n} draws each of {self.steps} instants are too many"
             raise ModelError([f"{said}: give fewer rows at once, or a smaller n"])
+        self._observed = {
+            name: np.repeat(np.moveaxis(values, 1, 0), n, axis=1)
+            for name, values in seen.values.items()
+        }
         self.log_weights = np.zeros(self._size)
         self._ancestors = np.tile(np.arange(n), self._rows)
         self.sampled = False
@@ -284,51 +213,18 @@ class _Abduction:
             before = model.remembered(self._abduct(step, before), before)
             before = self._drawn_again(step, before)
 
-    # --- what was observed ----------------------------------------------------------------------
-
-    def _read(self, columns: Mapping[str, Any]) -> dict[str, Value]:
-        """Check what was observed, and repeat it for the draws; shape (steps, rows * n, *shape)."""
-        temporal = self.model.is_temporal
-        found, rows, steps = {}, set[int](), set[int]()
-        for name, values in columns.items():
-            if name not in self.model:
-                raise UnknownVariable(name, self.model)
-            shape = self.model.declared(name).shape
-            lead = values.shape[: values.ndim - len(shape)]
-            if values.shape[len(lead) :] != shape or len(lead) not in (temporal, temporal + 1):
-                allowed = "(steps,) or (rows, steps)" if temporal else "() or (rows,)"
-                said = f"{name!r} was observed with shape {values.shape}: give {allowed}"
-                raise ModelError([said + f" and then {shape}" * bool(shape)])
-            if temporal:
-                steps.add(lead[-1])
-            rows.add(lead[0] if len(lead) > temporal else 0)
-            found[name] = values
-        if len(rows) > 1 or len(steps) > 1 or not found or 0 in steps:
-            said = "observe at least one variable, and all of the same rows and control steps"
-            raise ModelError([said])
-        self.one = rows == {0}
-        self._rows = 1 if self.one else rows.pop()
-        self.steps = steps.pop() if temporal else 1
-        return {name: self._repeated(name, values) for name, values in found.items()}
-
-    def _repeated(self, name: str, values: Value) -> Value:
-        shape = self.model.declared(name).shape
-        table = np.reshape(values, (self._rows, self.steps, *shape))
-        if np.isinf(table).any():
-            raise ImpossibleObservation(
-                name, "an observation is finite, or NaN where there is none"
-            )
-        unknown = np.isnan(table).reshape(self._rows, self.steps, -1)
-        if (unknown.any(axis=2) & ~unknown.all(axis=2)).any():
-            raise ModelError([f"{name!r} was observed in part: give all of its numbers, or none"])
-        return np.repeat(np.moveaxis(table, 1, 0), self.n, axis=1)
-
     # --- abduction ------------------------------------------------------------------------------
 
     def _abduct(self, step: int, before: Values) -> dict[str, Value]:
         """Find the noise of one instant; return the values of all variables."""
         model, values = self.model, dict[str, Value]()
-        self.given.append({} if not step else dict(self._kept()))
+        self.given.append(
+            {
+                name: value  # drawn once for the episode
+                for name, value in (self.given[0] if step else {}).items()
+                if getattr(model.declared(name), "per", "step") == "episode"
+            }
+        )
         self.values.append(values)
         for name in model.structure.order:
             variable: Any = model[name]
@@ -365,12 +261,6 @@ class _Abduction:
         logs = self.log_weights.reshape(self._rows, self.n)
         weights = np.exp(logs - logs.max(axis=1, keepdims=True))
         return np.asarray(weights / weights.sum(axis=1, keepdims=True))
-
-    def _kept(self) -> Iterator[tuple[str, Value]]:
-        """Give what was drawn once for the episode."""
-        for name, value in self.given[0].items():
-            if getattr(self.model.declared(name), "per", "step") == "episode":
-                yield name, value
 
     def _find(
         self,

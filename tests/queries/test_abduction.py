@@ -283,6 +283,7 @@ def test_what_cannot_be_is_refused_by_name() -> None:
         ({"q": 1.0}, UnknownVariable, "q"),
         ({"x": [0.1, 0.2], "y": 1.0}, ModelError, "same rows"),
         ({}, ModelError, "at least one"),
+        ({"x": []}, ModelError, "at least one"),
         ({"x": np.zeros((2, 2))}, ModelError, "shape"),
         (3.0, UnknownOption, "values by name"),
         ({"x": np.inf}, ImpossibleObservation, "finite"),
