@@ -50,7 +50,7 @@ def cloned(shown: Recording, updates: int, seed: int) -> nn.Module:
     return network
 
 
-def main(episodes: str = "120", updates: str = "8000", seed: str = "0", dataset: str = "") -> None:
+def main(episodes: str = "240", updates: str = "16000", seed: str = "0", dataset: str = "") -> None:
     """Record, learn, and evaluate on 25 episodes, without noise and with it."""
     shown = demonstrations(int(episodes), int(seed))
     print(f"{len(shown)} of {episodes} demonstrations solved the task")

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from scm_world._types import Floats
-from scm_world.backends.renderer import body_names, render
+from scm_world.backends.renderer import body_names, picture, render
 from scm_world.geometry import from_rotation_vector, rotation_matrix
 from scm_world.geometry.hulls import Hull, box_hull, hull_of
 from scm_world.models import GoalRegion, Light, Scene
 from scm_world.models.camera import Camera
-from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger import drawing, hardware
 from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
-from scm_world.tasks.trifinger.drawing import MOUNT
+from scm_world.tasks.trifinger.drawing import MOUNT, link_meshes
 from scm_world.tasks.trifinger.kinematics import link_frames
 from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
 
@@ -276,3 +277,44 @@ def test_fingers_cover_the_pixels_whose_rays_pass_them(camera: Camera) -> None:
 
     assert robot.sum() > 200
     assert unlike.sum() <= 5
+
+
+def test_published_links_hang_in_the_frames_of_physics() -> None:
+    """Each reaches along the axis of its capsule, and holds the joint of the next link, or the tip.
+
+    Their license is beside them, and they are small.
+    """
+    origins = (*hardware.JOINT_ORIGINS[1:], hardware.TIP_ORIGIN)  # in the frame of the link
+    capsules = [hardware.COLLISION[name] for name in ("upper", "middle", "lower")]
+    for mesh, end, capsule in zip(link_meshes(), origins, capsules, strict=True):
+        for point in (np.zeros(3), np.array(end), np.array(capsule.start), np.array(capsule.end)):
+            assert (mesh.low - 0.01 <= point).all(), point
+            assert (point <= mesh.high + 0.01).all(), point
+        sides = mesh.vertices[mesh.faces]
+        inside = np.einsum("ij,ij->i", sides[:, 0], np.cross(sides[:, 1], sides[:, 2])).sum() / 6.0
+        assert 1e-5 < inside < 5e-4  # [m³] faces are seen from outside
+    folder = Path(drawing.__file__).parent / "meshes"
+    assert "BSD 3-Clause License" in (folder / "LICENSE").read_text()
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 1_000_000
+
+
+def test_pictures_for_people_show_the_published_links_and_else_the_same() -> None:
+    """They cover about what the capsules cover, in the same colors and with the same owners."""
+    scene = scene_with()
+    whole, shown = (render(scene, SMALL, published=published) for published in (False, True))
+    np.testing.assert_array_equal(picture(scene, SMALL), shown.rgb)
+    assert not np.array_equal(whole.rgb, shown.rgb)
+    links = [index for index, name in enumerate(shown.names) if "_link_" in name]
+    one, other = (np.isin(found.segmentation, links) for found in (whole, shown))
+    assert (one & other).sum() > 0.6 * (one | other).sum()
+    np.testing.assert_array_equal(whole.rgb[~(one | other)], shown.rgb[~(one | other)])
+    for link in hardware.LINK_NAMES:
+        if not link.endswith("_0"):
+            assert shown.shows(link).any()
+    meshes = [
+        shape
+        for shape in drawing.DRAWING.shapes(scene)
+        if any(shape.mesh is mesh for mesh in link_meshes())
+    ]
+    names = [shown.names[shape.body] for shape in meshes]
+    assert names == [link for link in hardware.LINK_NAMES if not link.endswith("_0")]

@@ -42,8 +42,15 @@ class Drawing:
         """Name what the numbers of a segmentation stand for."""
         return model_shapes(structure.default_scene())[1]
 
-    def content(self, scene: Scene, *, shadows: bool) -> Any:
-        """Gather what all pictures of a scene have in common, for any camera."""
+    def content(self, scene: Scene, *, shadows: bool, published: bool = False) -> Any:
+        """Gather what all pictures of a scene have in common, for any camera.
+
+        Args:
+            scene: What to show.
+            shadows: Whether there are any.
+            published: Whether bodies look as their makers published them, where that is something
+                else than the shapes of physics.
+        """
         return self.shapes(scene), shadows
 
     def shapes(self, scene: Scene) -> list[Shape]:
@@ -131,7 +138,9 @@ class RenderedImage:
         return mask
 
 
-def render(scene: Scene, camera: Camera, *, samples: int = 1) -> RenderedImage:
+def render(
+    scene: Scene, camera: Camera, *, samples: int = 1, published: bool = False
+) -> RenderedImage:
     """Take a picture of a scene with the software renderer; ``picture`` can do with less.
 
     A camera inside a body sees its inside. Light comes from one direction, that of the scene;
@@ -143,6 +152,7 @@ def render(scene: Scene, camera: Camera, *, samples: int = 1) -> RenderedImage:
         camera: Where from.
         samples: How many samples per pixel and axis the colors are averaged over; 2 or 3 make
             smooth edges. Depth and segmentation are those of the center of the pixel.
+        published: Draw the links of the robot as published, not as the capsules of physics.
 
     Raises:
         ValueError: ``samples`` is not positive, or the camera has no optical axis.
@@ -158,7 +168,8 @@ def render(scene: Scene, camera: Camera, *, samples: int = 1) -> RenderedImage:
     if samples < 1:
         raise ValueError(f"samples: expected a positive number, got {samples}")
     drawing = drawing_of(scene.structure)
-    content, names = drawing.content(scene, shadows=True), drawing.names(scene.structure)
+    content = drawing.content(scene, shadows=True, published=published)
+    names = drawing.names(scene.structure)
     canvas = drawing.draw(scene, content, camera)
     fine = canvas if samples == 1 else drawing.draw(scene, content, camera, samples=samples)
     shown = _average(np.ascontiguousarray(fine.rgb.transpose(1, 2, 0)), samples)
@@ -174,6 +185,8 @@ def picture(
     samples: int = 1,
 ) -> NDArray[np.uint8]:
     """Take a picture for people, of any scene that has shapes. No screen is needed.
+
+    The links of the robot look as published; ``render`` shows the capsules that physics knows.
 
     Args:
         scene: What to show.
@@ -219,7 +232,7 @@ def picture(
                 "install libegl1 or libosmesa6, or use renderer='software'",
                 "mujoco",
             )
-        return render(scene, camera, samples=samples).rgb
+        return render(scene, camera, samples=samples, published=True).rgb
     samples = max(samples, 2)
     fine = replace(camera, height=camera.height * samples, width=camera.width * samples)
     return _average(draw_by_mujoco(scene, fine, SKY, library), samples)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, final
 
 from scm_world._arguments import load, one_of, whole_number
-from scm_world.backends.renderer import drawing_of, picture, png
+from scm_world.backends.renderer import drawing_of, png, render, scene_camera
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Scene
 
@@ -68,7 +68,7 @@ class Pictures:
             scenes[f"goal_{label}"] = drawing_of(scene.structure).background(scene, obstacles=True)
         return {
             name + (f".{camera}" if len(self.cameras) > 1 else ""): png(
-                picture(shown, own.get(camera, camera), self.size, "software")
+                render(shown, scene_camera(shown, own.get(camera, camera), self.size)).rgb
             )
             for name, shown in scenes.items()
             for camera in self.cameras

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -36,11 +37,18 @@ from scm_world.backends.renderer.kernels import (
     draw,
     shade_at,
 )
-from scm_world.backends.renderer.meshes import NO_COLORS, NO_SHADOW, lamp, shadow_map
+from scm_world.backends.renderer.meshes import (
+    NO_COLORS,
+    NO_SHADOW,
+    Triangles,
+    draw_mesh,
+    lamp,
+    shadow_map,
+)
 from scm_world.backends.renderer.picture import Drawing
 from scm_world.backends.renderer.shapes import GOAL_OPACITY, goal_shapes
 from scm_world.geometry.hulls import Hull
-from scm_world.geometry.rotations import rotation_kernel
+from scm_world.geometry.rotations import rotation_kernel, rotation_matrix
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Light, Scene
 from scm_world.models.shapes import Kind, Mesh, Shape, mesh_of
@@ -75,10 +83,13 @@ class Content(NamedTuple):
     Attributes:
         bodies: The hub, the links, the blocks and the obstacles.
         shadow: How dark the floor is; None where shadows are not drawn.
+        links: The links as published, in pictures for people; else they are among the bodies, as
+            the capsules of physics.
     """
 
     bodies: Bodies
     shadow: Floats | None
+    links: tuple[Triangles, ...] = ()
 
 
 class TriFingerDrawing(Drawing):
@@ -100,16 +111,20 @@ class TriFingerDrawing(Drawing):
         links = hardware.LINK_NAMES
         return ("floor", "stage", "robot", *links, *structure.blocks, *structure.obstacles)
 
-    def content(self, scene: Scene, *, shadows: bool) -> Content:
+    def content(self, scene: Scene, *, shadows: bool, published: bool = False) -> Content:
         """Gather the bodies of a scene, and their shadow on the floor."""
         bodies = solid_bodies(scene)
-        if not shadows:
-            return Content(bodies, None)
-        return Content(bodies, shadow_map(bodies, scene.light, half=WALL_RADIUS, n=SHADOW_TEXELS))
+        shadow = None
+        if shadows:
+            shadow = shadow_map(bodies, scene.light, half=WALL_RADIUS, n=SHADOW_TEXELS)
+        if not published:
+            return Content(bodies, shadow)
+        return Content(_without_links(bodies), shadow, _links(scene, bodies))
 
     def shapes(self, scene: Scene) -> list[Shape]:
         """List the floor, the wall, the hub, the links, blocks, obstacles and goals."""
-        bodies, hulls = solid_bodies(scene), dict(scene.structure.hulls)
+        whole, hulls = solid_bodies(scene), dict(scene.structure.hulls)
+        bodies = _without_links(whole)
         names = (*scene.structure.blocks, *scene.structure.obstacles)
         floor, wall = (np.array([*color, 1.0]) for color in palette(scene)[:2])
         flat = np.array([WALL_RADIUS, WALL_RADIUS, FLOOR_HALF])
@@ -118,8 +133,9 @@ class TriFingerDrawing(Drawing):
             Shape("cylinder", flat, below, turn, floor, FLOOR),
             Shape("mesh", np.zeros(3), np.zeros(3), turn, wall, STAGE, mesh=_ring()),
         ]
+        first = len(bodies.shapes) - len(names)
         for i, kind in enumerate(bodies.shapes.tolist()):
-            hull = hulls.get(names[i - N_ROBOT]) if kind == HULL else None
+            hull = hulls.get(names[i - first]) if kind == HULL else None
             found.append(
                 Shape(
                     _KINDS[kind],
@@ -132,6 +148,10 @@ class TriFingerDrawing(Drawing):
                     None if hull is None else _hull_mesh(hull),
                 )
             )
+        for link, mesh in zip(_links(scene, whole), N_FINGERS * link_meshes(), strict=True):
+            place = np.zeros(3), link.position, link.rotation
+            color = np.array([*link.color, 1.0])
+            found.append(Shape("mesh", *place, color, link.owner, True, mesh))
         return found + goal_shapes(scene.goals)
 
     def background(self, scene: Scene, *, obstacles: bool) -> Scene:
@@ -156,7 +176,7 @@ class TriFingerDrawing(Drawing):
         colors: bool = True,
     ) -> Canvas:
         """Draw the bodies over the arena, and then the goals over the bodies."""
-        bodies, shadow = content
+        bodies, shadow, links = content
         view, light = camera_view(camera, samples), lamp(scene.light)
         empty = trace_arena(camera, samples) if samples > 1 else empty_arena(camera)
         canvas = Canvas(empty.depth.copy(), empty.owners.copy(), NO_COLORS)
@@ -167,12 +187,56 @@ class TriFingerDrawing(Drawing):
             colored = paint_arena(empty, view, scene.light, palette(scene), dark)
             canvas = canvas._replace(rgb=colored)
         draw(bodies, view, light, 1.0, canvas)
+        for link in links:
+            draw_mesh(link, view, light, 1.0, canvas)
         if scene.goals:
             draw(goal_bodies(scene.goals, camera.eye), view, light, GOAL_OPACITY, canvas)
         return canvas
 
 
 DRAWING = TriFingerDrawing()
+
+
+@lru_cache(maxsize=1)
+def link_meshes() -> tuple[Mesh, ...]:
+    """Read the upper, the middle and the lower link as published, each in its frame.
+
+    Source:
+        robot_properties_fingers 2.0.2, ``meshes/edu`` and ``urdf/edu``, BSD-3-Clause: its text is
+        beside the files.
+    """
+    found, folder = [], Path(__file__).parent / "meshes"
+    rows = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
+    for name, offset in (("upper", 0.0195), ("middle", 0.0), ("lower", 0.0)):
+        triangles = np.frombuffer((folder / f"{name}_link.stl").read_bytes()[84:], rows)
+        points, faces = np.unique(triangles["corners"].reshape(-1, 3), axis=0, return_inverse=True)
+        found.append(mesh_of(points + np.array([offset, 0.0, 0.0]), faces.reshape(-1, 3)))
+    return tuple(found)
+
+
+def _links(scene: Scene, bodies: Bodies) -> tuple[Triangles, ...]:
+    """Put the published links where they are, in the colors of the capsules among the bodies."""
+    height = float(scene.parameters["robot", "height"])
+    origins, orientations = link_frames(scene.state.joint_positions, height)
+    found = []
+    for finger in range(N_FINGERS):
+        for part, mesh in enumerate(link_meshes(), start=1):
+            frame = FRAMES_PER_FINGER * finger + part
+            look = mesh.vertices, mesh.faces, mesh.normals
+            place = origins[frame], rotation_matrix(orientations[frame])
+            of = bodies.colors[frame + 1], int(bodies.owners[frame + 1])
+            found.append(Triangles(*look, *place, *of))
+    return tuple(found)
+
+
+def _without_links(bodies: Bodies) -> Bodies:
+    """Leave out the capsules of the links, of which none has flat sides."""
+    mounts = [1 + FRAMES_PER_FINGER * finger for finger in range(N_FINGERS)]
+    kept = [0, *mounts, *range(N_ROBOT, len(bodies.shapes))]
+    gone = len(bodies.shapes) - len(kept)
+    each = "shapes", "centers", "rotations", "halves", "colors", "owners"
+    rows: dict[str, Any] = {name: getattr(bodies, name)[kept] for name in each}
+    return bodies._replace(**rows, first=bodies.first[gone:])
 
 
 @lru_cache(maxsize=1)
@@ -335,8 +399,8 @@ def _along(capsule: hardware.Capsule) -> tuple[Floats, Floats, Floats]:
 _COLLISION = hardware.COLLISION
 _CAPSULES = tuple(_along(capsule) for capsule in (MOUNT, *_COLLISION.values()))
 _CENTERS, _ROTATIONS, _HALVES = (np.array(column) for column in zip(*_CAPSULES, strict=True))
-_N_FINGERS = len(hardware.FINGERS)
-_LINKS = np.array([4 * f + min(i, 3) for f in range(_N_FINGERS) for i in range(FRAMES_PER_FINGER)])
+N_FINGERS = len(hardware.FINGERS)
+_LINKS = np.array([4 * f + min(i, 3) for f in range(N_FINGERS) for i in range(FRAMES_PER_FINGER)])
 """The link that each capsule belongs to: links 0 to 3 and the tip, which belongs to link 3."""
 
 N_ROBOT = 1 + len(_LINKS)
@@ -345,7 +409,7 @@ N_ROBOT = 1 + len(_LINKS)
 FIRST_BLOCK = ROBOT + 1 + len(hardware.LINK_NAMES)
 
 _ROBOT_SHAPES = np.array([ELLIPSOID] + [CAPSULE] * len(_LINKS))
-_ROBOT_HALVES = np.vstack([HUB_HALVES, np.tile(_HALVES, (_N_FINGERS, 1))])
+_ROBOT_HALVES = np.vstack([HUB_HALVES, np.tile(_HALVES, (N_FINGERS, 1))])
 _ROBOT_OWNERS = np.array([ROBOT, *(_LINKS + ROBOT + 1)])
 
 
