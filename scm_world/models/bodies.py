@@ -105,6 +105,7 @@ class Geom:
         vertices: Corners of the convex hull of a mesh [m].
         friction: Sliding coefficient.
         slippery: Whether it asks for contacts without friction.
+        special: Whether its contacts have a softness, margin or priority of their own.
     """
 
     name: str
@@ -116,6 +117,7 @@ class Geom:
     vertices: tuple[Vector, ...] = ()
     friction: float = 1.0
     slippery: bool = False
+    special: bool = False
 
 
 @final

@@ -532,7 +532,7 @@ class _Laws:
             if geom.position[2] == 0.0 and tuple(geom.orientation[:2]) == (0.0, 0.0)
         ]
         level = bodies.gravity[2] < 0.0 and not any(bodies.gravity[:2])
-        if len(grounds) != 1 or not level:
+        if len(grounds) != 1 or not level or bodies.missing or bodies.geoms[grounds[0]].special:
             return
         ground, shaping = grounds[0], self.shaping()
         roots = [bodies.roots[geom.body] for geom in bodies.geoms]
@@ -544,7 +544,7 @@ class _Laws:
             if joint.kind != "free" or not alone or (ground, own[0]) not in bodies.touching:
                 continue
             shape, geom = own[0], bodies.geoms[own[0]]
-            if geom.kind not in ("box", "sphere"):
+            if geom.kind not in ("box", "sphere") or geom.special or joint.damping:
                 continue
             found = [self.laid(joint, geom, axis) for axis in range(len(geom.size))]
             heights = [(half, f[0]) for half, f in zip(geom.size, found, strict=True) if f]

@@ -105,6 +105,28 @@ def test_laws_hold_and_leave_no_trace(system: str, engine: str) -> None:
     assert all(law.reason for law in laws if law.passed is None)
 
 
+CRATE = 'name="crate" type="box" size="0.1 0.12 0.1"'
+ODD = {
+    "lighter": ('<body name="box"', '<body name="box" gravcomp="0.5"'),
+    "airy": ("<worldbody>", '<option density="1.2" viscosity="2"/><worldbody>'),
+    "soft": (CRATE, f'{CRATE} solref="0.2 0.5" solimp="0.5 0.6 0.05"'),
+    "wide": (CRATE, f'{CRATE} margin="0.02"'),
+    "first": (CRATE, f'{CRATE} priority="1"'),
+    "bouncing": (CRATE, f'{CRATE} solref="-1000 -2"'),
+    "slippery": (CRATE, f'{CRATE} condim="1"'),
+}
+
+
+@pytest.mark.parametrize("what", ODD)
+def test_contacts_of_their_own_break_no_law(what: str) -> None:
+    """What has other contacts than an engine's usual ones, or floats, has no law of contact."""
+    pytest.importorskip("mujoco")
+    odd = Simulation(ModelTask(ARM.replace(*ODD[what])), backend="mujoco")
+    laws = check_laws(odd)
+    assert not [str(law) for law in laws if law.passed is False]
+    assert "sliding" not in {law.law for law in laws}
+
+
 def scaled(element, attribute, factor):
     """Multiply one parameter."""
     return lambda key, value, _: (
