@@ -28,6 +28,7 @@ from scm_world.policies.cards import OPTIONS
 from scm_world.policies.scripted import NAMED
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress, Tell
+from scm_world.tasks import TASKS
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.training.export import mean, scored, words
 from scm_world.training.loop import open_folder, torch_threads
@@ -157,6 +158,8 @@ class Lesson(Frozen):
 def lesson(task: str, **changes: Any) -> Lesson:
     """Return the lesson that works for a task, with changes.
 
+    For a task that is not of this package, what varies is what it has of that: P0 at least.
+
     Args:
         task: Name of the task.
         changes: Fields of the ``Lesson``. Those that have parts (``env``, ``network``,
@@ -173,6 +176,11 @@ def lesson(task: str, **changes: Any) -> Lesson:
     """
     fields: dict[str, Any] = Lesson.model_construct(task=task).model_dump(mode="json")
     fields |= LESSONS.get(task, {})
+    known = protocols_of(task)
+    there = {protocol.name for protocol in known}
+    for part in (fields, fields["trials"]) if task not in TASKS else ():
+        usual = [name for name in part["protocols"] if name in there]
+        part["protocols"] = usual or ["P0"]  # nothing varies: every task has it
     for name, value in changes.items():
         first, part = nested(name, value)
         if first not in Lesson.model_fields:
@@ -183,7 +191,7 @@ def lesson(task: str, **changes: Any) -> Lesson:
     except ValidationError as error:
         raise refused("a lesson", error) from None
     for names in (found.protocols, found.trials.protocols or ("P0",)):
-        chosen(names, protocols_of(task))
+        chosen(names, known)
     return found
 
 

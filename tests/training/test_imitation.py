@@ -330,3 +330,12 @@ def test_a_clone_does_not_depend_on_the_threads_of_torch(
         assert (seen, torch.get_num_threads()) == ([1], 2)
     finally:
         torch.set_num_threads(before)
+
+
+def test_a_task_that_is_not_ours_has_a_lesson() -> None:
+    """With the protocols that it has; what was asked for and is not there is refused."""
+    task = f"{Path(__file__).parents[1] / 'env' / 'model_tasks.py'}:Balance"
+    made = lesson(task, keep=0.0)
+    assert made.protocols == made.trials.protocols == ("P0",)
+    with pytest.raises(UnknownOption, match="P5"):
+        lesson(task, protocols=["P5"])
