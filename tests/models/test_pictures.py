@@ -264,14 +264,14 @@ def test_one_camera_for_two_scenes(scene: Scene) -> None:
     assert following_camera(camera, scene).eye != camera.eye
 
 
-def test_the_trifinger_looks_as_before() -> None:
+def test_the_trifinger_looks_as_published() -> None:
     """Its pictures are those of ``render``, from the overview, and its renderer is ours."""
     scene = default_scene(TriFingerStructure(blocks=("tool_block",)))
 
-    np.testing.assert_array_equal(picture(scene), render(scene, OVERVIEW).rgb)
-    np.testing.assert_array_equal(
-        picture(scene, "60", (128, 128), samples=2), render(scene, CAMERAS[0], samples=2).rgb
-    )
+    whole = render(scene, OVERVIEW, published=True).rgb
+    np.testing.assert_array_equal(picture(scene), whole)
+    fine = render(scene, CAMERAS[0], samples=2, published=True).rgb
+    np.testing.assert_array_equal(picture(scene, "60", (128, 128), samples=2), fine)
     with pytest.raises(UnknownOption, match=r"renderer.*software"):
         picture(scene, renderer="mujoco")
 
@@ -505,3 +505,23 @@ def test_a_forked_process_can_draw(scene: Scene) -> None:
         theirs = pool.apply_async(picture, (scene, "front", SIZE)).get(timeout=60.0)
 
     np.testing.assert_array_equal(theirs, software(scene, "front"))
+
+
+_DRAW_AND_LEARN = """
+from scm_world import ModelTask, World
+from scm_world.backends.renderer import picture
+
+ball = '<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
+with World(ModelTask(ball)) as world:
+    world.reset(seed=0)
+    picture(world.scene(), size=(8, 8), renderer="mujoco")
+import triton._C.libtriton  # as torch does when an optimizer is made
+"""
+
+
+def test_what_has_drawn_can_learn() -> None:
+    """An optimizer of torch is made after a picture; the LLVM of both was the end of a process."""
+    if opengl() is None:
+        pytest.skip("neither EGL nor OSMesa works here")
+    pytest.importorskip("triton")
+    subprocess.run([sys.executable, "-c", _DRAW_AND_LEARN], check=True)  # noqa: S603 # our own code

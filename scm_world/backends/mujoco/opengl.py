@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 import threading
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from functools import lru_cache
 from typing import Any, final
 
@@ -65,6 +65,9 @@ def _works(library: str) -> bool:
         )
     except (OSError, subprocess.TimeoutExpired):
         return False
+    with suppress(Exception):  # it is torch's, if there is one
+        # A software driver and triton have an LLVM each: the process ends if triton comes second.
+        importlib.import_module("triton")
     return trial.returncode == 0
 
 
