@@ -41,8 +41,8 @@ def studio(
     """
     for package in ("starlette", "uvicorn", "websockets"):
         load(package, package, "studio")
+    from scm_world.studio.reading import Spec
     from scm_world.studio.server import serve
-    from scm_world.studio.worker import Spec
 
     given = parse_assignments(option, "'--option'")
     for key, value in given.items():

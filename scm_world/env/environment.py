@@ -367,7 +367,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
         """
-        self.world.advance(self._commanded(action))
+        self.world.advance(self.command(action))
         now = self._look()
         reward = self._scale * one_number(now, REWARD, self._terms)
         terminated = TERMINATED in self._counted and bool(now[TERMINATED])
@@ -376,8 +376,12 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             self._window.show(self.world.scene())
         return self._observer.observe(now), reward, terminated, truncated, self._info(now)
 
-    def _commanded(self, action: NDArray[np.float32]) -> Floats:
-        """Turn an action into what the world takes, shape (n,)."""
+    def command(self, action: ArrayLike) -> Floats:
+        """Give what the world takes for an action of this environment, shape (n,) [SI units].
+
+        Raises:
+            ActionError: Wrong shape, or a number that is not finite.
+        """
         given: Any = action
         if getattr(action, "dtype", None) is not SINGLE:
             given = doubles(action, self._given.size)

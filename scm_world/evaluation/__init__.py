@@ -12,7 +12,7 @@ from scm_world.evaluation.checking import Check, check
 from scm_world.evaluation.episodes import METRICS
 from scm_world.evaluation.explanation import Explanation, Otherwise, why
 from scm_world.evaluation.pipeline import evaluate
-from scm_world.evaluation.players import Player, WorldPolicy, as_player, player_from
+from scm_world.evaluation.players import Player, WorldPolicy, as_player, in_world, player_from
 from scm_world.evaluation.protocols import Protocol, protocols_of
 from scm_world.evaluation.recording import Recorder, Recording, record
 from scm_world.evaluation.results import Evaluation
@@ -34,6 +34,7 @@ __all__ = [
     "as_player",
     "check",
     "evaluate",
+    "in_world",
     "player_from",
     "protocols_of",
     "record",

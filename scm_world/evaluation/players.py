@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import load
+from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
 from scm_world.env.arguments import action_scale
 from scm_world.env.delta import PREFIX as RELATIVE_MODE
@@ -23,6 +24,7 @@ from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableF
 from scm_world.evaluation.recording_files import Recorded, from_parquet
 from scm_world.output.reading import LARGEST_TABLE, read_bytes
 from scm_world.policies import MlpPolicy, OnnxPolicy, PolicyAbout, file_of, load_policy, load_sb2
+from scm_world.policies.cards import FORM
 from scm_world.policies.scripted import NAMED, Policy
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries.episode_files import load_episode
@@ -336,6 +338,49 @@ def as_player(policy: Any, *, trusted: Sequence[str] | None = None) -> Player:
         raise UnknownOption("policy", policy, FORMS)
     made.policy = policy
     return made
+
+
+def in_world(policy: Any, world: Simulation) -> Policy:
+    """Return a policy of observations as one of a world, for ``rollout`` and ``live``.
+
+    It observes what an environment would show it, and its actions are turned into commands.
+
+    Args:
+        policy: As in ``as_player``; one that says how it was trained gets such observations.
+        world: In which it acts, or one like it.
+
+    Raises:
+        UnknownOption: There is no such policy, or it was trained with other options.
+        SnapshotMismatch: When it acts: that world has another task or other options.
+
+    Example:
+        >>> from scm_world.queries import World
+        >>> world = World("pushing", backend="fake")
+        >>> world.rollout(in_world("zoo:pushing", world), steps=2).actions.shape
+        (2, 9)
+    """
+    player = as_player(policy)
+    options = {} if player.made_for is None else player.made_for.unusual(FORM)
+    env = ScmWorldEnv(
+        world.structures.task,
+        backend=world.backend.name,
+        preset=world.options.preset,
+        resolution=world.resolution,
+        frame_skip=world.frame_skip,
+        max_episode_length=world.given_length,
+        conventions=world.conventions.name,
+        **options,
+    )
+    episode: list[tuple[int, int]] = []
+
+    def act(now: Simulation) -> Floats:
+        env.world.restore(now.snapshot())
+        if now.index == 0 or [(now.noise.seed, now.episode)] != episode:
+            episode[:] = [(now.noise.seed, now.episode)]
+            player.begin(env)
+        return env.command(player.act(env.observe()))
+
+    return act
 
 
 def player_from(about: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Player:

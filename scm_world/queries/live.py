@@ -122,7 +122,11 @@ class LiveEpisode:
         audit = self.world.do(due) if due else None
         if audit is not None:
             self._running.trace.audits[step] = audit
-        self._take((*self.layers, (step, plan)))
+        earlier, (start, last) = self.layers[:-1], self.layers[-1]
+        draws = any(isinstance(act, Draw) for _, act in last.acts())
+        if start != step or draws or not {*last} <= {*plan}:  # else this one takes its place
+            earlier = self.layers
+        self._take((*earlier, (step, plan)))
         return audit
 
     def _with_streams(self, plan: Plan) -> Plan:

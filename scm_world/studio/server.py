@@ -27,7 +27,8 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from scm_world.errors import UnknownOption
-from scm_world.studio.worker import Spec, work
+from scm_world.studio.reading import Spec
+from scm_world.studio.worker import work
 
 PAGE = Path(__file__).parent / "page"
 LOCAL = ("127.0.0.1", "localhost", "::1")
@@ -72,6 +73,10 @@ def standalone(recording: dict[str, Any]) -> str:
     coded = {file: b64encode(read(file).encode()).decode() for file in MODULES.values()}
     imports = import_map(lambda file: f"data:text/javascript;base64,{coded[file]}")
     return page(imports, json.dumps(recording, allow_nan=False).replace("<", "\\u003c"))
+
+
+def _refused(word: str) -> Any:
+    raise ValueError(f"{word} is no number")
 
 
 @final
@@ -145,7 +150,7 @@ class _Session:
                 try:
                     if len(text) > LARGEST:
                         raise ValueError(f"it has more than {LARGEST} characters")
-                    message = json.loads(text)
+                    message = json.loads(text, parse_constant=_refused)
                 except (ValueError, RecursionError) as error:
                     said = {"type": "reply", "id": None, "error": f"no JSON: {error}"}
                     self._texts.append(json.dumps(said))
@@ -325,6 +330,7 @@ def serve(
     except (OSError, SystemExit) as error:
         allowed = (f"an address of this machine with a free port: {error}",)
         raise UnknownOption("--port", f"{host}:{port}", allowed) from None
+    bound.listen()  # a page that is opened at once waits until the server answers
     shown = f"[{host}]" if ":" in host else host
     address = f"http://{shown}:{bound.getsockname()[1]}/" + (f"?token={token}" if token else "")
     say(address)

@@ -6,9 +6,6 @@ as bytes. What a message asks for happens completely, or it gets an error and no
 
 from __future__ import annotations
 
-import math
-import multiprocessing
-import os
 import signal
 import tempfile
 import time
@@ -22,15 +19,23 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, validate_call
 
 from scm_world._types import Floats, Value
-from scm_world.backends.step import StepModel
 from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, in_one_line
-from scm_world.queries import LiveEpisode, Plan, World, save_episode
-from scm_world.queries.plans import At
-from scm_world.queries.timed import Clamp
+from scm_world.evaluation import in_world
+from scm_world.policies.zoo import PREFIX as ZOO
+from scm_world.queries import At, Clamp, LiveEpisode, save_episode
+from scm_world.studio.jobs import Job
+from scm_world.studio.reading import (
+    Spec,
+    audited,
+    described,
+    lit_edges,
+    marks,
+    nearest,
+    plain,
+    told,
+)
 from scm_world.studio.scene import Shapes, frame, touching
-from scm_world.tasks import make_task
 from scm_world.variables import Draw, Natural, Scale, Shift
-from scm_world.variables.spaces import Box, Categories, Either, Integers
 
 FRAMES, NEWS = 60.0, 15.0  # most frames and reports of a second
 LATE = 0.25  # [s] by how much a world that plays may be late before it gives up catching up
@@ -41,34 +46,6 @@ FACTUAL, TWIN = 0, 1
 Step = Annotated[int, Field(ge=0)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Lane = Literal[0, 1]
-
-
-class Spec(BaseModel):
-    """What a world is made of.
-
-    Attributes:
-        system: A task, a model file or ``module:function``.
-        options: Arguments of the task.
-        settings: Arguments of ``World``.
-    """
-
-    model_config = ConfigDict(extra="forbid")
-    system: str
-    options: dict[str, Any] = {}
-    settings: dict[str, Any] = {}
-
-    def make(self) -> World:
-        """Make the world."""
-        return World(make_task(self.system, **self.options), **self.settings)
-
-    def code(self) -> list[str]:
-        """Return the lines of Python that make it."""
-        settings = "".join(f", {name}={value!r}" for name, value in self.settings.items())
-        made = repr(self.system)
-        if self.options:
-            given = ", ".join(f"{name}={value!r}" for name, value in self.options.items())
-            made = f"sw.make_task({made}, {given})"
-        return ["import scm_world as sw", "", f"world = sw.World({made}{settings})"]
 
 
 class Act(BaseModel):
@@ -165,7 +142,7 @@ class Session:
         self._loop: tuple[str, int] = ("", 0)
         self._new_lines = True
         self._policy: str | list[float] | None = None
-        self._job: _Job | None = None
+        self._job: Job | None = None
         self._seed, self._number = 0, 0
         self._lanes: list[_LaneState] = []
         self._begin(0, 0)
@@ -244,6 +221,10 @@ class Session:
     def _steps(self) -> int:
         return self._lanes[FACTUAL].live.steps
 
+    @property
+    def _model(self) -> Any:
+        return self._lanes[FACTUAL].live.world.model
+
     def _hello(self) -> None:
         """Describe the system: what the page draws before anything moves."""
         live = self._lanes[FACTUAL].live
@@ -303,6 +284,7 @@ class Session:
             "values": values,
             "rows": rows,
             "lit": self._touched(step),
+            "policy": "sliders" if isinstance(self._policy, list) else self._policy or "",
         }
         if self._new_lines:
             news["python"], self._new_lines = self._code(), False
@@ -352,13 +334,13 @@ class Session:
     # --- what the page asks for -----------------------------------------------------------------
 
     def _begin(self, seed: int, number: int) -> None:
-        live = self.world.live(self._policy, seed=seed, episode=number)
+        live = self.world.live(self._acting(self._policy), seed=seed, episode=number)
         for lane in self._lanes:
             lane.live.close()
         self._seed, self._number, self._looking, self._playing = seed, number, None, False
         self._lanes, self._sent_rows = [_LaneState(live)], [0, 0]
         of = "" if not number else f", episode={number}"
-        policy = "" if self._policy is None else f"{self._policy!r}, "
+        policy = "" if self._policy is None else f"{self._policy_code()}, "
         self._note(f"live = world.live({policy}seed={seed}{of})")
 
     def _advance(self, count: int) -> None:
@@ -419,16 +401,28 @@ class Session:
     @validate_call
     def policy(self, name: str | None = None, action: list[Finite] | None = None) -> None:
         """Choose who acts: nobody, a policy by its name, or an action that is kept."""
+        if action is not None:
+            self._lanes[FACTUAL].live.world.compiled.clipped(action)
         chosen: Any = name if action is None else action
-        self._lanes[FACTUAL].live.policy = chosen
+        self._lanes[FACTUAL].live.policy = self._acting(chosen)
         self._policy = chosen
-        self._note(f"live.policy = {chosen!r}")
+        self._note(f"live.policy = {self._policy_code()}")
+
+    def _acting(self, chosen: Any) -> Any:
+        """Return a policy as ``live`` takes it; one of the zoo observes the world."""
+        is_trained = isinstance(chosen, str) and chosen.startswith(ZOO)
+        return in_world(chosen, self.world) if is_trained else chosen
+
+    def _policy_code(self) -> str:
+        name = self._policy
+        trained = isinstance(name, str) and name.startswith(ZOO)
+        return f"in_world({name!r}, world)" if trained else repr(name)
 
     @validate_call
     def watch(self, names: list[str]) -> None:
         """Choose the variables whose present value is shown."""
         for name in names:
-            self.world.model.declared(name)
+            self._model.declared(name)
         self._watched = tuple(names)
 
     @validate_call
@@ -437,7 +431,7 @@ class Session:
         if len(names) > MOST_SERIES:
             raise UnknownOption("number of outcomes", len(names), (f"at most {MOST_SERIES}",))
         for name in names:
-            self.world.model.declared(name)
+            self._model.declared(name)
         self._plotted, self._sent_rows = tuple(names), [0, 0]
 
     @validate_call
@@ -464,7 +458,11 @@ class Session:
         part, code = act.part(chosen.live.steps)
         audit = chosen.live.do({name: part})
         chosen.look()
-        self._note(f"{('live', 'twin')[lane]}.do({{{name!r}: {code}}})")
+        first = f"{('live', 'twin')[lane]}.do({{{name!r}: "
+        last = self._code()[-1]
+        if last.startswith(first) and "sw.Draw" not in last:
+            self._lines.pop()  # at one instant, the last one counts
+        self._note(f"{first}{code}}})")
         return audited(audit)
 
     @validate_call
@@ -531,7 +529,7 @@ class Session:
     def _start(self, kind: str, probes: int, seed: int) -> None:
         if self._job is not None:
             raise UnknownOption("job", kind, (f"cancel {self._job.kind} first",))
-        self._job = _Job(self._spec, kind, probes, seed)
+        self._job = Job(self._spec, kind, probes, seed)
         made = "sw.discover(world, " if kind == "discover" else "sw.verify(world, "
         self._note(f"report = {made}probes={probes}, seed={seed})")
 
@@ -562,7 +560,8 @@ class Session:
             UnknownOption: There is no such lane, or no step was taken.
         """
         live = self._lane(lane).live
-        stem = f"{Path(self._spec.system.rpartition(':')[2]).stem}-{('factual', 'twin')[lane]}"
+        title = self._spec.title.partition(".")[0].replace(":", "-")
+        stem = f"{title}-{('factual', 'twin')[lane]}"
         if what == "plan":
             return {"name": f"{stem}-plan.json", "text": live.plan().to_json()}
         if what == "episode":
@@ -609,257 +608,11 @@ OPS = {
 """What a message may ask for."""
 
 
-# --- plain data -----------------------------------------------------------------------------------
-
-
-def plain(value: Any) -> Any:
-    """Return numbers as JSON can hold them; what is not finite becomes None."""
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [plain(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def told(act: Any) -> str:
-    """Say what an intervention does in a few words."""
-    return str(Plan({"x": act}))[len("do(x = ") : -1]
-
-
-def audited(audit: Any) -> dict[str, Any]:
-    """Write an audit as plain data."""
-    if audit is None:
-        return {"targets": [], "followed": [], "came": [], "went": []}
-    changes = [*audit.followed.items(), *audit.engine.items()]
-    return {
-        "targets": [
-            {
-                "name": name,
-                "requested": told(one.requested),
-                "applied": plain(one.applied),
-                "read_back": plain(one.read_back),
-            }
-            for name, one in audit.targets.items()
-        ],
-        "followed": [[name, plain(old), plain(new)] for name, (old, new) in changes],
-        "came": list(audit.came),
-        "went": list(audit.went),
-    }
-
-
-def nearest(error: Any) -> list[dict[str, Any]]:
-    """List the nearest possible values that an error names."""
-    found = [one for part in getattr(error, "problems", ()) if not isinstance(part, str)
-             for one in nearest(part)]  # fmt: skip
-    value = getattr(error, "nearest", None)
-    if value is not None and not callable(value):
-        found.append({"name": error.variable, "value": plain(np.asarray(value))})
-    return found
-
-
-def marks(space: Any, shape: tuple[int, ...], values: Any) -> list[dict[str, Any]] | None:
-    """Return the parts of a space as plain data, for marks on a scale; None where it has none."""
-    match space:
-        case Box():
-            low, high = space.bounds(shape, values)
-            return [{"low": plain(np.ravel(low)), "high": plain(np.ravel(high))}]
-        case Integers(low=low, high=high):
-            return [{"low": [low], "high": [high], "whole": True}]
-        case Categories(members=members, labels=labels):
-            return [{"members": list(members), "labels": list(labels)}]
-        case Either(first=first, second=second):
-            parts = (marks(part, shape, values) for part in (first, second))
-            return [one for part in parts for one in part or ()]
-    return None
-
-
-def group_of(world: World) -> dict[str, str]:
-    """Name the entity of every variable: what declared it, or the beginning of its name."""
-    owners: dict[str, str] = {}
-    for entity in world.composition.entities:
-        for one in (part for parts in entity.declared for part in parts):
-            owners[one.name] = entity.name
-    found = {}
-    for name in world.model:
-        variable = world.model.declared(name)
-        first = name.rpartition(".")[0]
-        outcome = "outcomes" if variable.role == "readout" else "world"
-        found[name] = (
-            owners.get(name) or first or ("actions" if variable.role == "action" else outcome)
-        )
-    return found
-
-
-def described(spec: Spec, world: World, live: Any) -> dict[str, Any]:
-    """Describe a world: variables, edges, actions, policies."""
-    model, groups = live.model, group_of(live)
-    names = list(model)
-    place = {name: index for index, name in enumerate(names)}
-    variables = []
-    for name in names:
-        variable = model.declared(name)
-        category = variable.bounds if isinstance(variable.bounds, Categories) else None
-        variables.append(
-            {
-                "name": name,
-                "group": groups[name],
-                "kind": variable.kind,
-                "role": variable.role,
-                "unit": variable.unit,
-                "shape": list(variable.shape),
-                "dtype": variable.dtype,
-                "doc": " ".join(variable.doc.split()),
-                "settable": bool(variable.settable),
-                "state": variable.role == "state",
-                "categories": category
-                and [list(category.members), list(category.labels) or list(category.members)],
-            }
-        )
-    low, high = plain(world.action_low), plain(world.action_high)
-    actions = [
-        {"name": f"{name}[{i}]" if part.stop - part.start > 1 else name, "low": low[k],
-         "high": high[k], "unit": model.declared(name).unit}
-        for name, part in live.compiled.actions.items()
-        for i, k in enumerate(range(part.start, part.stop))
-    ]  # fmt: skip
-    return {
-        "system": spec.system,
-        "backend": world.engine,
-        "dt": world.control_period,
-        "length": world.max_episode_length,
-        "variables": variables,
-        "edges": [[place[e.cause], place[e.effect], e.lag, e.when] for e in model.edges],
-        "actions": actions,
-        "policies": ["random", *world.task.policies],
-        "has_shapes": not isinstance(live.structure, StepModel),
-    }
-
-
-def lit_edges(model: Any, pairs: frozenset[tuple[str, str]]) -> list[int]:
-    """Number the edges by contact that join what touches.
-
-    The states of a body are those named after it, and those on which a parameter of it acts
-    in every step. A parameter of what has no states, such as a floor, counts wherever bodies touch.
-    """
-    edges, moves, acts = list(model.edges), dict[str, set[str]](), dict[str, set[str]]()
-    for name in model:
-        if model.declared(name).role == "state":
-            moves.setdefault(name.rpartition(".")[0], set()).add(name)
-    for edge in edges:
-        if edge.lag and edge.when is None:
-            acts.setdefault(edge.cause, set()).add(edge.effect)
-            if model.declared(edge.cause).role == "parameter":
-                moves.setdefault(edge.cause.rpartition(".")[0], set()).add(edge.effect)
-    moves.pop("", None)
-    islands: list[set[str]] = []
-    for pair in pairs:
-        moved = set[str]().union(*(moves.get(body, set()) for body in pair))
-        joined = [island for island in islands if island & moved]
-        islands = [island for island in islands if not island & moved]
-        islands.append(moved.union(*joined))
-    found = []
-    for number, edge in enumerate(edges):
-        island = next((one for one in islands if edge.effect in one), None)
-        if edge.when == "contact" and island is not None:
-            is_state = model.declared(edge.cause).role == "state"
-            mine = {edge.cause} if is_state else acts.get(edge.cause, set())
-            mine = mine or moves.get(edge.cause.rpartition(".")[0], set())
-            if not mine or mine & island:
-                found.append(number)
-    return found
-
-
 def loop(line: str, count: int) -> list[str]:
     """Write a line that is done several times."""
     if count < 2:
         return [line] * count
     return [f"for _ in range({count}):", f"    {line}"]
-
-
-# --- discovery and verification -------------------------------------------------------------------
-
-
-@final
-class _Job:
-    """Discovery or verification in a process of its own.
-
-    Attributes:
-        kind: ``"discover"`` or ``"verify"``.
-        pipe: What comes out of it; it is closed at the end.
-    """
-
-    def __init__(self, spec: Spec, kind: str, probes: int, seed: int) -> None:
-        self.kind = kind
-        context = multiprocessing.get_context("spawn")
-        self.pipe, other = context.Pipe(duplex=False)
-        given = spec.model_dump_json(), kind, probes, seed, other
-        self._process = context.Process(target=_experiment, args=given, daemon=True)
-        self._process.start()
-        other.close()
-
-    def interrupt(self) -> None:
-        """Ask it to report what is finished, and to end."""
-        if self._process.pid is not None and self._process.is_alive():
-            os.kill(self._process.pid, signal.SIGINT)
-
-    def end(self) -> None:
-        """End it, finished or not."""
-        self._process.terminate()
-        self._process.join()
-        self.pipe.close()
-
-
-def _experiment(spec: str, kind: str, probes: int, seed: int, pipe: Connection) -> None:
-    """Run experiments and report what they find."""
-    from scm_world.discovery import discover
-    from scm_world.queries import verify
-
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # the session ignores it
-    about = {"type": "job", "kind": kind}
-    edges: set[Any] = set()
-
-    def found(now: set[Any]) -> None:
-        new = sorted(now - edges)
-        edges.update(new)
-        pipe.send({**about, "edges": [list(edge) for edge in new]})
-
-    def progress(done: int, planned: int) -> None:
-        pipe.send({**about, "done": done, "planned": planned})
-
-    try:
-        with Spec.model_validate_json(spec).make() as world:
-            common: dict[str, Any] = {"probes": probes, "seed": seed, "found": found}
-            if kind == "discover":
-                report = discover(world, progress=progress, **common)
-                score = report.score
-                facts: dict[str, Any] = {
-                    "probe states": report.probes,
-                    "precision": score.precision,
-                    "recall": score.recall,
-                    "F1": score.f1,
-                    "SHD": score.shd,
-                    "noise floor": report.floor,
-                }
-                missed, extra = score.missed, score.undeclared
-            else:
-                checked = verify(world, progress=progress, least=min(16, probes), **common)
-                facts = {name: said for name, said, _ in checked.rows()}
-                missed = checked.never_fired
-                extra = tuple((u.cause, u.effect, u.lag) for u in checked.undeclared)
-            pipe.send(
-                {
-                    **about,
-                    "facts": facts,
-                    "missed": [list(edge) for edge in missed],
-                    "extra": [list(edge) for edge in extra],
-                }
-            )
-    except KeyboardInterrupt:
-        pipe.send({**about, "error": "cancelled before the first probe state was finished"})
-    except Exception as error:
-        pipe.send({**about, "error": in_one_line(error)})
-    finally:
-        pipe.close()
 
 
 def work(spec: str, pipe: Connection) -> None:

@@ -11,12 +11,15 @@ from policy_samples import RELATIVE, tensors, trained
 from benchmarks.baselines import publish as publishing
 from benchmarks.baselines.cards import card_text, page_text
 from benchmarks.baselines.publish import command_of, publish
+from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation import check, evaluate
+from scm_world.evaluation import check, evaluate, in_world
 from scm_world.evaluation.players import as_player, player_from
 from scm_world.policies import file_of, load_policy, save_policy
 from scm_world.policies import zoo as zoo_module
+from scm_world.policies.cards import FORM
 from scm_world.policies.zoo import best_known, card, zoo
+from scm_world.queries import World
 from scm_world.training.recipe import recipe
 
 PAGE = Path(__file__).parents[2] / "docs" / "zoo.md"
@@ -187,3 +190,20 @@ def test_the_command_line_lists_the_zoo(published: str, capsys: pytest.CaptureFi
     shown = " ".join(capsys.readouterr().out.split())
     for part in ("zoo:small", "pushing", " 4 ", "P0 0."):
         assert part in shown
+
+
+def test_a_policy_of_the_zoo_acts_in_a_world_as_in_an_environment() -> None:
+    """Its episode is that of the environment that it was trained in, bit for bit."""
+    player = as_player("zoo:pushing")
+    assert player.made_for is not None
+    env = ScmWorldEnv("pushing", **player.made_for.unusual(FORM))
+    observation, _ = env.reset(seed=3)
+    player.begin(env)
+    with World("pushing") as world:
+        policy = in_world("zoo:pushing", world)
+        for seed in (5, 3):  # it begins anew in every episode
+            episode = world.rollout(policy, seed=seed, steps=12)
+        assert episode.counterfactual({}, at=4, actions=policy) == episode
+    for _ in range(12):
+        observation, *_ = env.step(player.act(observation))
+    assert env.world.vector.tobytes() == episode.trace.vectors[-1].tobytes()

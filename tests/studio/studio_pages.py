@@ -52,10 +52,10 @@ PUSHER = """
 class Server:
     """``scm-world studio`` on a free port, or on the one that it had before."""
 
-    def __init__(self, system: str, *options: str, folder: Path) -> None:
+    def __init__(self, system: str, *options: str, folder: Path, port: int = 0) -> None:
         self._command = [sys.executable, "-m", "scm_world", "studio", system, *options]
         self._folder = folder
-        self.port = 0
+        self.port = port
         self.start()
 
     def start(self) -> None:
@@ -70,7 +70,10 @@ class Server:
         )
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
-        assert line.startswith("http://"), line + self._process.stdout.read()
+        if not line.startswith("http://"):
+            said = line + self._process.stdout.read()
+            self.stop()
+            raise AssertionError(said)
         self.address = line.strip()
         self.port = int(self.address.split("/")[2].rpartition(":")[2])
 

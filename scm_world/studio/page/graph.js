@@ -6,7 +6,7 @@ import dagre from "cytoscape-dagre";
 cytoscape.use(dagre);
 cytoscape.warnings(false); // of edges between nodes that overlap while a group opens
 
-const ROW = 44, WIDE = 170, PAD = 26, MANY = 400;
+const ROW = 44, WIDE = 170, PAD = 26, MANY = 400, READABLE = 0.7;
 const SHAPES = { parameter: "round-rectangle", state: "ellipse", readout: "octagon", action: "diamond" };
 
 /** Colours of a theme: those of Okabe and Ito, which colour-blind people tell apart. */
@@ -33,7 +33,7 @@ export class Graph {
     this.cut = new Set();
     this.cy = cytoscape({
       container: element, minZoom: 0.05, maxZoom: 3, boxSelectionEnabled: false,
-      autounselectify: true, autoungrabify: true,
+      autounselectify: true, autoungrabify: true, textureOnViewport: true, pixelRatio: Math.min(devicePixelRatio, 2),
     });
     this.cy.on("tap", "node", event => {
       const data = event.target.data();
@@ -44,7 +44,9 @@ export class Graph {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#style());
     new ResizeObserver(() => {
       this.cy.resize();
-      if (!this.touched) this.cy.fit(undefined, 14);
+      const shape = element.clientHeight / (element.clientWidth || 1);
+      if (Math.abs(Math.log(shape / (this.shape || 1e9))) > 0.3 && element.clientWidth) { this.placed = null; this.draw(); }
+      if (!this.touched) this.fit();
     }).observe(element);
     element.addEventListener("pointerdown", () => this.touched = true);
     element.addEventListener("wheel", () => this.touched = true, { passive: true });
@@ -87,9 +89,15 @@ export class Graph {
     this.draw();
   }
 
+  /** Show all; where names could not be read then, what is chosen and its neighbours. */
   fit() {
     this.touched = false;
     this.cy.fit(undefined, 14);
+    const node = this.chosen && this.cy.getElementById(this.chosen);
+    if (node?.nonempty() && this.cy.zoom() < READABLE) {
+      this.cy.fit(node.closedNeighborhood(), 30);
+      if (this.cy.zoom() > 1.1) this.cy.zoom({ level: 1.1, position: node.position() });
+    }
   }
 
   /** Where each group is: dagre, on groups alone; inside a group, rows. */
@@ -113,28 +121,56 @@ export class Graph {
       joined.add(a).add(b);
       flat.add({ data: { source: `g:${a}`, target: `g:${b}`, minLen: 1, weight: lag ? 1 : 3 } });
     }
-    const lone = [...rows.keys()].filter(group => !joined.has(group));
-    for (const group of lone) flat.getElementById(`g:${group}`).remove();
     flat.layout({ name: "dagre", rankDir: "TB", nodeSep: 26, rankSep: 46, animate: false, fit: false,
       ranker: "network-simplex" }).run();
-    const box = flat.elements().boundingBox(), at = new Map();
-    flat.nodes().forEach(node => at.set(node.id().slice(2), { ...node.position() }));
-    flat.destroy();
-    // A graph that is wide and low is stretched, so that it fills its place.
-    const { clientWidth, clientHeight } = this.element;
-    const wanted = Math.max(1, box.w || 1) * (clientHeight / Math.max(1, clientWidth)) * 0.75;
-    const stretch = Math.min(2.4, Math.max(1, wanted / Math.max(1, box.h || 1)));
-    for (const place of at.values()) place.y *= stretch;
-    let x = (box.x1 || 0), y = (box.y2 || 0) * stretch + 50, high = 0;
-    for (const group of lone) {  // what causes nothing and has no causes stands below, in rows
-      const { w, h } = rows.get(group);
-      if (x > (box.x1 || 0) && x + w > (box.x1 || 0) + Math.max(box.w || 0, 700)) { x = box.x1 || 0; y += high + 30; high = 0; }
-      at.set(group, { x: x + w / 2, y: y + h / 2 });
-      x += w + 26;
-      high = Math.max(high, h);
+    const ranks = new Map();
+    for (const node of flat.nodes().sort((m, n) => m.position("x") - n.position("x"))) {
+      const group = node.id().slice(2), rank = joined.has(group) ? Math.round(node.position("y")) : Infinity;
+      if (!ranks.has(rank)) ranks.set(rank, []);
+      ranks.get(rank).push(group);
     }
+    flat.destroy();
+    const at = this.#wrapped([...ranks.keys()].sort((m, n) => m - n).map(rank => ranks.get(rank)), rows);
     this.placed = { key, hello: this.hello, rows, at };
     return this.placed;
+  }
+
+  /** Put ranks under one another, each in as many rows as make the whole largest in its place. */
+  #wrapped(ranks, rows) {
+    const across = this.element.clientWidth || 1, down = this.element.clientHeight || 1;
+    this.shape = down / across;
+    const lines = width => ranks.flatMap(rank => {
+      const found = [[]];
+      let x = 0;
+      for (const group of rank) {
+        const { w } = rows.get(group);
+        if (x && x + w > width) { found.push([]); x = 0; }
+        found.at(-1).push(group);
+        x += w + 24;
+      }
+      return found.map((groups, i) => ({ groups, gap: i ? 18 : 50, x: groups.reduce((sum, g) => sum + rows.get(g).w + 24, -24),
+        h: Math.max(...groups.map(g => rows.get(g).h)) }));
+    });
+    const size = all => [Math.max(...all.map(l => l.x)), all.reduce((sum, l) => sum + l.h + l.gap, 0)];
+    const widest = Math.max(...[...rows.values()].map(r => r.w));
+    let best = null, most = 0;
+    for (let width = widest; width <= 40 * widest; width *= 1.15) {
+      const all = lines(width), [w, h] = size(all), scale = Math.min(across / w, down / h);
+      if (scale > most) { most = scale; best = all; }
+    }
+    const [, h] = size(best), spare = Math.min(2.2, Math.max(1, down / most / h)), at = new Map();
+    let y = 0;
+    for (const line of best) {
+      let x = -line.x / 2;
+      y += line.gap * spare + line.h / 2;
+      for (const group of line.groups) {
+        const { w } = rows.get(group);
+        at.set(group, { x: x + w / 2, y });
+        x += w + 24;
+      }
+      y += line.h / 2;
+    }
+    return at;
   }
 
   draw() {
@@ -181,7 +217,7 @@ export class Graph {
     this.cy.add(elements);
     this.cy.endBatch();
     this.#style();
-    if (!this.touched) this.cy.fit(undefined, 14);
+    if (!this.touched) this.fit();
     this.lit = new Set();
     this.#highlight();
     if (this.lastLit) this.light(this.lastLit);
@@ -194,7 +230,7 @@ export class Graph {
     const role = name => ({ selector: `node.${name}`, style: { shape: SHAPES[name], "background-color": c[name] } });
     this.cy.style([
       { selector: "node", style: {
-        label: "data(label)", "font-size": 11, "font-family": "system-ui, sans-serif", color: c.ink, "text-valign": "center",
+        label: "data(label)", "font-size": node => Math.min(11, Math.max(7, 250 / (node.data("label")?.length || 1))), "font-family": "system-ui, sans-serif", color: c.ink, "text-valign": "center",
         "text-halign": "center", width: WIDE - 16, height: 24, "border-width": 1, "border-color": c.line,
         "text-wrap": "ellipsis", "text-max-width": WIDE - 26, "background-color": c.group, "min-zoomed-font-size": 5 } },
       role("parameter"), role("state"), role("readout"), role("action"),
@@ -207,7 +243,7 @@ export class Graph {
       { selector: "edge:loop", style: { "loop-direction": "90deg", "loop-sweep": "40deg", "control-point-step-size": 22 } },
       { selector: "edge.lag1", style: { "line-style": "dashed" } },
       { selector: "edge.contact", style: { "line-style": "dotted" } },
-      { selector: "edge.many", style: { "curve-style": "straight", width: 1, opacity: 0.16, "target-arrow-shape": "none" } },
+      { selector: "edge.many", style: { "curve-style": "straight", "line-style": "solid", width: 1, opacity: 0.16, "target-arrow-shape": "none" } },
       { selector: "edge.cut", style: { "line-color": c.missed, opacity: 0.12 } },
       { selector: "edge.lit", style: { "line-color": c.lit, "target-arrow-color": c.lit, width: 2.4, opacity: 0.9, "z-index": 5 } },
       { selector: "edge.many.lit", style: { opacity: 0.4, width: 1.4 } },
@@ -221,6 +257,7 @@ export class Graph {
       { selector: "edge.faded", style: { opacity: 0.04 } },
       { selector: "edge.into", style: { "line-color": c.cause, "target-arrow-color": c.cause, width: 2.4, opacity: 1, "z-index": 9, "target-arrow-shape": "triangle" } },
       { selector: "edge.out", style: { "line-color": c.effect, "target-arrow-color": c.effect, width: 2.4, opacity: 1, "z-index": 9, "target-arrow-shape": "triangle" } },
+      { selector: "edge.many.lag1.into, edge.many.lag1.out", style: { "line-style": "dashed" } },
       { selector: "node.cause", style: { "border-width": 3, "border-color": c.cause } },
       { selector: "node.effect", style: { "border-width": 3, "border-color": c.effect } },
       { selector: "node.chosen", style: { "border-width": 4, "border-color": c.chosen, "font-weight": 700 } },
@@ -233,7 +270,7 @@ export class Graph {
     const group = name && this.byName.get(name)?.group;
     if (group && !this.open.has(group)) this.toggle(group, true);
     else this.#highlight();
-    if (name && !this.touched) return;
+    if (!this.touched) return this.fit();
     const node = name && this.cy.getElementById(name);
     if (node?.nonempty()) {
       const { x1, y1, x2, y2 } = this.cy.extent(), p = node.position();

@@ -115,18 +115,16 @@ const on = {
   hello(message) {
     const first = !hello;
     hello = message;
-    document.title = `${message.system} · scm_world studio`;
-    $("title").textContent = message.system;
+    document.title = `${message.title} · scm_world studio`;
+    $("title").textContent = message.title;
     $("about").textContent = `${message.backend} · ${message.variables.length} variables · ${message.edges.length} edges · control step ${show(message.dt)} s`;
     if (!recording) $("connection").textContent = "connected";
     if (first) view.forget();
     graph.load(message);
     $("names").replaceChildren(...message.variables.map(v => make("option", { value: v.name })));
-    const kept = $("policy").value;
     $("policy").replaceChildren(make("option", { value: "", textContent: "none" }),
       ...message.policies.map(name => make("option", { value: name, textContent: name })),
       ...(message.actions.length ? [make("option", { value: "sliders", textContent: "sliders" })] : []));
-    $("policy").value = [...$("policy").options].some(o => o.value === kept) ? kept : "";
     sliders();
     $("no-shapes").hidden = message.has_shapes;
     view.period = message.dt;
@@ -149,6 +147,10 @@ const on = {
     news = message;
     $("play").textContent = message.playing ? "Pause" : "Play";
     $("play").setAttribute("aria-pressed", message.playing);
+    if (message.policy !== undefined && document.activeElement !== $("policy")) {
+      $("policy").value = message.policy;
+      $("sliders").hidden = message.policy !== "sliders";
+    }
     $("scrub").max = message.steps;
     if (document.activeElement !== $("scrub") || !scrubbing) $("scrub").value = message.step;
     $("instant").textContent = `${message.step} of ${message.steps}`;
@@ -259,7 +261,6 @@ function sliders() {
     input.oninput = slide;
     return make("label", {}, make("span", { textContent: `${name}${unit && unit !== "1" ? ` [${unit}]` : ""}` }), input);
   }));
-  $("sliders").hidden = $("policy").value !== "sliders";
 }
 
 let sliding = false;
@@ -329,7 +330,7 @@ $("save-episode").onclick = () => save("episode");
 $("save-twin").onclick = () => save("episode", 1);
 $("save-plan").onclick = () => save("plan");
 $("save-page").onclick = () => save("recording");
-const stem = () => (hello?.system ?? "world").replace(/[^\w.-]+/g, "_");
+const stem = () => (hello?.title ?? "world").replace(/[^\w.-]+/g, "_");
 $("png").onclick = () => $("canvas").toBlob(blob => download(`${stem()}.png`, blob));
 let recorder = null;
 $("webm").onclick = () => {

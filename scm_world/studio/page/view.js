@@ -3,6 +3,7 @@
 import * as THREE from "three";
 import { bytesOf } from "studio/ask";
 
+const SLOW = 24; // [ms] a software renderer that takes longer for a picture draws fewer pixels while things move
 const FAR = 40; // [m] half the edge of a plane that does not end
 const TWIN = new THREE.Color("#E69F00");
 const MOST_ARROWS = 64;
@@ -32,6 +33,7 @@ export class View {
     this.drawn = 0;
     this.framed = false;
     this.pace = 16;
+    this.coarse = 0;
     this.#picking(pick);
     this.theme();
     new ResizeObserver(() => this.#dirty = true).observe(canvas);
@@ -130,7 +132,7 @@ export class View {
     const middle = box.getCenter(new THREE.Vector3());
     const size = box.getSize(point).length() / 2 || 1;
     const narrow = Math.min(1, this.canvas.clientWidth / Math.max(1, this.canvas.clientHeight));
-    const away = new THREE.Vector3(0.5, -1, 0.55).normalize().multiplyScalar(2.4 * size / Math.max(0.55, narrow));
+    const away = new THREE.Vector3(0.5, -1, 0.55).normalize().multiplyScalar(2.6 * size / Math.max(0.55, narrow));
     this.size = size;
     this.camera.near = size / 100;
     this.camera.far = Math.max(200, 50 * size);
@@ -160,7 +162,10 @@ export class View {
     this.#dirty = false;
     const { canvas, renderer } = this, width = canvas.clientWidth, height = canvas.clientHeight;
     if (!width || !height) return;
-    const ratio = this.software ? 1 : Math.min(devicePixelRatio, 2);
+    if (this.software && moving && this.pace > SLOW) this.coarse = now;
+    else if (this.coarse && now - this.coarse > 500) this.coarse = 0;
+    if (this.coarse) this.#dirty = true; // once more, sharp, when it stands still
+    const ratio = this.software ? (this.coarse ? 0.6 : 1) : Math.min(devicePixelRatio, 2);
     if (canvas.width !== Math.floor(width * ratio) || canvas.height !== Math.floor(height * ratio)) {
       renderer.setPixelRatio(ratio);
       renderer.setSize(width, height, false);
@@ -264,6 +269,7 @@ function material(shape, twin) {
   const color = new THREE.Color().setRGB(r, g, b, THREE.SRGBColorSpace);
   if (twin && !shape.goal) color.lerp(TWIN, 0.55);
   const made = new THREE.MeshLambertMaterial({ color, transparent: a < 1, opacity: a, depthWrite: a >= 1 });
+  Object.assign(made, { polygonOffset: twin, polygonOffsetFactor: 1, polygonOffsetUnits: 4 }); // where both are, the factual one is seen
   if (shape.kind === "plane" && shape.tiles) {
     made.map = checker(shape, color);
     made.color.set("#ffffff");

@@ -1,0 +1,209 @@
+"""What a session is made of, and worlds, audits and errors as plain data."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from scm_world.backends.step import StepModel
+from scm_world.policies.zoo import zoo
+from scm_world.queries import Plan, World
+from scm_world.tasks import make_task
+from scm_world.variables.spaces import Box, Categories, Either, Integers
+
+
+class Spec(BaseModel):
+    """What a world is made of.
+
+    Attributes:
+        system: A task, a model file or ``module:function``.
+        options: Arguments of the task.
+        settings: Arguments of ``World``.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+    system: str
+    options: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
+
+    def make(self) -> World:
+        """Make the world."""
+        return World(make_task(self.system, **self.options), **self.settings)
+
+    @property
+    def title(self) -> str:
+        """The system in few words: of a file, its name."""
+        home, _, function = self.system.rpartition(":")
+        return f"{Path(home).stem}:{function}" if home else Path(function).name
+
+    def code(self) -> list[str]:
+        """Return the lines of Python that make it."""
+        settings = "".join(f", {name}={value!r}" for name, value in self.settings.items())
+        made = repr(self.system)
+        if self.options:
+            given = ", ".join(f"{name}={value!r}" for name, value in self.options.items())
+            made = f"sw.make_task({made}, {given})"
+        first = ["import scm_world as sw", "from scm_world.evaluation import in_world", ""]
+        return [*first, f"world = sw.World({made}{settings})"]
+
+
+def plain(value: Any) -> Any:
+    """Return numbers as JSON can hold them; what is not finite becomes None."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [plain(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def told(act: Any) -> str:
+    """Say what an intervention does in a few words."""
+    return str(Plan({"x": act}))[len("do(x = ") : -1]
+
+
+def audited(audit: Any) -> dict[str, Any]:
+    """Write an audit as plain data."""
+    if audit is None:
+        return {"targets": [], "followed": [], "came": [], "went": []}
+    changes = [*audit.followed.items(), *audit.engine.items()]
+    return {
+        "targets": [
+            {
+                "name": name,
+                "requested": told(one.requested),
+                "applied": plain(one.applied),
+                "read_back": plain(one.read_back),
+            }
+            for name, one in audit.targets.items()
+        ],
+        "followed": [[name, plain(old), plain(new)] for name, (old, new) in changes],
+        "came": list(audit.came),
+        "went": list(audit.went),
+    }
+
+
+def nearest(error: Any) -> list[dict[str, Any]]:
+    """List the nearest possible values that an error names."""
+    found = [one for part in getattr(error, "problems", ()) if not isinstance(part, str)
+             for one in nearest(part)]  # fmt: skip
+    value = getattr(error, "nearest", None)
+    if value is not None and not callable(value):
+        found.append({"name": error.variable, "value": plain(np.asarray(value))})
+    return found
+
+
+def marks(space: Any, shape: tuple[int, ...], values: Any) -> list[dict[str, Any]] | None:
+    """Return the parts of a space as plain data, for marks on a scale; None where it has none."""
+    match space:
+        case Box():
+            low, high = space.bounds(shape, values)
+            return [{"low": plain(np.ravel(low)), "high": plain(np.ravel(high))}]
+        case Integers(low=low, high=high):
+            return [{"low": [low], "high": [high], "whole": True}]
+        case Categories(members=members, labels=labels):
+            return [{"members": list(members), "labels": list(labels)}]
+        case Either(first=first, second=second):
+            parts = (marks(part, shape, values) for part in (first, second))
+            return [one for part in parts for one in part or ()]
+    return None
+
+
+def group_of(world: World) -> dict[str, str]:
+    """Name the entity of every variable: what declared it, or the beginning of its name."""
+    owners: dict[str, str] = {}
+    for entity in world.composition.entities:
+        for one in (part for parts in entity.declared for part in parts):
+            owners[one.name] = entity.name
+    found = {}
+    for name in world.model:
+        variable = world.model.declared(name)
+        first = name.rpartition(".")[0]
+        outcome = "outcomes" if variable.role == "readout" else "world"
+        found[name] = (
+            owners.get(name) or first or ("actions" if variable.role == "action" else outcome)
+        )
+    return found
+
+
+def described(spec: Spec, world: World, live: Any) -> dict[str, Any]:
+    """Describe a world: variables, edges, actions, policies."""
+    model, groups = live.model, group_of(live)
+    names = list(model)
+    place = {name: index for index, name in enumerate(names)}
+    variables = []
+    for name in names:
+        variable = model.declared(name)
+        category = variable.bounds if isinstance(variable.bounds, Categories) else None
+        variables.append(
+            {
+                "name": name,
+                "group": groups[name],
+                "kind": variable.kind,
+                "role": variable.role,
+                "unit": variable.unit,
+                "shape": list(variable.shape),
+                "dtype": variable.dtype,
+                "doc": " ".join(variable.doc.split()),
+                "settable": bool(variable.settable),
+                "state": variable.role == "state",
+                "categories": category
+                and [list(category.members), list(category.labels) or list(category.members)],
+            }
+        )
+    trained = [name for name, card in zoo().items() if card.task == world.task.name]
+    low, high = plain(world.action_low), plain(world.action_high)
+    actions = [
+        {"name": f"{name}[{i}]" if part.stop - part.start > 1 else name, "low": low[k],
+         "high": high[k], "unit": model.declared(name).unit}
+        for name, part in live.compiled.actions.items()
+        for i, k in enumerate(range(part.start, part.stop))
+    ]  # fmt: skip
+    return {
+        "title": spec.title,
+        "backend": world.engine,
+        "dt": world.control_period,
+        "length": world.max_episode_length,
+        "variables": variables,
+        "edges": [[place[e.cause], place[e.effect], e.lag, e.when] for e in model.edges],
+        "actions": actions,
+        "policies": ["random", *world.task.policies, *trained],
+        "has_shapes": not isinstance(live.structure, StepModel),
+    }
+
+
+def lit_edges(model: Any, pairs: frozenset[tuple[str, str]]) -> list[int]:
+    """Number the edges by contact that join what touches.
+
+    The states of a body are those named after it, and those on which a parameter of it acts
+    in every step. A parameter of what has no states, such as a floor, counts wherever bodies touch.
+    """
+    edges, moves, acts = list(model.edges), dict[str, set[str]](), dict[str, set[str]]()
+    for name in model:
+        if model.declared(name).role == "state":
+            moves.setdefault(name.rpartition(".")[0], set()).add(name)
+    for edge in edges:
+        if edge.lag and edge.when is None:
+            acts.setdefault(edge.cause, set()).add(edge.effect)
+            if model.declared(edge.cause).role == "parameter":
+                moves.setdefault(edge.cause.rpartition(".")[0], set()).add(edge.effect)
+    moves.pop("", None)
+    islands: list[set[str]] = []
+    for pair in pairs:
+        moved = set[str]().union(*(moves.get(body, set()) for body in pair))
+        joined = [island for island in islands if island & moved]
+        islands = [island for island in islands if not island & moved]
+        islands.append(moved.union(*joined))
+    found = []
+    for number, edge in enumerate(edges):
+        island = next((one for one in islands if edge.effect in one), None)
+        if edge.when == "contact" and island is not None:
+            is_state = model.declared(edge.cause).role == "state"
+            mine = {edge.cause} if is_state else acts.get(edge.cause, set())
+            mine = mine or moves.get(edge.cause.rpartition(".")[0], set())
+            if not mine or mine & island:
+                found.append(number)
+    return found
