@@ -205,12 +205,15 @@ export class Graph {
       merged.get(id).numbers.push(number);
     });
     this.edgesOf = new Map();
+    const places = new Map(elements.filter(e => e.position).map(e => [e.data.id, e.position]));
     const many = merged.size > MANY;
     for (const edge of merged.values()) {
       const { id, source, target, lag, whens, numbers } = edge;
       const contact = whens.size === 1 && whens.has("contact");
       for (const number of numbers) this.edgesOf.set(number, id);
-      elements.push({ data: { id, source, target, numbers }, classes: `${lag ? "lag1" : "lag0"}${contact ? " contact" : ""}${many ? " many" : ""}` });
+      const a = places.get(source), b = places.get(target), far = Math.abs(a.y - b.y);
+      const bow = !many && Math.abs(a.x - b.x) < 2 && far > 1.5 * ROW; // around what stands between
+      elements.push({ data: { id, source, target, numbers, bow: 85 + 0.1 * far }, classes: `${bow ? "bow " : ""}${lag ? "lag1" : "lag0"}${contact ? " contact" : ""}${many ? " many" : ""}` });
     }
     this.cy.startBatch();
     this.cy.elements().remove();
@@ -240,6 +243,7 @@ export class Graph {
       { selector: "edge", style: {
         width: 1.4, "line-color": c.edge, "target-arrow-color": c.edge, "target-arrow-shape": "triangle", "arrow-scale": 0.8,
         "curve-style": "bezier", "control-point-step-size": 26, opacity: 0.75 } },
+      { selector: "edge.bow", style: { "curve-style": "unbundled-bezier", "control-point-distances": "data(bow)", "control-point-weights": 0.5 } },
       { selector: "edge:loop", style: { "loop-direction": "90deg", "loop-sweep": "40deg", "control-point-step-size": 22 } },
       { selector: "edge.lag1", style: { "line-style": "dashed" } },
       { selector: "edge.contact", style: { "line-style": "dotted" } },

@@ -269,7 +269,7 @@ function material(shape, twin) {
   const color = new THREE.Color().setRGB(r, g, b, THREE.SRGBColorSpace);
   if (twin && !shape.goal) color.lerp(TWIN, 0.55);
   const made = new THREE.MeshLambertMaterial({ color, transparent: a < 1, opacity: a, depthWrite: a >= 1 });
-  Object.assign(made, { polygonOffset: twin, polygonOffsetFactor: 1, polygonOffsetUnits: 4 }); // where both are, the factual one is seen
+  Object.assign(made, { polygonOffset: twin, polygonOffsetFactor: 2, polygonOffsetUnits: 16 }); // where both are, the factual one is seen
   if (shape.kind === "plane" && shape.tiles) {
     made.map = checker(shape, color);
     made.color.set("#ffffff");
