@@ -56,9 +56,11 @@ class Page:
         self.frames: list[bytes] = []
 
     def take(self) -> dict[str, Any]:
-        """Return the next message that is no frame."""
-        while isinstance(message := self.socket.recv(timeout=60), bytes):
+        """Return the next message that is no frame; of frames, nothing but that it came."""
+        message = self.socket.recv(timeout=60)
+        if isinstance(message, bytes):
             self.frames.append(message)
+            return {"type": "frame"}
         found: dict[str, Any] = json.loads(message)
         self.news[found["type"]] = found
         return found
@@ -151,6 +153,8 @@ def test_the_first_messages_describe_the_world(server: Server) -> None:
     """Variables, edges and shapes come first, then poses as 32-bit floats."""
     with session(server) as page:
         assert "ok" in page.ask("step")
+        while not (page.frames and page.news.keys() >= {"hello", "scene"}):
+            page.take()
         hello, scene = page.news["hello"], page.news["scene"]
         names = [variable["name"] for variable in hello["variables"]]
         assert "cube.mass" in names
