@@ -151,9 +151,13 @@ def noise_of(
     return {"noise": key.natural(source, variable.name, shape, values)}
 
 
-def _check_categories(variable: Variable, value: Value) -> None:
-    """Refuse what a function gives that is none of the categories of its variable."""
+def _check_kind(variable: Variable, value: Value) -> None:
+    """Refuse what a function gives that is no whole number, or none of the categories."""
     bounds = variable.bounds
+    if variable.dtype == "integer" and value.dtype.kind == "f" and (np.rint(value) != value).any():
+        wrong = value[np.rint(value) != value].ravel().tolist()[:3]
+        said = f"the function of {variable.name!r} gives {wrong}, and the variable is an integer"
+        raise ModelError([f"{said}: round them in the function"])
     if isinstance(bounds, Categories) and not bounds.contains(value):
         wrong = np.setdiff1d(value, bounds.members).tolist()[:3]
         allowed = bounds.describe(variable.shape, {})
@@ -266,7 +270,7 @@ class Evaluator:
                 raise WrongShape(requested.name, given, requested.shape, value.shape) from None
         if requested.dtype != "real":
             value = np.rint(value).astype(np.int64)
-        _check_categories(requested, value)
+        _check_kind(requested, value)
         return self._given(requested, name, value)
 
     def _natural(
@@ -312,7 +316,7 @@ class Evaluator:
         if value.dtype.kind not in "biuf" or shape != variable.shape:
             wanted = f"numbers of shape {variable.shape}" if variable.shape else "a number"
             raise ModelError([f"the function of {variable.name!r} gives {value!r}, not {wanted}"])
-        _check_categories(variable, value)
+        _check_kind(variable, value)
         return value
 
     def _arguments(

@@ -205,6 +205,9 @@ def sample(
         first: Number of the first episode.
         each: What is done in each of them besides.
         progress: Called after each episode.
+
+    Raises:
+        UnknownOption: An intervention would begin when the episode has ended.
     """
     count = whole_number("n", n, least=1)
     given = (outcomes,) if isinstance(outcomes, str | Outcome) else outcomes
@@ -225,6 +228,11 @@ def sample(
 
     numbers, plan = range(first, first + count), setting.plan(world, do)
     unit = setting.unit(world, plan, first, names)
+    for name, part in Plan(do).timed():
+        begin = getattr(part, "step", getattr(part, "start", 0))
+        if begin > 0 and begin >= unit.steps:
+            allowed = (f"a control step before {unit.steps}, where episodes end",)
+            raise UnknownOption(f"time of an intervention on {name}", part, allowed)
     units = [replace(unit, number=number) for number in numbers]
     if each:
         several = [((0, plan.do(more)),) for more in each]

@@ -349,3 +349,44 @@ def test_worlds_have_lags_of_one_step() -> None:
             outcomes=[far],
             control_dt=0.1,
         )
+
+
+def test_another_noise_leaves_the_start_alone() -> None:
+    """Only a replaced function acts at the instant before the first step."""
+    model = SCM(
+        [
+            Derived(
+                name="s", parents=(Parent("s", 1),), mechanism=Linear(weights=(0.5,)),
+                noise=Normal(), start=4.0,
+            )
+        ]
+    )  # fmt: skip
+    noisy = model.do({"s": Mechanism(noise=Normal(3.0, 1e-9))})
+    assert noisy.draw(2, seed=0, steps=2)["s"] == pytest.approx(np.array([[5.0, 5.5]] * 2))
+    assert noisy.begin()["s"] == 4.0
+
+
+def test_an_intervention_after_the_end_is_refused() -> None:
+    """It would never be due, and its effect 0 without a word."""
+    model = SCM(
+        [
+            Derived(
+                name="s", parents=(Parent("s", 1),), mechanism=Linear(weights=(0.5,)),
+                noise=Normal(),
+            )
+        ]
+    )  # fmt: skip
+    for late in (At(5, 1.0), Clamp(1.0, 7)):
+        with pytest.raises(UnknownOption, match="before 5, where episodes end"):
+            model.effect("s", do={"s": late}, n=4, steps=5)
+    assert model.effect("s", do={"s": At(4, 1.0)}, versus={"s": At(4, 0.0)}, n=4, steps=5).mean == 1
+
+
+def test_whole_numbers_stay_whole() -> None:
+    """A function of an integer that gives something else is refused, with what it gave."""
+    x = Exogenous(name="x", distribution=Normal())
+    bent = SCM([x, Derived(name="y", parents=("x",), mechanism=np.cos, dtype="integer")])
+    with pytest.raises(ModelError, match=r"'y' gives \[.*\], and the variable is an integer"):
+        bent.draw(3, seed=0)
+    whole = SCM([x, Derived(name="y", parents=("x",), mechanism=np.rint, dtype="integer")])
+    assert set(whole.draw(50, seed=0)["y"].ravel().tolist()) <= {-3, -2, -1, 0, 1, 2, 3}
