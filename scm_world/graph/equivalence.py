@@ -210,17 +210,15 @@ def extension(graph: Bools) -> Bools | None:
 
 def extensions(graph: Bools) -> Iterator[Bools]:
     """Yield all acyclic graphs with these directions and v-structures; there can be p! of them."""
-    if extension(graph) is not None:
-        yield from _members(meek(graph))
-
-
-def _members(graph: Bools) -> Iterator[Bools]:
-    open_edges = np.argwhere(np.triu(graph & graph.T))
-    if not len(open_edges):
-        yield graph
-        return
-    i, j = open_edges[0]
-    for cause, effect in ((i, j), (j, i)):
-        directed = graph.copy()
-        directed[effect, cause] = False
-        yield from _members(meek(directed))
+    left = [graph] if extension(graph) is not None else []
+    while left:  # depth first; as deep as there are edges without direction
+        one = meek(left.pop())
+        undirected = np.argwhere(np.triu(one & one.T))
+        if not len(undirected):
+            yield one
+            continue
+        i, j = undirected[0]
+        for cause, effect in ((j, i), (i, j)):
+            directed = one.copy()
+            directed[effect, cause] = False
+            left.append(directed)

@@ -163,3 +163,10 @@ def test_faults_are_told() -> None:
     torn[0, 1] = torn[1, 2] = torn[2, 1] = torn[3, 2] = True
     with pytest.raises(ModelError, match="both directions"):
         meek(torn)
+
+
+def test_a_clique_of_fifty_has_extensions() -> None:
+    """More undirected edges than Python has room for calls are no matter."""
+    clique = ~np.eye(50, dtype=bool)
+    first = next(extensions(clique))
+    assert (first ^ first.T)[clique].all()
