@@ -36,13 +36,16 @@ from scm_world.variables import (
     Action,
     Box,
     Categories,
+    Discrete,
     Draw,
     Exogenous,
+    Integers,
     Measured,
     Mechanism,
     Noise,
     Scale,
     Shift,
+    Table,
 )
 
 DRAWS = 1000
@@ -155,6 +158,8 @@ def counterfactuals(
     tolerance: float = 1e-6,
 ) -> Counterfactuals:
     """Say what observed units would have been under an intervention; see ``SCM.counterfactual``."""
+    if isinstance(tolerance, bool) or not tolerance >= 0.0:
+        raise UnknownOption("tolerance", tolerance, ("a number that is not negative",))
     seen = observations(model, observed)
     if n is None:
         sure = _Abduction(model, seen, 1, seed, tolerance, certain=True)
@@ -189,7 +194,8 @@ class _Abduction:
         certain: bool = False,
     ) -> None:
         self.model, self.n, self._tolerance = model, n, tolerance
-        self._noise, self._certain = Noise(whole_number("seed", seed, least=0)), certain
+        own = np.random.SeedSequence((whole_number("seed", seed, least=0), 1))  # not that of data
+        self._noise, self._certain = Noise(int(own.generate_state(1)[0])), certain
         self._together = Layout(model).is_vectorised
         self.one, self._rows, self.steps = seen.one, seen.rows, seen.steps
         self._size = self._rows * n
@@ -202,6 +208,7 @@ class _Abduction:
         }
         self.log_weights = np.zeros(self._size)
         self._ancestors = np.tile(np.arange(n), self._rows)
+        self._tried = 1  # of how many combinations of hidden discrete noise each has its draws
         self.sampled = False
         self._unsure: set[str] = set()
         self.given: list[dict[str, Value]] = []
@@ -250,6 +257,7 @@ class _Abduction:
             points = (start[row] + np.arange(self.n)) / self.n
             chosen[row] = np.searchsorted(np.cumsum(weights[row]), points).clip(max=self.n - 1)
         self.log_weights.reshape(self._rows, self.n)[few] = 0.0
+        self._tried = 0
         where = (chosen + self.n * np.arange(self._rows)[:, None]).ravel()
         self._ancestors = self._ancestors[where]
         for instant in (*self.given, *self.values):
@@ -301,6 +309,7 @@ class _Abduction:
             if not there.all():
                 self.sampled = True
                 self._unsure.add(name)
+                drawn = self._each(variable, source, drawn, there, values, before, step)
             given[name] = drawn
             if there.any():
                 found, log, possible, several = self._noise_of(
@@ -323,6 +332,51 @@ class _Abduction:
             self._weigh(name, there, self.near(value, wanted, whole=True), unsure=unsure)
             value = self._where(there, wanted, value)
         values[name] = value if variable.dtype == "real" else np.rint(value).astype(np.int64)
+
+    def _each(
+        self,
+        variable: Any,
+        source: Any,
+        drawn: Value,
+        there: Value,
+        values: Values,
+        before: Values,
+        step: int,
+    ) -> Value:
+        """Give every value of a hidden discrete noise, or category of a table, its share of draws.
+
+        Their probabilities are the weights. Where there are too many, or draws were drawn again,
+        noise stays as it was drawn.
+        """
+        own = getattr(variable, "noise_shape", None)
+        shape = variable.shape if own is None else own
+        table = getattr(variable, "mechanism", None)
+        if isinstance(table, Table):
+            members = np.asarray(table.values or range(table.shape[-1]))
+        elif isinstance(source, Discrete | Categories | Integers) and not source.parents():
+            members = np.asarray(law_of(source, shape, values).support)
+        else:
+            return drawn
+        count = len(members) ** int(np.prod(shape))
+        if self._tried * count > self.n or self._tried == 0:
+            return drawn
+        number = np.arange(self.n) // self._tried % count
+        self._tried *= count
+        digits = np.stack([number // len(members) ** k for k in range(int(np.prod(shape)))], -1)
+        given = members[digits % len(members)].reshape(self.n, *shape)
+        given = np.tile(given, (self._rows, *(1,) * len(shape)))
+        if isinstance(table, Table):
+            parents = self._parents(variable, values, before)
+            given, log, possible, _ = Inverse(self, variable, source, parents, step, 1).solve(
+                given, weigh=True
+            )
+            log = np.where(possible, log, -np.inf)
+        else:
+            log = summed(law_of(source, shape, values).log_density(given))
+        rest = np.tile(np.arange(self.n) >= self.n // self._tried * self._tried, self._rows)
+        self.log_weights += np.where(there, 0.0, log)
+        self.log_weights[rest] = -np.inf  # so that every combination has as many draws
+        return given
 
     def _natural(self, name: str, wanted: Value, there: Value) -> Value:
         """Give what a variable would have been without a shift or scale, 0 where it is unknown."""
@@ -359,6 +413,12 @@ class _Abduction:
                 log = np.zeros(len(value))  # of no account, but that it is possible
             log = summed(log)
             return value, np.where(np.isfinite(log), log, 0.0) * bounded, np.isfinite(log), False
+        parents = self._parents(variable, values, before)
+        each = 1 if weigh else self.n
+        return Inverse(self, variable, source, parents, step, each).solve(value, weigh=weigh)
+
+    def _parents(self, variable: Any, values: Values, before: Values) -> list[Value]:
+        """List the values of the causes, shape (units, *shape) each."""
         parents: list[Value] = []
         for parent in variable.all_parents:
             found = values if not parent.lag else before
@@ -367,8 +427,7 @@ class _Abduction:
                 first = first_value(self.model.declared(parent.name))
                 found = {where: np.broadcast_to(first, (self._size, *first.shape))}
             parents.append(found[where])
-        each = 1 if weigh else self.n
-        return Inverse(self, variable, source, parents, step, each).solve(value, weigh=weigh)
+        return parents
 
     def _weigh(self, name: str, there: Value, possible: Value, *, unsure: bool) -> None:
         """Leave out draws that contradict an observation; refuse what no draw gives."""
@@ -378,7 +437,10 @@ class _Abduction:
         if lost.any() and wrong.any():
             row = int(np.flatnonzero(lost)[0])
             said = f"in row {row}, " if self._rows > 1 else ""
-            said += "no value of its noise gives what was observed"
+            if name in self.given[-1]:
+                said += "no value of its noise gives what was observed"
+            else:
+                said += "its causes give another value, and it has no noise"
             if unsure:
                 said = (
                     f"{said}, in none of {self.n} draws of the causes that were not observed; "
@@ -527,6 +589,12 @@ class _Abduction:
     ) -> dict[str, Value]:
         """Solve all units together, or one after another where functions take one only."""
         given: Values = self.given[step] if step < len(self.given) else {}
+        if starts:
+            values = {
+                name: np.zeros((self._size, *model.declared(name).shape))
+                for name in model
+                if _is_free(model[name]) and not isinstance(model[name], Exogenous)
+            }
         solve: Any = model.begin if starts else model.solve
         more: Any = {} if starts else {"previous": before}
         if self._together:

@@ -13,6 +13,7 @@ from scm_world.discovery.data import Design, as_frame, collect
 from scm_world.errors import ImpossibleObservation, ModelError, UnknownOption, UnknownVariable
 from scm_world.queries import At, Clamp, Counterfactuals
 from scm_world.variables import (
+    Action,
     Bernoulli,
     Box,
     Categorical,
@@ -593,3 +594,70 @@ def test_effects_by_a_covariate_do_not_split_its_values() -> None:
     quarters = model.effect_by("y", by="x", bins=4, **asked | {"do": {"z": 1}, "versus": {"z": 0}})
     assert [effect.n for _, effect in quarters] == [100] * 4
     assert [ends[1] for ends, _ in quarters] == sorted(ends[1] for ends, _ in quarters)
+
+
+def test_hidden_categories_are_enumerated() -> None:
+    """Two roots and a table that nobody saw, one of them rare: the posterior to nine digits."""
+    bit: dict[str, Any] = {"dtype": "integer", "bounds": Integers(0, 1)}
+    kind: dict[str, Any] = {"dtype": "categorical", "bounds": Categories(labels=("a", "b", "c"))}
+    table = np.array([[[0.99, 0.01], [0.5, 0.5], [0.2, 0.8]], [[0.1, 0.9], [0.3, 0.7], [0.0, 1.0]]])
+    prior = {"d": (0.999, 0.001), "c": (0.5, 0.49, 0.01)}
+
+    def told(d: Any, c: Any, e: Any, noise: Any = 0.0) -> Any:
+        return 3 * np.asarray(d) + np.asarray(c) - 2 * np.asarray(e) + noise
+
+    model = SCM(
+        [
+            Exogenous(name="d", distribution=Bernoulli(0.001), **bit),
+            Exogenous(name="c", distribution=Categorical(prior["c"]), **kind),
+            Derived(name="e", parents=("d", "c"), mechanism=Table(table), **bit),
+            Derived(name="y", parents=("d", "c", "e"), mechanism=told, noise=Normal(0.0, 0.5)),
+        ]
+    )
+    each = list(np.ndindex(2, 3, 2))
+    mass = np.array([prior["d"][d] * prior["c"][c] * table[d, c, e] for d, c, e in each])
+    mass *= np.exp(-0.5 * ((3.3 - np.array([told(*k) for k in each])) / 0.5) ** 2)
+    mass /= mass.sum()
+    found = model.counterfactual({"y": 3.3}, do={"e": 0})
+    for place, name in enumerate(("d", "c", "e")):
+        wanted = mass @ [k[place] for k in each]
+        assert believed(found, name)[0] == pytest.approx(wanted, rel=1e-9)
+    assert found["y"] == pytest.approx(mass @ [3.3 + 2 * e for *_, e in each], rel=1e-9)
+    lines = Linear(weights=(1.0,))
+    rare = [Exogenous(name="d", distribution=Bernoulli(1e-6), **bit)]
+    seen = SCM([*rare, Derived(name="t", parents=("d",), mechanism=lines, **bit)])
+    assert believed(seen.counterfactual({"t": [1, 0]}, do={"d": 0}), "d") == pytest.approx([1.0, 0.0])
+
+
+def test_what_was_not_observed_is_not_that_of_the_seed() -> None:
+    """Data of a seed and draws of the same seed have nothing in common."""
+    model = line()
+    seen = model.draw(2000, seed=0)
+    found = model.counterfactual({"y": seen["y"]}, do={"x": 0.0}, n=1, seed=0)
+    assert abs(np.corrcoef(found.factual["x"][:, 0], seen["x"])[0, 1]) < 0.1
+
+
+def test_actions_that_were_observed() -> None:
+    """They are given, and may be done otherwise; what is done holds before the first step, too."""
+    model = SCM(
+        [
+            Action(name="u", bounds=Box(-1.0, 1.0)),
+            Derived(name="s", parents=(Parent("s", 1), Parent("u", 1)),
+                    mechanism=Linear(weights=(0.5, 1.0)), noise=Normal()),
+        ]
+    )  # fmt: skip
+    found = model.counterfactual({"u": [0.0, 0.5, 0.2], "s": [0.1, 0.2, 0.8]}, do={"u": 1.0})
+    assert found.exact
+    assert found["s"] == pytest.approx([0.1 + 1.0, 0.2 + 0.5 + 1.0, 0.8 + 0.75 + 0.5])
+
+
+def test_a_tolerance_is_a_distance() -> None:
+    """Rounded values of a function without noise need one; less than 0 is refused."""
+    x = Exogenous(name="x", distribution=Normal())
+    model = SCM([x, Derived(name="y", parents=("x",), mechanism=np.exp)])
+    seen = {name: values.round(3) for name, values in model.draw(50, seed=0).items()}
+    with pytest.raises(ImpossibleObservation, match=r"'y'.*it has no noise"):
+        model.counterfactual(seen, do={"x": 0.0})
+    assert model.counterfactual(seen, do={"x": 0.0}, tolerance=0.01)["y"] == pytest.approx(1.0)
+    with pytest.raises(UnknownOption, match="tolerance"):
+        model.counterfactual(seen, do={"x": 0.0}, tolerance=-1.0)
