@@ -28,7 +28,7 @@ from scm_world.errors import ImpossibleObservation, ModelError, UnknownOption
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier, first_value, noise_of
 from scm_world.queries.equations import Layout
-from scm_world.queries.inversion import Inverse, law_of, summed
+from scm_world.queries.inversion import Found, Inverse, law_of, summed
 from scm_world.queries.observations import Observations, observations
 from scm_world.queries.plans import Plan, numbered
 from scm_world.queries.timed import At
@@ -202,10 +202,14 @@ class _Abduction:
         if self._size * self.steps > MOST:
             said = f"{self._rows} units with {n} draws each of {self.steps} instants are too many"
             raise ModelError([f"{said}: give fewer rows at once, or a smaller n"])
-        self._observed = {
-            name: np.repeat(np.moveaxis(values, 1, 0), n, axis=1)
-            for name, values in seen.values.items()
-        }
+        self._observed: dict[str, Value] = {}
+        for name, values in seen.values.items():
+            gap = np.isnan(values)
+            if getattr(model.declared(name), "per", "step") == "step":
+                gap[:] = False  # what is drawn once for an episode is known once it is seen
+            first = np.take_along_axis(values, np.isfinite(values).argmax(axis=1)[:, None], 1)
+            whole = np.where(gap, first, values)
+            self._observed[name] = np.repeat(np.moveaxis(whole, 1, 0), n, axis=1)
         self.log_weights = np.zeros(self._size)
         self._ancestors = np.tile(np.arange(n), self._rows)
         self._tried = 1  # of how many combinations of hidden discrete noise each has its draws
@@ -213,45 +217,41 @@ class _Abduction:
         self._unsure: set[str] = set()
         self.given: list[dict[str, Value]] = []
         self.values: list[dict[str, Value]] = []
-        before: Values = self._solved(model, {}, {}, 0, starts=True) if model.is_temporal else {}
+        self._before: Values = {}
+        if model.is_temporal:
+            self._before = self._solved(model, {}, {}, 0, starts=True)
         for step in range(self.steps):
             if certain and self.sampled:
                 return
-            before = model.remembered(self._abduct(step, before), before)
-            before = self._drawn_again(step, before)
+            self._step = step
+            self._abduct()
+            self._before = model.remembered(self.values[-1], self._before)
+            self._draw_again()
 
     # --- abduction ------------------------------------------------------------------------------
 
-    def _abduct(self, step: int, before: Values) -> dict[str, Value]:
-        """Find the noise of one instant; return the values of all variables."""
-        model, values = self.model, dict[str, Value]()
-        self.given.append(
-            {
-                name: value  # drawn once for the episode
-                for name, value in (self.given[0] if step else {}).items()
-                if getattr(model.declared(name), "per", "step") == "episode"
-            }
-        )
-        self.values.append(values)
-        for name in model.structure.order:
-            variable: Any = model[name]
-            there = np.zeros(self._size, dtype=bool)
-            wanted: Any = None
-            if name in self._observed:
-                wanted = self._observed[name][step]
-                there = ~np.isnan(wanted).reshape(self._size, -1).any(axis=1)
-            self._find(variable, wanted, there, values, before, step)
+    def _abduct(self) -> None:
+        """Find noise and values of one instant."""
+        kept = self.given[0] if self._step else {}
+        per = {name: getattr(self.model.declared(name), "per", "step") for name in kept}
+        self.given.append({name: v for name, v in kept.items() if per[name] == "episode"})
+        self.values.append({})
+        for name in self.model.structure.order:
             if self._certain and self.sampled:
-                break
-        return values
+                return
+            there, wanted = np.zeros(self._size, dtype=bool), None
+            if name in self._observed:
+                wanted = self._observed[name][self._step]
+                there = ~np.isnan(wanted).reshape(self._size, -1).any(axis=1)
+            self._find(self.model[name], wanted, there)
 
-    def _drawn_again(self, step: int, before: Values) -> Values:
+    def _draw_again(self) -> None:
         """Draw the draws of a unit again by their weights, where fewer than half count."""
         weights = self._weights()
         few = 1.0 / (weights**2).sum(axis=1) < 0.5 * self.n
-        if step == self.steps - 1 or not few.any():
-            return before
-        start = self._noise.uniforms("|again", n=1, step=step, count=self._rows)
+        if self._step == self.steps - 1 or not few.any():
+            return
+        start = self._noise.uniforms("|again", n=1, step=self._step, count=self._rows)
         chosen = np.tile(np.arange(self.n), (self._rows, 1))
         for row in np.flatnonzero(few).tolist():
             points = (start[row] + np.arange(self.n)) / self.n
@@ -260,9 +260,9 @@ class _Abduction:
         self._tried = 0
         where = (chosen + self.n * np.arange(self._rows)[:, None]).ravel()
         self._ancestors = self._ancestors[where]
+        self._before = {name: np.asarray(value)[where] for name, value in self._before.items()}
         for instant in (*self.given, *self.values):
             instant.update({name: np.asarray(value)[where] for name, value in instant.items()})
-        return {name: np.asarray(value)[where] for name, value in before.items()}
 
     def _weights(self) -> Floats:
         """Give the weights of the draws, shape (rows, n); each row sums to 1."""
@@ -270,26 +270,16 @@ class _Abduction:
         weights = np.exp(logs - logs.max(axis=1, keepdims=True))
         return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
-    def _find(
-        self,
-        variable: Any,
-        wanted: Value,
-        there: Value,
-        values: dict[str, Value],
-        before: Values,
-        step: int,
-    ) -> None:
+    def _find(self, variable: Any, wanted: Any, there: Value) -> None:
         """Find value and noise of a variable, from what was observed of it and of its causes.
 
         Args:
             variable: As it is in the model.
             wanted: Its observed values, shape (units, *shape), or None.
             there: Where it was observed, shape (units,).
-            values: Those of this instant so far; the value is added.
-            before: Those of the instant before.
-            step: Number of the instant.
         """
-        name, key, given = variable.name, self._key(step), self.given[-1]
+        values = self.values[-1]
+        name, key, given = variable.name, self._key(self._step), self.given[-1]
         source = getattr(variable, "distribution", None) or getattr(variable, "noise", None)
         unsure = name in self._unsure or not self._unsure.isdisjoint(
             parent.name for parent in variable.all_parents
@@ -309,40 +299,25 @@ class _Abduction:
             if not there.all():
                 self.sampled = True
                 self._unsure.add(name)
-                drawn = self._each(variable, source, drawn, there, values, before, step)
+                drawn = self._each(variable, source, drawn, there)
             given[name] = drawn
             if there.any():
-                found, log, possible, several = self._noise_of(
-                    variable,
-                    source,
-                    self._natural(name, wanted, there),
-                    values,
-                    before,
-                    step,
-                    weigh=unsure or not there.all(),
-                )
+                natural = self._natural(name, wanted, there)
+                weigh = unsure or not there.all()
+                found, log, possible, several = self._noise_of(variable, source, natural, weigh)
                 if several:
                     self.sampled = True
                     self._unsure.add(name)
                 given[name] = self._where(there, found, drawn)
                 self._weigh(name, there, possible, unsure=unsure)
                 self.log_weights += np.where(there, log, 0.0)
-        value = self._computed(self.model, name, values, before, step)
+        value = self._computed(self.model, name, values, self._before, self._step)
         if wanted is not None:
             self._weigh(name, there, self.near(value, wanted, whole=True), unsure=unsure)
             value = self._where(there, wanted, value)
         values[name] = value if variable.dtype == "real" else np.rint(value).astype(np.int64)
 
-    def _each(
-        self,
-        variable: Any,
-        source: Any,
-        drawn: Value,
-        there: Value,
-        values: Values,
-        before: Values,
-        step: int,
-    ) -> Value:
+    def _each(self, variable: Any, source: Any, drawn: Value, there: Value) -> Value:
         """Give every value of a hidden discrete noise, or category of a table, its share of draws.
 
         Their probabilities are the weights. Where there are too many, or draws were drawn again,
@@ -354,7 +329,7 @@ class _Abduction:
         if isinstance(table, Table):
             members = np.asarray(table.values or range(table.shape[-1]))
         elif isinstance(source, Discrete | Categories | Integers) and not source.parents():
-            members = np.asarray(law_of(source, shape, values).support)
+            members = np.asarray(law_of(source, shape, {}).support)
         else:
             return drawn
         count = len(members) ** int(np.prod(shape))
@@ -366,13 +341,10 @@ class _Abduction:
         given = members[digits % len(members)].reshape(self.n, *shape)
         given = np.tile(given, (self._rows, *(1,) * len(shape)))
         if isinstance(table, Table):
-            parents = self._parents(variable, values, before)
-            given, log, possible, _ = Inverse(self, variable, source, parents, step, 1).solve(
-                given, weigh=True
-            )
+            given, log, possible, _ = self._inverse(variable, source, given, weigh=True)
             log = np.where(possible, log, -np.inf)
         else:
-            log = summed(law_of(source, shape, values).log_density(given))
+            log = summed(law_of(source, shape, {}).log_density(given))
         rest = np.tile(np.arange(self.n) >= self.n // self._tried * self._tried, self._rows)
         self.log_weights += np.where(there, 0.0, log)
         self.log_weights[rest] = -np.inf  # so that every combination has as many draws
@@ -391,43 +363,32 @@ class _Abduction:
                 return np.asarray(value / np.asarray(by))
         return value
 
-    def _noise_of(
-        self,
-        variable: Any,
-        source: Any,
-        value: Value,
-        values: Values,
-        before: Values,
-        step: int,
-        *,
-        weigh: bool,
-    ) -> tuple[Value, Floats, Value, bool]:
+    def _noise_of(self, variable: Any, source: Any, value: Value, weigh: bool) -> Found:
         """Give noise, log density, whether there is any, and whether there are several."""
         if isinstance(variable, Exogenous):
             bounded = bool(source.parents())
             try:
-                log = law_of(source, variable.shape, values).log_density(value)
+                log = law_of(source, variable.shape, self.values[-1]).log_density(value)
             except ModelError:
                 if bounded:
                     raise
                 log = np.zeros(len(value))  # of no account, but that it is possible
             log = summed(log)
             return value, np.where(np.isfinite(log), log, 0.0) * bounded, np.isfinite(log), False
-        parents = self._parents(variable, values, before)
-        each = 1 if weigh else self.n
-        return Inverse(self, variable, source, parents, step, each).solve(value, weigh=weigh)
+        return self._inverse(variable, source, value, weigh=weigh)
 
-    def _parents(self, variable: Any, values: Values, before: Values) -> list[Value]:
-        """List the values of the causes, shape (units, *shape) each."""
+    def _inverse(self, variable: Any, source: Any, value: Value, *, weigh: bool) -> Found:
+        """Invert a mechanism, given the values of its causes."""
         parents: list[Value] = []
         for parent in variable.all_parents:
-            found = values if not parent.lag else before
-            where = parent.name if not parent.lag else earlier(parent.name, parent.lag)
+            found = self._before if parent.lag else self.values[-1]
+            where = earlier(parent.name, parent.lag) if parent.lag else parent.name
             if where not in found:
                 first = first_value(self.model.declared(parent.name))
                 found = {where: np.broadcast_to(first, (self._size, *first.shape))}
             parents.append(found[where])
-        return parents
+        each = 1 if weigh else self.n
+        return Inverse(self, variable, source, parents, self._step, each).solve(value, weigh=weigh)
 
     def _weigh(self, name: str, there: Value, possible: Value, *, unsure: bool) -> None:
         """Leave out draws that contradict an observation; refuse what no draw gives."""

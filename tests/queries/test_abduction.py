@@ -626,7 +626,9 @@ def test_hidden_categories_are_enumerated() -> None:
     lines = Linear(weights=(1.0,))
     rare = [Exogenous(name="d", distribution=Bernoulli(1e-6), **bit)]
     seen = SCM([*rare, Derived(name="t", parents=("d",), mechanism=lines, **bit)])
-    assert believed(seen.counterfactual({"t": [1, 0]}, do={"d": 0}), "d") == pytest.approx([1.0, 0.0])
+    assert believed(seen.counterfactual({"t": [1, 0]}, do={"d": 0}), "d") == pytest.approx(
+        [1.0, 0.0]
+    )
 
 
 def test_what_was_not_observed_is_not_that_of_the_seed() -> None:
@@ -661,3 +663,18 @@ def test_a_tolerance_is_a_distance() -> None:
     assert model.counterfactual(seen, do={"x": 0.0}, tolerance=0.01)["y"] == pytest.approx(1.0)
     with pytest.raises(UnknownOption, match="tolerance"):
         model.counterfactual(seen, do={"x": 0.0}, tolerance=-1.0)
+
+
+def test_a_constant_of_an_episode_may_be_seen_once() -> None:
+    """At any control step; what contradicts it elsewhere is refused."""
+    model = lagged()
+    seen = model.draw(2, seed=1, steps=5)
+    whole = model.counterfactual(seen, do={"a": 0.0})
+    once = {**seen, "k": np.array(seen["k"])}
+    once["k"][:, [0, 1, 2, 4]] = np.nan
+    found = model.counterfactual(once, do={"a": 0.0})
+    assert found.exact
+    np.testing.assert_allclose(found["b"], whole["b"], atol=1e-12)
+    once["k"][0, 1] = 9.0
+    with pytest.raises(ImpossibleObservation, match="'k'"):
+        model.counterfactual(once, do={"a": 0.0})
