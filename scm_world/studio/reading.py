@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from scm_world.backends.step import StepModel
+from scm_world.errors import UnknownOption
+from scm_world.graph import scm as graph
 from scm_world.policies.zoo import zoo
-from scm_world.queries import Plan, World
+from scm_world.queries import SCM, Plan, World
 from scm_world.tasks import make_task
+from scm_world.tasks.factories import load_factory
 from scm_world.variables.spaces import Box, Categories, Either, Integers
+from scm_world.world import Simulation
 
 
 class Spec(BaseModel):
@@ -30,9 +35,22 @@ class Spec(BaseModel):
     options: dict[str, Any] = {}
     settings: dict[str, Any] = {}
 
-    def make(self) -> World:
-        """Make the world."""
-        return World(make_task(self.system, **self.options), **self.settings)
+    def make(self) -> Any:
+        """Return the world, or the causal model without a backend that ``module:function`` gives.
+
+        Raises:
+            UnknownOption: There is no such system, or equations are given settings of a world.
+        """
+        made: Any = None
+        if ":" in self.system:
+            with suppress(Exception):  # ``make_task`` raises it again, and says what is wrong
+                made = load_factory(self.system)(**self.options)
+        if not isinstance(made, graph.SCM):
+            return World(make_task(self.system, **self.options), **self.settings)
+        if self.settings:
+            allowed = ("left out: a causal model without a backend has none",)
+            raise UnknownOption("setting of a world", next(iter(self.settings)), allowed)
+        return SCM(made)
 
     @property
     def title(self) -> str:
@@ -40,8 +58,12 @@ class Spec(BaseModel):
         home, _, function = self.system.rpartition(":")
         return f"{Path(home).stem}:{function}" if home else Path(function).name
 
-    def code(self) -> list[str]:
+    def code(self, made_of: Any) -> list[str]:
         """Return the lines of Python that make it."""
+        if isinstance(made_of, SCM):
+            given = ", ".join(f"{name}={value!r}" for name, value in self.options.items())
+            first = ["import scm_world as sw", "from scm_world.tasks.factories import load_factory"]
+            return [*first, "", f"world = sw.SCM(load_factory({self.system!r})({given}))"]
         settings = "".join(f", {name}={value!r}" for name, value in self.settings.items())
         made = repr(self.system)
         if self.options:
@@ -112,25 +134,25 @@ def marks(space: Any, shape: tuple[int, ...], values: Any) -> list[dict[str, Any
     return None
 
 
-def group_of(world: World) -> dict[str, str]:
+def group_of(system: Any) -> dict[str, str]:
     """Name the entity of every variable: what declared it, or the beginning of its name."""
     owners: dict[str, str] = {}
-    for entity in world.composition.entities:
+    for entity in system.composition.entities if isinstance(system, Simulation) else ():
         for one in (part for parts in entity.declared for part in parts):
             owners[one.name] = entity.name
-    found = {}
-    for name in world.model:
-        variable = world.model.declared(name)
-        first = name.rpartition(".")[0]
-        outcome = "outcomes" if variable.role == "readout" else "world"
-        found[name] = (
-            owners.get(name) or first or ("actions" if variable.role == "action" else outcome)
-        )
-    return found
+    roles = {"readout": "outcomes", "action": "actions"}
+    found = {
+        name: owners.get(name)
+        or name.rpartition(".")[0]
+        or roles.get(system.model.declared(name).role, "world")
+        for name in system.model
+    }
+    joined = {found[name] for e in system.model.edges for name in (e.cause, e.effect)}
+    return {name: group if group in joined else "no edges" for name, group in found.items()}
 
 
-def described(spec: Spec, world: World, live: Any) -> dict[str, Any]:
-    """Describe a world: variables, edges, actions, policies."""
+def described(spec: Spec, live: Any) -> dict[str, Any]:
+    """Describe a world, or equations: variables, edges, actions, policies."""
     model, groups = live.model, group_of(live)
     names = list(model)
     place = {name: index for index, name in enumerate(names)}
@@ -154,8 +176,12 @@ def described(spec: Spec, world: World, live: Any) -> dict[str, Any]:
                 and [list(category.members), list(category.labels) or list(category.members)],
             }
         )
-    trained = [name for name, card in zoo().items() if card.task == world.task.name]
-    low, high = plain(world.action_low), plain(world.action_high)
+    policies, shapes = ["random"], False
+    if isinstance(live, Simulation):
+        policies += live.task.policies
+        policies += [name for name, card in zoo().items() if card.task == live.task.name]
+        shapes = not isinstance(live.structure, StepModel)
+    low, high = plain(live.action_low), plain(live.action_high)
     actions = [
         {"name": f"{name}[{i}]" if part.stop - part.start > 1 else name, "low": low[k],
          "high": high[k], "unit": model.declared(name).unit}
@@ -164,15 +190,19 @@ def described(spec: Spec, world: World, live: Any) -> dict[str, Any]:
     ]  # fmt: skip
     return {
         "title": spec.title,
-        "backend": world.engine,
-        "dt": world.control_period,
-        "length": world.max_episode_length,
+        "backend": live.engine if isinstance(live, Simulation) else "equations",
+        "dt": period(live),
         "variables": variables,
         "edges": [[place[e.cause], place[e.effect], e.lag, e.when] for e in model.edges],
         "actions": actions,
-        "policies": ["random", *world.task.policies, *trained],
-        "has_shapes": not isinstance(live.structure, StepModel),
+        "policies": policies,
+        "has_shapes": shapes,
     }
+
+
+def period(live: Any) -> float:
+    """Return the length of a control step [s]; equations count steps of one second."""
+    return float(live.control_period) if isinstance(live, Simulation) else 1.0
 
 
 def lit_edges(model: Any, pairs: frozenset[tuple[str, str]]) -> list[int]:

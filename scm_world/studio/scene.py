@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from base64 import b64encode
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Any, final
 
 import numpy as np
@@ -32,17 +33,17 @@ class Shapes:
         self._meshes: dict[int, tuple[int, Mesh]] = {}
         self._count = 0
 
-    def place(self, scene: Scene) -> tuple[int, Floats, dict[str, Any] | None]:
+    def place(self, scene: Scene | None) -> tuple[int, Floats, dict[str, Any] | None]:
         """Return the shapes of a scene by number, and where they are.
 
         Returns:
             The number; for each shape position and orientation (x, y, z, w), shape (n, 7); and the
             message that describes the shapes, if there was none of this number before.
         """
-        try:
-            shapes = drawing_of(scene.structure).shapes(scene)
-        except ModelError:  # a step function has no shapes
-            shapes = []
+        shapes: list[Shape] = []
+        if scene is not None:  # equations have none
+            with suppress(ModelError):  # a step function has no shapes
+                shapes = drawing_of(scene.structure).shapes(scene)
         key = tuple(
             (s.kind, s.halves.tobytes(), s.color.tobytes(), id(s.mesh), s.body, s.tiles)
             for s in shapes
@@ -60,12 +61,9 @@ class Shapes:
             poses[:, 3:] = Rotation.from_matrix(np.array([s.rotation for s in shapes])).as_quat()
         return self._known[key][0], poses, message
 
-    def _described(self, number: int, shapes: list[Shape], scene: Scene) -> dict[str, Any]:
-        try:
-            names = body_names(scene.structure) if shapes else ()
-        except ModelError:
-            names = ()
-        goals = len(shapes) - len(scene.goals)
+    def _described(self, number: int, shapes: list[Shape], scene: Any) -> dict[str, Any]:
+        names = body_names(scene.structure) if shapes else ()
+        goals = len(shapes) - (len(scene.goals) if shapes else 0)
         sent, listed = [], []
         for index, s in enumerate(shapes):
             mesh = None

@@ -22,7 +22,7 @@ from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, in_one_line
 from scm_world.evaluation import in_world
 from scm_world.policies.zoo import PREFIX as ZOO
-from scm_world.queries import At, Clamp, LiveEpisode, save_episode
+from scm_world.queries import At, Clamp, LiveEpisode, World, save_episode
 from scm_world.studio.jobs import Job
 from scm_world.studio.reading import (
     Spec,
@@ -31,11 +31,13 @@ from scm_world.studio.reading import (
     lit_edges,
     marks,
     nearest,
+    period,
     plain,
     told,
 )
 from scm_world.studio.scene import Shapes, frame, touching
 from scm_world.variables import Draw, Natural, Scale, Shift
+from scm_world.world import Simulation
 
 FRAMES, NEWS = 60.0, 15.0  # most frames and reports of a second
 LATE = 0.25  # [s] by how much a world that plays may be late before it gives up catching up
@@ -114,7 +116,10 @@ class _LaneState:
         at = self.live.steps - self.first
         del self.rows[at:], self.contacts[at:]
         self.rows.append(self.live.world.values())
-        self.contacts.append(touching(self.live.world.backend.contacts()))
+        world = self.live.world
+        self.contacts.append(
+            touching(world.backend.contacts() if isinstance(world, Simulation) else ())
+        )
 
 
 @final
@@ -138,7 +143,7 @@ class Session:
         self._last_frame = self._last_news = 0.0
         self._compiled: Any = None
         self._lit: dict[Any, list[int]] = {}
-        self._lines: list[str] = [*spec.code()]
+        self._lines: list[str] = spec.code(self.world)
         self._loop: tuple[str, int] = ("", 0)
         self._new_lines = True
         self._policy: str | list[float] | None = None
@@ -173,10 +178,10 @@ class Session:
                 self._play_on()
         if self._job:
             self._job.end()
-        self.world.close()
+        self._lanes[FACTUAL].live.close()
 
     def _play_on(self) -> None:
-        period = self.world.control_period / self._speed
+        period = self._period / self._speed
         now = time.monotonic()
         self._next = self._next + period if now - self._next < LATE else now + period
         if self._looking is not None:
@@ -189,8 +194,8 @@ class Session:
             except ScmWorldError as error:
                 self._playing = False
                 self._pipe.send({"type": "trouble", "error": str(error)})
-            length = self.world.max_episode_length
-            if self._steps % length == 0:
+            world = self.world
+            if isinstance(world, World) and self._steps % world.max_episode_length == 0:
                 self._playing = False
         self._show(force=not self._playing)
 
@@ -222,6 +227,10 @@ class Session:
         return self._lanes[FACTUAL].live.steps
 
     @property
+    def _period(self) -> float:
+        return period(self._lanes[FACTUAL].live.world)
+
+    @property
     def _model(self) -> Any:
         return self._lanes[FACTUAL].live.world.model
 
@@ -230,7 +239,7 @@ class Session:
         live = self._lanes[FACTUAL].live
         self._compiled = live.world.compiled
         self._lit.clear()
-        self._pipe.send({"type": "hello", **described(self._spec, self.world, live.world)})
+        self._pipe.send({"type": "hello", **described(self._spec, live.world)})
 
     def _show(self, *, force: bool = False) -> None:
         """Send frames and news, not more often than a page can show."""
@@ -246,6 +255,8 @@ class Session:
     def _scene(self, number: int, step: int) -> Any:
         """Describe an instant for a picture: that of the episode, never one drawn again."""
         live = self._lanes[number].live
+        if not isinstance(live.world, Simulation):
+            return None
         return live.world.scene() if step >= live.steps else live.episode().scene(step)[0]
 
     def _send_frame(self, number: int) -> None:
@@ -274,7 +285,7 @@ class Session:
             "type": "news",
             "step": step,
             "steps": self._steps,
-            "time": step * self.world.control_period,
+            "time": step * self._period,
             "playing": self._playing,
             "past": self._looking is not None,
             "held": [
@@ -586,7 +597,7 @@ class Session:
         live = self._lanes[FACTUAL].live
         held = [[[n, told(a)] for n, a in lane.live.held.items()] for lane in self._lanes]
         return {
-            "hello": described(self._spec, self.world, live.world),
+            "hello": described(self._spec, live.world),
             "scenes": scenes,
             "frames": frames,
             "rows": rows,

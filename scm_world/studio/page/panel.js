@@ -108,7 +108,7 @@ export class Panel {
     const source = make("select", { id: "source" }, ...["A", "B", "A|B"].map(s => make("option", { value: s, textContent: s })));
     const from = make("label", { hidden: true }, "space ", source);
     const inputs = [];
-    const colour = v.name.endsWith("color") && size === 3;
+    const colour = v.name.endsWith("color") && (size === 3 || size === 4);
     if (v.categories) {
       const choice = make("select", { id: "category" });
       v.categories[0].forEach((member, i) => choice.append(make("option", { value: member, textContent: v.categories[1][i] })));
@@ -118,7 +118,7 @@ export class Panel {
     } else if (size <= MOST) {
       if (colour) {
         const hex = x => Math.round(255 * Math.min(1, Math.max(0, x))).toString(16).padStart(2, "0");
-        const pick = make("input", { type: "color", id: "colour", value: `#${this.about.value.map(hex).join("")}` });
+        const pick = make("input", { type: "color", id: "colour", value: `#${this.about.value.slice(0, 3).map(hex).join("")}` });
         pick.oninput = () => {
           [1, 3, 5].forEach((k, i) => { inputs[i].value = (parseInt(pick.value.slice(k, k + 2), 16) / 255).toFixed(4); inputs[i].slide(); });
           this.#drag();

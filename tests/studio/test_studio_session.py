@@ -1,0 +1,214 @@
+"""A session of the studio, without a server: other systems, changes of structure, Python."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scm_world.queries import World
+from scm_world.studio.reading import Spec, lit_edges, marks
+from scm_world.studio.scene import Shapes
+from scm_world.studio.worker import Session
+from scm_world.variables import Box, Categories, Integers
+from scm_world.variables.spaces import Affine, Either
+
+EQUATIONS = """
+import scm_world as sw
+
+def cart(drag=0.1):
+    return sw.SCM([
+        sw.Exogenous(name="mass", unit="kg", default=1.0, bounds=sw.Box(0.1, 5.0)),
+        sw.Exogenous(name="push", distribution=sw.Box(-1.0, 1.0), per="step"),
+        sw.Derived(name="speed", parents=(sw.Parent("speed", 1), sw.Parent("push"), "mass"),
+                   mechanism=sw.Linear(weights=(1.0 - drag, 1.0, -0.1))),
+    ])
+
+def pond(growth=0.1):
+    return sw.StepTask(
+        lambda parameters, state, action, noise: {"size": state["size"] * (1 + parameters["rate"])},
+        parameters=[sw.Exogenous(name="rate", default=growth, bounds=sw.Box(0.0, 2.0))],
+        states=[sw.Measured(name="size", default=1.0, parents=("rate", sw.Parent("size", 1)))],
+        control_dt=0.1,
+    )
+"""
+
+
+class Pipe:
+    """Keeps what is sent."""
+
+    def __init__(self) -> None:
+        self.sent: list[Any] = []
+
+    def send(self, message: Any) -> None:
+        """Keep a message."""
+        self.sent.append(message)
+
+    def last(self, kind: str) -> dict[str, Any]:
+        """Return the last message of a type."""
+        found = (m for m in reversed(self.sent) if isinstance(m, dict) and m["type"] == kind)
+        return next(found)
+
+
+class Asked:
+    """A session, and a short way to ask it."""
+
+    def __init__(self, system: str, **options: Any) -> None:
+        settings = options.pop("settings", {})
+        self.pipe = Pipe()
+        pipe: Any = self.pipe
+        spec = Spec(system=system, options=options, settings=settings)
+        self.session = Session(spec, pipe)
+        self.session._hello()
+
+    def __call__(self, op: str, **given: Any) -> Any:
+        """Ask for something that is granted."""
+        reply = self.session._answer({"op": op, "id": 1, **given})
+        self.session._show(force=True)
+        assert "ok" in reply, reply["error"]
+        return reply["ok"]
+
+    @property
+    def news(self) -> dict[str, Any]:
+        """The last news."""
+        return self.pipe.last("news")
+
+    @property
+    def head(self) -> tuple[int, ...]:
+        """The head of the last frame: type, lane, scene, step, shapes, contacts."""
+        frame = next(m for m in reversed(self.pipe.sent) if isinstance(m, bytes))
+        return struct.unpack("<6I", frame[:24])
+
+    def code(self) -> dict[str, Any]:
+        """Run the Python that the page shows, and return its names."""
+        names: dict[str, Any] = {}
+        exec("\n".join(self.session._code()), names)  # noqa: S102 # what the page shows
+        return names
+
+
+@pytest.fixture
+def module(tmp_path: Path) -> str:
+    """A file with factories."""
+    (tmp_path / "systems.py").write_text(EQUATIONS)
+    return str(tmp_path / "systems.py")
+
+
+@pytest.mark.parametrize(("factory", "variable"), [("cart", "speed"), ("pond", "size")])
+def test_systems_without_shapes(module: str, factory: str, variable: str) -> None:
+    """Equations and step functions have a page too: graph, do, twins, series and Python."""
+    ask = Asked(f"{module}:{factory}")
+    hello = ask.pipe.last("hello")
+    assert hello["has_shapes"] is False
+    assert variable in [one["name"] for one in hello["variables"]]
+    ask("plot", names=[variable])
+    ask("step", n=4)
+    cause = {"cart": "mass", "pond": "rate"}[factory]
+    ask("do", name=cause, act={"value": 0.5})
+    ask("step", n=2)
+    ask("split", at=1, do={cause: {"value": 1.5}})
+    ask("step")
+    assert ask.head[4:] == (0, 0)
+    assert ask.news["twin"] == 1
+    recording = ask("save", what="recording")["recording"]
+    series = [lane["values"][variable] for lane in recording["rows"]]
+    assert len(series[0]) == len(series[1]) == 8
+    assert series[0][:1] == series[1][:1]
+    assert series[0][3] != series[1][3]
+    names, lanes = ask.code(), ask.session._lanes
+    assert names["live"].episode() == lanes[0].live.episode()
+    assert names["twin"].episode() == lanes[1].live.episode()
+
+
+def test_bodies_come_and_go() -> None:
+    """Where an intervention changes which bodies there are, graph and shapes are sent anew."""
+    ask = Asked("towers", settings={"backend": "fake"})
+    ask("step", n=2)
+    before, edges = ask.head, len(ask.pipe.last("hello")["edges"])
+    ask("do", name="number_of_blocks_in_tower", act={"value": [1, 1, 2]})
+    assert ask.head[2] != before[2]
+    assert ask.head[4] < before[4]
+    assert len(ask.pipe.last("hello")["edges"]) < edges
+    ask("step", n=2)
+    ask("look", step=1)
+    assert ask.head[2:5] == (before[2], 1, before[4])
+    names = ask.code()
+    assert names["live"].episode() == ask.session._lanes[0].live.episode()
+
+
+def test_what_is_dragged_is_one_line() -> None:
+    """At one instant the last value counts, in the episode and in Python; draws all count."""
+    ask = Asked("pushing", settings={"backend": "fake"})
+    ask("step", n=3)
+    for value in (0.03, 0.04, 0.05):
+        ask("do", name="tool_block.mass", act={"value": value})
+    for _ in range(2):
+        ask("do", name="floor_friction", act={"kind": "draw", "source": "B"})
+    ask("do", name="stage_friction", act={"kind": "shift", "value": 0.1, "window": True, "stop": 5})
+    ask("step", n=4)
+    ask("policy", action=[0.0] * 9)
+    ask("reset", seed=2, number=1)
+    ask("policy", name="random")
+    ask("step", n=2)
+    lines = ask.session._code()
+    assert [line for line in lines if "tool_block.mass" in line] == [
+        "live.do({'tool_block.mass': 0.05})"
+    ]
+    assert sum("sw.Draw('B')" in line for line in lines) == 2
+    assert "live.do({'stage_friction': sw.Clamp(sw.Shift(0.1), 3, 5)})" in lines
+    assert ask.code()["live"].episode() == ask.session._lanes[0].live.episode()
+
+
+def test_a_trained_policy_acts() -> None:
+    """One of the zoo is offered for its task, and its line of Python repeats it."""
+    ask = Asked("pushing")
+    assert "zoo:pushing" in ask.pipe.last("hello")["policies"]
+    assert "zoo:reaching" not in ask.pipe.last("hello")["policies"]
+    ask("policy", name="zoo:pushing")
+    ask("step", n=5)
+    assert ask.code()["live"].episode() == ask.session._lanes[0].live.episode()
+
+
+def test_marks_say_where_spaces_lie() -> None:
+    """Spaces that follow other variables are given as they are now."""
+    now = {"size": np.array(0.06)}
+    box = Box((0.0, Affine(parent="size", scale=0.5)), (0.1, 0.3))
+    assert marks(box, (2,), now) == [{"low": [0.0, 0.03], "high": [0.1, 0.3]}]
+    assert marks(Box(0.0, np.inf), (), {}) == [{"low": [0.0], "high": [None]}]
+    both = marks(Either(first=Box(0.0, 1.0), second=Box(2.0, 3.0)), (), {})
+    assert [one["low"] for one in both or ()] == [[0.0], [2.0]]
+    assert marks(Integers(1, 4), (), {}) == [{"low": [1], "high": [4], "whole": True}]
+    members = marks(Categories(labels=("dry", "wet")), (), {})
+    assert members == [{"members": [0, 1], "labels": ["dry", "wet"]}]
+    assert marks(None, (), {}) is None
+
+
+def test_edges_by_contact_join_what_touches() -> None:
+    """A block on the floor is moved by the floor's friction, and not by a robot far away."""
+    with World("pushing", backend="fake") as world:
+        edges = list(world.model.edges)
+        pairs = frozenset({("floor", "tool_block")})
+        found = {(edges[i].cause, edges[i].effect) for i in lit_edges(world.model, pairs)}
+        assert ("floor_friction", "tool_block.linear_velocity") in found
+        assert ("tool_block.friction", "tool_block.linear_velocity") in found
+        assert not any("joint" in name for edge in found for name in edge)
+        both = pairs | {("robot_finger_60_link_3", "tool_block")}
+        found = {(edges[i].cause, edges[i].effect) for i in lit_edges(world.model, both)}
+        assert ("joint_positions", "tool_block.linear_velocity") in found
+        assert lit_edges(world.model, frozenset()) == []
+
+
+def test_every_task_has_shapes() -> None:
+    """The robot is drawn from its links, and each goal once."""
+    for task, goals in (("reaching", 3), ("pushing", 1), ("stacking2", 2)):
+        with World(task, backend="fake") as world:
+            world.reset(seed=0)
+            number, poses, message = Shapes().place(world.scene())
+            assert number == 0
+            assert message is not None
+            kinds = [shape["kind"] for shape in message["shapes"]]
+            assert len(kinds) == len(poses)
+            assert sum(bool(shape["goal"]) for shape in message["shapes"]) == goals
+            assert np.allclose(np.linalg.norm(poses[:, 3:], axis=1), 1.0)
