@@ -62,7 +62,7 @@ export class Graph {
       this.groups.get(v.group).push(v.name);
     }
     if (!same) {
-      this.open = new Set([...this.groups].filter(([, names]) => names.length === 1).map(([name]) => name));
+      this.open = new Set([...this.groups].filter(([, names]) => names.length === 1 || this.groups.size === 1).map(([name]) => name));
       this.lit.clear();
       this.chosen = null;
       this.touched = false;
@@ -93,6 +93,7 @@ export class Graph {
   fit() {
     this.touched = false;
     this.cy.fit(undefined, 14);
+    if (this.cy.zoom() > 1.5) { this.cy.zoom(1.5); this.cy.center(); }
     const node = this.chosen && this.cy.getElementById(this.chosen);
     if (node?.nonempty() && this.cy.zoom() < READABLE) {
       this.cy.fit(node.closedNeighborhood(), 30);

@@ -132,7 +132,7 @@ const on = {
       if (!plotted.length) {
         const usual = PLOTS.filter(name => graph.byName.has(name));
         plotted = usual.length ? usual : message.variables.filter(v => v.role === "readout").concat(
-          message.variables.filter(v => v.role === "state" && v.name !== "control_index")).slice(0, 2).map(v => v.name);
+          message.variables.filter(v => (v.role === "state" || v.kind === "derived") && v.name !== "control_index")).slice(0, 2).map(v => v.name);
       }
       choosePlots();
       if (chosen && graph.byName.has(chosen)) choose(chosen); else panel.clear();
@@ -331,7 +331,7 @@ $("save-twin").onclick = () => save("episode", 1);
 $("save-plan").onclick = () => save("plan");
 $("save-page").onclick = () => save("recording");
 const stem = () => (hello?.title ?? "world").replace(/[^\w.-]+/g, "_");
-$("png").onclick = () => $("canvas").toBlob(blob => download(`${stem()}.png`, blob));
+$("png").onclick = () => view.picture(blob => download(`${stem()}.png`, blob));
 let recorder = null;
 $("webm").onclick = () => {
   if (recorder) { recorder.stop(); return; }

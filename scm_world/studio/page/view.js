@@ -13,7 +13,7 @@ export class View {
   constructor(canvas, pick) {
     this.canvas = canvas;
     this.software = isSoftware();
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !this.software, preserveDrawingBuffer: true });
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !this.software });
     this.renderer.setScissorTest(true);
     this.camera = new THREE.PerspectiveCamera(40, 1, 0.01, 500);
     this.camera.up.set(0, 0, 1);
@@ -144,6 +144,13 @@ export class View {
   }
 
   redraw() { this.#dirty = true; }
+
+  /** Give a picture of the view to a function, as a PNG. */
+  picture(take) {
+    this.#dirty = true;
+    this.#frame(performance.now());
+    this.canvas.toBlob(take); // at once: what was drawn is gone after this task
+  }
 
   turn(dx, dy, zoom = 1) {
     const offset = this.camera.position.clone().sub(this.controls.target).multiplyScalar(zoom);
