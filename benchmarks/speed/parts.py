@@ -74,7 +74,7 @@ def watched(env: ScmWorldEnv, watch: Stopwatch) -> None:
         "mechanisms": (world, "evaluate"),
         "observation": (env._observer, "observe"),
         "info": (env, "_info"),
-        "command": (env, "_commanded"),
+        "command": (env, "command"),
         REST: (env, "step"),
     }
     for part, (owner, name) in places.items():
