@@ -13,7 +13,7 @@ from scm_world.studio.reading import Spec
 
 
 @final
-class Job:
+class StudioJob:
     """Discovery or verification in a process of its own.
 
     Attributes:

@@ -23,7 +23,7 @@ from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, in_one
 from scm_world.evaluation import in_world
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries import At, Clamp, LiveEpisode, World, save_episode
-from scm_world.studio.jobs import Job
+from scm_world.studio.jobs import StudioJob
 from scm_world.studio.reading import (
     Spec,
     audited,
@@ -147,7 +147,7 @@ class Session:
         self._loop: tuple[str, int] = ("", 0)
         self._new_lines = True
         self._policy: str | list[float] | None = None
-        self._job: Job | None = None
+        self._job: StudioJob | None = None
         self._seed, self._number = 0, 0
         self._lanes: list[_LaneState] = []
         self._begin(0, 0)
@@ -540,7 +540,7 @@ class Session:
     def _start(self, kind: str, probes: int, seed: int) -> None:
         if self._job is not None:
             raise UnknownOption("job", kind, (f"cancel {self._job.kind} first",))
-        self._job = Job(self._spec, kind, probes, seed)
+        self._job = StudioJob(self._spec, kind, probes, seed)
         made = "sw.discover(world, " if kind == "discover" else "sw.verify(world, "
         self._note(f"report = {made}probes={probes}, seed={seed})")
 

@@ -112,6 +112,7 @@ def until(page: Any, code: str, patience: float = PATIENCE) -> Any:
 
 def opened(context: Any, address: str) -> Any:
     """Open the page, and wait until it shows the world; errors of the page are errors."""
+    context.set_default_timeout(1000 * PATIENCE)
     page = context.new_page()
     page.problems = []
     page.on("pageerror", lambda error: page.problems.append(str(error)))

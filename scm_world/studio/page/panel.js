@@ -220,11 +220,9 @@ export class Panel {
   /** Intervene; a refusal names the nearest possible value, with a button that takes it. */
   async apply(act, twin = false) {
     const name = this.name, past = this.actions.past();
-    const begun = performance.now();
     const reply = twin || past
       ? await this.actions.ask("split", { do: { [name]: act } })
       : await this.actions.ask("do", { name, act });
-    document.body.dataset.doMs = (performance.now() - begun).toFixed(1);
     if (!reply.error) {
       this.said("");
       this.actions.done(name, act, reply.ok, twin || past);
