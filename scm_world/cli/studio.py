@@ -8,7 +8,7 @@ import typer
 
 from scm_world._arguments import load
 from scm_world.cli import console, options
-from scm_world.cli.arguments import WORDS, parse_assignments
+from scm_world.cli.arguments import WORDS, load_system, parse_assignments, refuse_settings
 
 
 def studio(
@@ -41,9 +41,13 @@ def studio(
     """
     for package in ("starlette", "uvicorn", "websockets"):
         load(package, package, "studio")
+    from scm_world.queries import SCM
     from scm_world.studio.reading import Spec
     from scm_world.studio.server import serve
 
+    system = load_system(task, option)  # what is wrong with it is said at once
+    if isinstance(system, SCM):
+        refuse_settings(backend=backend, preset=preset, resolution=resolution)
     given = parse_assignments(option, "'--option'")
     for key, value in given.items():
         given[key] = WORDS.get(value.lower(), value) if isinstance(value, str) else value

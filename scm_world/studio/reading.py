@@ -44,13 +44,19 @@ class Spec(BaseModel):
         made: Any = None
         if ":" in self.system:
             with suppress(Exception):  # ``make_task`` raises it again, and says what is wrong
-                made = load_factory(self.system)(**self.options)
+                made = load_factory(self.system)(**self._given)
         if not isinstance(made, graph.SCM):
-            return World(make_task(self.system, **self.options), **self.settings)
+            return World(make_task(self.system, **self._given), **self.settings)
         if self.settings:
             allowed = ("left out: a causal model without a backend has none",)
             raise UnknownOption("setting of a world", next(iter(self.settings)), allowed)
         return SCM(made)
+
+    @property
+    def _given(self) -> dict[str, Any]:
+        """The arguments, with tuples again where JSON has lists."""
+        listed = self.options.items()
+        return {key: tuple(value) if isinstance(value, list) else value for key, value in listed}
 
     @property
     def title(self) -> str:
@@ -61,13 +67,13 @@ class Spec(BaseModel):
     def code(self, made_of: Any) -> list[str]:
         """Return the lines of Python that make it."""
         if isinstance(made_of, SCM):
-            given = ", ".join(f"{name}={value!r}" for name, value in self.options.items())
+            given = ", ".join(f"{name}={value!r}" for name, value in self._given.items())
             first = ["import scm_world as sw", "from scm_world.tasks.factories import load_factory"]
             return [*first, "", f"world = sw.SCM(load_factory({self.system!r})({given}))"]
         settings = "".join(f", {name}={value!r}" for name, value in self.settings.items())
         made = repr(self.system)
         if self.options:
-            given = ", ".join(f"{name}={value!r}" for name, value in self.options.items())
+            given = ", ".join(f"{name}={value!r}" for name, value in self._given.items())
             made = f"sw.make_task({made}, {given})"
         first = ["import scm_world as sw", "from scm_world.evaluation import in_world", ""]
         return [*first, f"world = sw.World({made}{settings})"]

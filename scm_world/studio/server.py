@@ -102,6 +102,7 @@ class _Session:
         self._something = asyncio.Event()
         self._sending = threading.Lock()
         self.ended = False
+        self._fatal: dict[str, Any] | None = None
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
@@ -116,6 +117,9 @@ class _Session:
     def _take(self, given: Any) -> None:
         if isinstance(given, bytes):
             self._frames[given[4]] = given
+        elif given.get("type") == "fatal":
+            self._fatal = given
+            self._texts.append(json.dumps(given))
         else:
             if given.get("type") == "reply" and "recording" in (given.get("ok") or {}):
                 given["ok"]["text"] = standalone(given["ok"].pop("recording"))
@@ -125,9 +129,9 @@ class _Session:
 
     def _end(self) -> None:
         self.ended = True
-        if self.socket is not None:
-            self._texts.append(json.dumps({"type": "fatal", "error": "the world has ended"}))
-        self._something.set()
+        if self._fatal is None:
+            said = "the world has ended; load the page again to begin anew"
+            self._take({"type": "fatal", "error": said})
 
     def ask(self, message: Any) -> None:
         """Pass a message to the worker."""

@@ -223,6 +223,32 @@ def test_a_taken_port_is_one_line(server: Server, tmp_path: Path) -> None:
         Server("pushing", folder=tmp_path, port=server.port)
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("nothing",), "no task is named 'nothing'"),
+        (("pushing", "--option", "weight=2"), "weight"),
+        (("missing.xml",), "missing.xml"),
+    ],
+)
+def test_a_system_that_does_not_exist_is_one_line(
+    words: tuple[str, ...], said: str, tmp_path: Path
+) -> None:
+    """The command ends before anything is served."""
+    with pytest.raises(AssertionError, match=said):
+        Server(*words, folder=tmp_path)
+
+
+def test_a_world_that_cannot_be_built_says_why(tmp_path: Path) -> None:
+    """The page gets the reason, and not only that the world has ended."""
+    server = Server("pushing", "--backend", "step", folder=tmp_path)
+    with session(server) as page:
+        while "fatal" not in page.news:
+            page.take()
+        assert "world has ended" not in page.news["fatal"]["error"]
+    server.stop()
+
+
 def test_licences_lie_beside_what_is_vendored() -> None:
     """And all of it is small."""
     folder = PAGE / "vendor"

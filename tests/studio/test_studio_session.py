@@ -124,7 +124,8 @@ def test_systems_without_shapes(module: str, factory: str, variable: str) -> Non
 
 def test_bodies_come_and_go() -> None:
     """Where an intervention changes which bodies there are, graph and shapes are sent anew."""
-    ask = Asked("towers", settings={"backend": "fake"})
+    given = {"number_of_blocks_in_tower": [1, 1, 3]}  # as JSON has it
+    ask = Asked("towers", settings={"backend": "fake"}, **given)
     ask("step", n=2)
     before, edges = ask.head, len(ask.pipe.last("hello")["edges"])
     ask("do", name="number_of_blocks_in_tower", act={"value": [1, 1, 2]})
