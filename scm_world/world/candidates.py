@@ -157,8 +157,7 @@ class Candidates:
             raise Unknown
         values = {parent: self._value(parent) for parent in parents}
         own = variable.name if act.stream is None else f"{act.stream}/{variable.name}"
-        attempts = self.attempts.tolist()
-        keys = [word_of(f"{own}#{attempt}" if attempt else own) for attempt in attempts]
+        keys = [word_of(f"{own}#{attempt}") for attempt in self.attempts.tolist()]
         uniforms = np.empty((len(keys), source.n_uniforms(variable.shape)))
         where = np.array([self._key.noise.key, self._key.episode, self._key.step], dtype=np.uint64)
         philox(where, np.array(keys, dtype=np.uint64), uniforms)
@@ -186,7 +185,6 @@ def promising(
     structure: Callable[[NoiseKey], Plan | None] | None,
     key: NoiseKey,
     count: int,
-    first: int = 1,
 ) -> Iterator[tuple[int, Plan | None]]:
     """Yield the further draws that may be feasible, and the last one.
 
@@ -200,7 +198,6 @@ def promising(
             draws have the same.
         key: Where to draw.
         count: How many draws there are, the first one number 0.
-        first: Number of the first further one.
 
     Yields:
         The number of a draw, and its structure.
@@ -212,7 +209,7 @@ def promising(
     # What is asked of a body is refused where the body is not there.
     asked = {name.partition(".")[0] for name in (*plan.asked, *plan.removals)}
     alike_everywhere = asked.isdisjoint(plan.compiled.entity_names)
-    for begin in range(first, count - 1, CHUNK):
+    for begin in range(1, count - 1, CHUNK):
         attempts = list(range(begin, min(begin + CHUNK, count - 1)))
         if structure is None:
             places: dict[int, Plan | None] = dict.fromkeys(attempts, here)
@@ -227,7 +224,7 @@ def promising(
                 thinned[where] = frozenset(_thinned(made[where], before, key, alike))
             if where not in thinned or attempt in thinned[where]:
                 yield attempt, where
-    if count > first:
+    if count > 1:
         yield count - 1, None
 
 

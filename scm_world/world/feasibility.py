@@ -196,11 +196,7 @@ def feasible_plan(
     made: dict[Plan | None, InterventionPlan] = {}
     attempts: Iterator[tuple[int, Plan | None]] = iter(((0, None),))
     tried = ""
-    start = None
-    if earlier is not None:  # most first draws are infeasible, too, and need no plan
-        start, key = earlier.plan, replace(key, kept=earlier.kept)
-        known: dict[Plan | None, InterventionPlan] = {start.compiled.plan: start}
-        attempts, tried = promising(base, known, None, key, ATTEMPTS, first=0), NONE
+    start = None if earlier is None else earlier.plan
     while (drawn := next(attempts, None)) is not None:
         attempt, where = drawn
         key, last = replace(key, attempt=attempt), made.get(where, start)
@@ -213,11 +209,14 @@ def feasible_plan(
             problems = _buried(plan, request)
         if not problems:
             return plan, change
-        if draws and not attempt and earlier is None:
-            kept = _immaterial(structures, plan.compiled, request)
-            if _stay(structures, plan.compiled, request, kept, problems):
-                tried = "whatever is drawn, "
-                break
+        if draws and not attempt:
+            if earlier is not None:
+                kept = earlier.kept
+            else:
+                kept = _immaterial(structures, plan.compiled, request)
+                if _stay(structures, plan.compiled, request, kept, problems):
+                    tried = "whatever is drawn, "
+                    break
             key, tried = replace(key, kept=kept), NONE
             structure = None
             if draws_bodies(structures, request):
