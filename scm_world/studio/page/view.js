@@ -4,6 +4,7 @@ import * as THREE from "three";
 import { bytesOf } from "studio/ask";
 
 const SLOW = 24; // [ms] a software renderer that takes longer for a picture draws fewer pixels while things move
+const HALF = 20 * Math.PI / 180; // half of the field of view
 const FAR = 40; // [m] half the edge of a plane that does not end
 const TWIN = new THREE.Color("#E69F00");
 const MOST_ARROWS = 64;
@@ -131,8 +132,7 @@ export class View {
     if (box.isEmpty()) box.set(new THREE.Vector3(-1, -1, 0), new THREE.Vector3(1, 1, 1));
     const middle = box.getCenter(new THREE.Vector3());
     const size = box.getSize(point).length() / 2 || 1;
-    const narrow = Math.min(1, this.canvas.clientWidth / Math.max(1, this.canvas.clientHeight));
-    const away = new THREE.Vector3(0.5, -1, 0.55).normalize().multiplyScalar(2.6 * size / Math.max(0.55, narrow));
+    const away = new THREE.Vector3(0.5, -1, 0.55).normalize().multiplyScalar(2.6 * size);
     this.size = size;
     this.camera.near = size / 100;
     this.camera.far = Math.max(200, 50 * size);
@@ -181,6 +181,8 @@ export class View {
     for (const lane of used) this.#pose(lane, now);
     const halves = this.twin && this.beside;
     this.camera.aspect = (halves ? width / 2 : width) / height;
+    // In a narrow picture about as much is seen from side to side as in a square one.
+    this.camera.fov = 2 * Math.atan(Math.tan(HALF) * Math.max(1, 0.9 / this.camera.aspect)) * 180 / Math.PI;
     this.camera.updateProjectionMatrix();
     renderer.setClearColor(this.sky);
     used.forEach((lane, i) => {
@@ -274,7 +276,7 @@ const turned = new THREE.Quaternion(), aim = new THREE.Quaternion();
 function material(shape, twin) {
   const [r, g, b, a] = shape.color;
   const color = new THREE.Color().setRGB(r, g, b, THREE.SRGBColorSpace);
-  if (twin && !shape.goal) color.lerp(TWIN, 0.55);
+  if (twin && shape.moves && !shape.goal) color.lerp(TWIN, 0.55);
   const made = new THREE.MeshLambertMaterial({ color, transparent: a < 1, opacity: a, depthWrite: a >= 1 });
   Object.assign(made, { polygonOffset: twin, polygonOffsetFactor: 2, polygonOffsetUnits: 16 }); // where both are, the factual one is seen
   if (shape.kind === "plane" && shape.tiles) {
