@@ -57,8 +57,8 @@ def evaluate(
             within episodes, from control step 100 on.
         n: Episodes of each protocol.
         seeds: Seeds of the noise, with commas.
-        backend: Physics backend: mujoco, bullet, step or fake; or two with a comma, compared. That
-            of the task by default.
+        backend: Physics backend: mujoco, bullet, step, fake or trifinger_platform; or two with a
+            comma, compared. That of the task by default.
         env: Option of the environment, such as frame_skip=3; repeat it for more.
         metric: Score that is shown and drawn; all are written. By default
             last_fractional_success, or return where a task has none.

@@ -87,7 +87,8 @@ Option = Annotated[
 Backend = Annotated[
     str | None,
     typer.Option(
-        help="Physics backend: mujoco, bullet, step or fake.", show_default="that of the task"
+        help="Physics backend: mujoco, bullet, step or fake; see 'scm-world list'.",
+        show_default="that of the task",
     ),
 ]
 Preset = Annotated[

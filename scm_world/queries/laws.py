@@ -44,6 +44,7 @@ share of its speed that a box keeps when it bounces."""
 BOUNCES, DROP = (0.3, 0.6), 1.0  # restitution, and [m/s] of what falls on the ground
 FRICTIONS = ((0.6, 0.3), (0.3, 0.6), (0.6, 0.6))  # of the ground and of what slides on it
 SETTLED, GLIDE, GLIDING = 0.4, 0.5, 0.2  # [s] to come to rest, [m/s] at first, [s] at most
+LEAST = 12  # physics steps that sliding lasts, about: fewer say nothing of friction
 STILL = 0.02  # [m/s] and [rad/s] that what is at rest has at most
 SPOTS = (5.0, 20.0, 80.0)  # [m] from the origin: where nothing else is
 ALOFT = 100.0  # [m] above the ground: where everything else is
@@ -544,6 +545,7 @@ class _Laws:
             if joint.kind != "free" or not alone or (ground, own[0]) not in bodies.touching:
                 continue
             shape, geom = own[0], bodies.geoms[own[0]]
+            self.low = min(geom.size, default=0.0)
             if geom.kind not in ("box", "sphere") or geom.special or joint.damping:
                 continue
             found = [self.laid(joint, geom, axis) for axis in range(len(geom.size))]
@@ -634,9 +636,9 @@ class _Laws:
         return None
 
     def beneath(self, name: str) -> bool:
-        """Tell whether a body touches nothing but what is fixed and lies under it."""
+        """Tell whether a body touches nothing but the ground under it."""
         own = [c for c in self.backend.contacts() if name in c.bodies and c.force > 0.0]
-        return all(abs(c.normal[2]) > 0.99 for c in own)
+        return all(abs(c.normal[2]) > 0.99 and abs(c.position[2]) < self.low for c in own)
 
     def thrown(self, joint: Any, rest: Floats, velocity: tuple[float, float, float]) -> int:
         """Put a body where it lay at rest, with a velocity; tell where that is in the state."""
@@ -661,18 +663,29 @@ class _Laws:
         return best / DROP
 
     def braked(self, joint: Any, rest: Floats, gravity: float) -> float | None:
-        """Measure the coefficient of friction with which what lies there slides along x."""
-        at = self.thrown(joint, rest, (GLIDE, 0.0, 0.0))
-        command, speeds = np.zeros(self.world.structure.n_commands), [GLIDE]
-        for _ in range(math.ceil(GLIDING / self.bodies.timestep)):
-            speeds.append(float(self.step(command, {})[at]))
+        """Measure the coefficient of friction with which what lies there slides along x.
+
+        It is the impulse along x for each unit of what the ground carries, which is not the weight
+        of a box that hops.
+
+        Returns:
+            None if it touches something else, or hops most of the time.
+        """
+        step = self.bodies.timestep
+        fast = max(GLIDE, LEAST * gravity * step)
+        at = self.thrown(joint, rest, (fast, 0.0, 0.0))
+        command, speeds = np.zeros(self.world.structure.n_commands), [(fast, 0.0)]
+        for _ in range(max(math.ceil(GLIDING / step), LEAST)):
+            found = self.step(command, {})
+            speeds.append((float(found[at]), float(found[at + 2])))
             if not self.beneath(self.bodies.bodies[joint.body].name):
                 return None
-            if speeds[-1] < 0.3 * GLIDE:
+            if speeds[-1][0] < 0.3 * fast:
                 break
         first = len(speeds) // 4
-        lost = speeds[first] - speeds[-1]
-        return lost / (gravity * (len(speeds) - 1 - first) * self.bodies.timestep)
+        lost, rise = speeds[first][0] - speeds[-1][0], speeds[-1][1] - speeds[first][1]
+        weight = gravity * (len(speeds) - 1 - first) * step
+        return lost / (weight + rise) if weight + rise > 0.5 * weight else None
 
     # --- motion ------------------------------------------------------------------------------
 

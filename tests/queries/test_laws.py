@@ -127,6 +127,29 @@ def test_contacts_of_their_own_break_no_law(what: str) -> None:
     assert "sliding" not in {law.law for law in laws}
 
 
+HARD = {
+    "clutter": '<worldbody><geom type="box" pos="5 5 .5" size="1 1 1"/></worldbody>',
+    "coarse": '<option timestep="0.02"/>',
+    "heavy": '<option gravity="0 0 -80"/>',
+}
+BOX = """
+<worldbody>
+  <geom type="plane" size="9 9 1"/>
+  <body pos="0 0 1"><freejoint/><geom type="box" size=".1 .15 .2" mass="1"/></body>
+</worldbody>
+"""
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("what", HARD)
+def test_an_honest_engine_keeps_laws_where_they_are_hard_to_measure(what: str, engine: str) -> None:
+    """Something stands where bodies are laid; sliding lasts a few long steps; gravity is strong."""
+    model = f"<mujoco>{BOX}{HARD[what]}</mujoco>"
+    laws = check_laws(Simulation(ModelTask(model), backend=engine))
+    assert not [str(law) for law in laws if law.passed is False]
+    assert "lying" in {law.law for law in laws}
+
+
 def scaled(element, attribute, factor):
     """Multiply one parameter."""
     return lambda key, value, _: (

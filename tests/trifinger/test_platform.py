@@ -20,7 +20,10 @@ needed = pytest.mark.skipif(not HERE, reason="the extra 'trifinger' is not insta
 @pytest.mark.skipif(HERE, reason="the extra 'trifinger' is installed")
 def test_what_is_missing_is_said() -> None:
     """Without the extra the error says how to install it."""
-    with pytest.raises(MissingEngine, match="trifinger"):
+    said = (
+        "^the trifinger_platform engine is not installed; try: pip install 'scm-world.trifinger.'$"
+    )
+    with pytest.raises(MissingEngine, match=said):
         make_backend("trifinger_platform")
 
 
@@ -83,6 +86,21 @@ def test_parameters_are_written_or_refused() -> None:
             world.do({"tool_block.size": (0.06, 0.06, 0.06)})
         np.testing.assert_array_equal(world.vector, before)
         assert world["tool_block.size"].tolist() == [0.065] * 3
+
+
+@needed
+def test_closing_disconnects() -> None:
+    """No simulation is left: not of a world that is closed, and not of episodes before."""
+    import pybullet
+
+    with World("pushing", backend="trifinger_platform") as world:
+        clients = set()
+        for seed in range(2):
+            world.reset(seed=seed)
+            world.step(0.5 * (world.action_low + world.action_high))
+            clients.add(world.backend._platform.simfinger._pybullet_client_id)
+        assert len(clients) == 1  # numbers of clients that are gone are given again
+    assert not any(pybullet.isConnected(physicsClientId=client) for client in clients)
 
 
 @needed

@@ -71,7 +71,7 @@ class TriFingerPlatform(InMemory):
 
     def __init__(self) -> None:
         if find_spec("trifinger_simulation") is None:
-            raise MissingEngine(self.name, "pip install 'scm-world[trifinger]'", "not installed")
+            raise MissingEngine(self.name, "pip install 'scm-world[trifinger]'")
 
     @property
     def version(self) -> str:
@@ -138,6 +138,10 @@ class TriFingerPlatform(InMemory):
         super().restore(self.sealed(scene))
         self._begin()
         self._first, self._played[:] = first.copy(), played
+
+    def close(self) -> None:
+        """Disconnect the platform's simulation; a step would begin it again."""
+        self._platform = None
 
     # --- the platform ------------------------------------------------------------------------
 
