@@ -31,6 +31,7 @@ ARGUMENTS = (
     "--disable-gpu-rasterization",
     "--disable-accelerated-2d-canvas",
 )
+"""Only WebGL is drawn by SwiftShader, which is slow for all else."""
 READY = "Boolean(window.studio?.news && studio.view.drawn)"
 DRAW = """async seconds => {
   const first = studio.view.drawn, begun = performance.now();

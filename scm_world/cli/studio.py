@@ -16,7 +16,8 @@ def studio(
         str,
         typer.Argument(
             metavar="SYSTEM",
-            help="A task (see 'scm-world list'), a model.xml or model.urdf, or module:function.",
+            help="A task (see 'scm-world list'), a model.xml, model.urdf or model.json, or "
+            "module:name.",
         ),
     ] = "pushing",
     backend: options.Backend = None,

@@ -28,7 +28,7 @@ from scm_world.errors import ImpossibleObservation, ModelError, UnknownOption
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier, first_value, noise_of
 from scm_world.queries.equations import Layout
-from scm_world.queries.inversion import Found, Inverse, law_of, summed
+from scm_world.queries.inversion import Found, Inverse, density_of, summed
 from scm_world.queries.observations import Observations, observations
 from scm_world.queries.plans import Plan, numbered
 from scm_world.queries.timed import At
@@ -329,7 +329,7 @@ class _Abduction:
         if isinstance(table, Table):
             members = np.asarray(table.values or range(table.shape[-1]))
         elif isinstance(source, Discrete | Categories | Integers) and not source.parents():
-            members = np.asarray(law_of(source, shape, {}).support)
+            members = np.asarray(density_of(source, shape, {}).support)
         else:
             return drawn
         count = len(members) ** int(np.prod(shape))
@@ -344,7 +344,7 @@ class _Abduction:
             given, log, possible, _ = self._inverse(variable, source, given, weigh=True)
             log = np.where(possible, log, -np.inf)
         else:
-            log = summed(law_of(source, shape, {}).log_density(given))
+            log = summed(density_of(source, shape, {}).log_density(given))
         rest = np.tile(np.arange(self.n) >= self.n // self._tried * self._tried, self._rows)
         self.log_weights += np.where(there, 0.0, log)
         self.log_weights[rest] = -np.inf  # so that every combination has as many draws
@@ -368,7 +368,7 @@ class _Abduction:
         if isinstance(variable, Exogenous):
             bounded = bool(source.parents())
             try:
-                log = law_of(source, variable.shape, self.values[-1]).log_density(value)
+                log = density_of(source, variable.shape, self.values[-1]).log_density(value)
             except ModelError:
                 if bounded:
                     raise

@@ -77,7 +77,7 @@ class Inverse:
         self._parents = [parent[::each] for parent in parents]
         own = variable.noise_shape
         self._shape: tuple[int, ...] = variable.shape if own is None else own
-        self._law = law_of(source, self._shape, {})
+        self._density = density_of(source, self._shape, {})
         self._function, self._step = variable.mechanism.bind(), step
 
     def _gives(self, noise: Value) -> Value:
@@ -105,7 +105,7 @@ class Inverse:
             )
         if isinstance(variable.mechanism, Table):
             return self._in_table(value, variable.mechanism)
-        if self._law.support is not None:
+        if self._density.support is not None:
             return self._enumerated(value, alike=alike)
         if not alike:
             said = f"the noise of {variable.name!r} has shape {self._shape}, its value "
@@ -122,16 +122,16 @@ class Inverse:
         with np.errstate(all="ignore"):
             return all(
                 np.allclose(self._gives(np.full_like(still, by)), still + by, rtol=1e-6, atol=1e-9)
-                for by in np.ravel(self._law.quantile(SHARES[::16]))
+                for by in np.ravel(self._density.quantile(SHARES[::16]))
             )
 
     def _unique(self, noise: Value, value: Value, weigh: bool) -> Found:
         """Check a noise that is the only one that gives the value."""
-        log = summed(self._law.log_density(noise))
+        log = summed(self._density.log_density(noise))
         possible = np.isfinite(log) & self._units.near(self._gives(noise), value, whole=True)
         if not weigh:
             log = np.zeros(len(log))
-        elif self._law.support is None:
+        elif self._density.support is None:
             log = log - summed(self._log_slope(noise))
         log = np.where(possible, log, 0.0)
         return self._all(noise), self._all(log), self._all(possible), False
@@ -163,7 +163,7 @@ class Inverse:
 
     def _enumerated(self, value: Value, *, alike: bool) -> Found:
         """Try every value of a discrete noise: of each component by itself, or of all together."""
-        support, chances = self._law.support, self._law.chances
+        support, chances = self._density.support, self._density.chances
         count = 1 if alike else int(np.prod(self._shape))
         if len(support) ** count > JOINT:
             said = (
@@ -199,8 +199,8 @@ class Inverse:
         Solutions are single numbers, of which the density counts; or ranges, where whole numbers,
         thresholds and ceilings give one value for many noises: then their probability counts.
         """
-        law, shape = self._law, np.shape(value)
-        points = np.stack([np.broadcast_to(law.quantile(s), shape[1:]) for s in SHARES])
+        density, shape = self._density, np.shape(value)
+        points = np.stack([np.broadcast_to(density.quantile(s), shape[1:]) for s in SHARES])
         signs = np.stack([self._sign(np.broadcast_to(p, shape), value) for p in points])
         turns = signs[1:] != signs[:-1]
         number = np.cumsum(turns, axis=0)
@@ -223,11 +223,11 @@ class Inverse:
         there.append(signs[-1] == 0)
         low, high, real = (np.stack(each) for each in (starts, ends, there))
         wide = real & (high - low > 1e-9 * (1.0 + np.abs(low)))
-        masses = np.where(wide, law.mass(low, high), 0.0)
+        masses = np.where(wide, density.mass(low, high), 0.0)
         roots = 0.5 * (low + high)
         logs = []
         for root, single in zip(roots, real & ~wide, strict=True):
-            log = law.log_density(root) - self._log_slope(root)
+            log = density.log_density(root) - self._log_slope(root)
             found = single & self._units.near(self._gives(root), value) & np.isfinite(log)
             logs.append(np.where(found, log, -np.inf))
         top = np.max(logs, axis=0)
@@ -239,7 +239,7 @@ class Inverse:
             for each in (roots, low, high, wide)
         )
         if ranges.any():
-            within = law.between(start, end, self._at(shape[1:], "within"))
+            within = density.between(start, end, self._at(shape[1:], "within"))
             one = np.where(ranges, within, one)
         log = log + np.where(possible, self._all(summed(scale)), 0.0)
         return one, log, possible, several or bool(ranges.any())
@@ -271,7 +271,7 @@ def summed(log: Floats) -> Floats:
 
 @final
 @dataclass(frozen=True)
-class Law:
+class Density:
     """Density and quantiles of a distribution, component by component.
 
     Attributes:
@@ -310,7 +310,7 @@ class Law:
         return np.asarray(np.clip(np.where(upper, right, left), low, high))
 
 
-def law_of(source: Any, shape: tuple[int, ...], values: Values) -> Law:
+def density_of(source: Any, shape: tuple[int, ...], values: Values) -> Density:
     """Give density and quantiles of a distribution.
 
     Raises:
@@ -320,19 +320,19 @@ def law_of(source: Any, shape: tuple[int, ...], values: Values) -> Law:
 
     match source:
         case Normal(mean=mean, std=std) if std > 0.0:
-            return Law(stats.norm(mean, std))
+            return Density(stats.norm(mean, std))
         case Continuous():
-            return Law(source.frozen)
+            return Density(source.frozen)
         case Box():
             low, high = (np.asarray(end) for end in source.bounds(shape, values))
             if (high > low).all():
-                return Law(stats.uniform(low, high - low))
+                return Density(stats.uniform(low, high - low))
         case Normal(mean=mean):
-            return Law(None, np.array([mean]), np.ones(1))
+            return Density(None, np.array([mean]), np.ones(1))
         case Discrete():
-            return Law(None, np.asarray(source.values, dtype=float), source.chances)
+            return Density(None, np.asarray(source.values, dtype=float), source.chances)
         case Categories(members=members):
-            return law_of(Discrete(members), shape, values)
+            return density_of(Discrete(members), shape, values)
         case Integers(low=low, high=high):
-            return law_of(Discrete(range(low, high + 1)), shape, values)
+            return density_of(Discrete(range(low, high + 1)), shape, values)
     raise ModelError([f"the density of {source!r} is not known, so it cannot be abducted"])

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from scm_world.backends.step import StepModel
+from scm_world.discovery.problems import model_of_file
 from scm_world.errors import UnknownOption
 from scm_world.graph import scm as graph
 from scm_world.policies.zoo import zoo
@@ -25,7 +26,7 @@ class Spec(BaseModel):
     """What a world is made of.
 
     Attributes:
-        system: A task, a model file or ``module:function``.
+        system: A task, a model file, ``module:name``, or the JSON file of an ``SCM``.
         options: Arguments of the task.
         settings: Arguments of ``World``.
     """
@@ -36,13 +37,15 @@ class Spec(BaseModel):
     settings: dict[str, Any] = {}
 
     def make(self) -> Any:
-        """Return the world, or the causal model without a backend that ``module:function`` gives.
+        """Return the world, or the causal model without a backend that was named.
 
         Raises:
             UnknownOption: There is no such system, or equations are given settings of a world.
         """
         made: Any = None
-        if ":" in self.system:
+        if self.system.endswith(".json"):
+            made = model_of_file(self.system)
+        elif ":" in self.system:
             with suppress(Exception):  # ``make_task`` raises it again, and says what is wrong
                 made = load_factory(self.system)(**self._given)
         if not isinstance(made, graph.SCM):
@@ -68,8 +71,11 @@ class Spec(BaseModel):
         """Return the lines of Python that make it."""
         if isinstance(made_of, SCM):
             given = ", ".join(f"{name}={value!r}" for name, value in self._given.items())
-            first = ["import scm_world as sw", "from scm_world.tasks.factories import load_factory"]
-            return [*first, "", f"world = sw.SCM(load_factory({self.system!r})({given}))"]
+            module, made = "tasks.factories", f"load_factory({self.system!r})({given})"
+            if self.system.endswith(".json"):
+                module, made = "discovery.problems", f"model_of_file({self.system!r})"
+            imported = f"from scm_world.{module} import {made.partition('(')[0]}"
+            return ["import scm_world as sw", imported, "", f"world = sw.SCM({made})"]
         settings = "".join(f", {name}={value!r}" for name, value in self.settings.items())
         made = repr(self.system)
         if self.options:

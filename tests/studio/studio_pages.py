@@ -15,17 +15,9 @@ from typing import Any
 
 import pytest
 
+from benchmarks.studio import ARGUMENTS
+
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-DRAWING = (
-    "--no-sandbox",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-gpu-compositing",
-    "--disable-gpu-rasterization",
-    "--disable-accelerated-2d-canvas",
-)
-"""Only WebGL is drawn by SwiftShader, which is slow for all else."""
 PATIENCE = 60.0  # [s]
 
 PUSHER = """
@@ -94,7 +86,7 @@ def browser() -> Iterator[Any]:
     if path is None:
         pytest.skip(f"there is no browser: none of {', '.join(BROWSERS)} is installed")
     with driver.sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=path, args=list(DRAWING))
+        opened = playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS))
         yield opened
         opened.close()
 

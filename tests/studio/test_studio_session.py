@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from scm_world.graph import to_json
 from scm_world.queries import World
 from scm_world.studio.reading import Spec, lit_edges, marks
 from scm_world.studio.scene import Shapes
 from scm_world.studio.worker import Session
+from scm_world.tasks.factories import load_factory
 from scm_world.variables import Box, Categories, Integers
 from scm_world.variables.spaces import Affine, Either
 
@@ -96,16 +98,22 @@ def module(tmp_path: Path) -> str:
     return str(tmp_path / "systems.py")
 
 
-@pytest.mark.parametrize(("factory", "variable"), [("cart", "speed"), ("pond", "size")])
-def test_systems_without_shapes(module: str, factory: str, variable: str) -> None:
+@pytest.mark.parametrize(
+    ("factory", "variable"), [("cart", "speed"), ("pond", "size"), ("file", "speed")]
+)
+def test_systems_without_shapes(module: str, factory: str, variable: str, tmp_path: Path) -> None:
     """Equations and step functions have a page too: graph, do, twins, series and Python."""
-    ask = Asked(f"{module}:{factory}")
+    system = f"{module}:{factory}"
+    if factory == "file":
+        system = str(tmp_path / "cart.json")
+        Path(system).write_text(to_json(load_factory(f"{module}:cart")()))
+    ask = Asked(system)
     hello = ask.pipe.last("hello")
     assert hello["has_shapes"] is False
     assert variable in [one["name"] for one in hello["variables"]]
     ask("plot", names=[variable])
     ask("step", n=4)
-    cause = {"cart": "mass", "pond": "rate"}[factory]
+    cause = {"cart": "mass", "pond": "rate", "file": "mass"}[factory]
     ask("do", name=cause, act={"value": 0.5})
     ask("step", n=2)
     ask("split", at=1, do={cause: {"value": 1.5}})

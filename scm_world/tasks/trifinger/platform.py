@@ -61,8 +61,10 @@ class TriFingerPlatform(InMemory):
     It takes joint positions only. Parameters that the platform cannot change must keep their
     defaults, among them the size of the cube (65 mm) and masses of links; they are reported as
     such, though links differ. States can be set, as an experimenter does by hand: the platform
-    begins anew then. Torques are mapped by the Jacobians of both robots. Velocities of the cube
-    are differences of the poses that the cameras saw. No contacts are reported.
+    begins anew then, and so it does when a parameter is set; all is at rest, whatever moved, and
+    velocities that are set are not used. Torques are mapped by the Jacobians of both robots.
+    Velocities of the cube are differences of the poses that the cameras saw. No contacts are
+    reported.
     """
 
     name: ClassVar[str] = "trifinger_platform"
@@ -117,7 +119,8 @@ class TriFingerPlatform(InMemory):
             EngineFailure: Torques are commanded, or a number is not finite.
         """
         if mode is not ControlMode.JOINT_POSITIONS:
-            raise EngineFailure("the platform takes joint positions only", self.name)
+            advice = "use action_mode='joint_positions', or relative to them"
+            raise EngineFailure(f"the platform takes joint positions only; {advice}", self.name)
         if self._platform is None:
             self._start()
             for earlier in self._played:
