@@ -398,20 +398,32 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
 }
 """What differs from that, by task and algorithm."""
 
-_PLACED: Fields = {"protocols": ("P1", "P5"), "episodes": 400, "rounds": 0}
+_BY_FEEDBACK: Fields = {
+    "teacher": "hold",
+    "env": {
+        **ENV,
+        "delta_origin": "command",
+        "observation_mode": "custom",
+        "observe": [*_SEEN, "tool_block.size"],
+    },
+    "protocols": ("P4", "P5", "P7", "P10"),
+    "episodes": 2_400,
+    "rounds": 1,
+    "more": 600,
+    "noise": 0.06,
+    "keep": 0.5,
+    "updates": 30_000,
+    "batch": 1_024,
+    "trials": {"protocols": ("P4", "P5", "P7", "P10"), "episodes": 20},
+}
+"""A teacher whose actions follow from the present, in much of A. With relative commands a network
+corrects errors until they are gone, whatever the fingers weigh."""
 
 LESSONS: Mapping[str, Fields] = {
-    # A block that was released is dragged along by fingers that retreat a little too early.
-    "pushing": {
-        "teacher": "hold",
-        "protocols": ("P5",),
-        "episodes": 1_200,
-        "rounds": 0,
-        "trials": {"protocols": ("P0", "P5"), "episodes": 40},
-    },
-    "picking": {"updates": 4_000},
-    "pick_and_place": _PLACED,
-    "stacking2": {**_PLACED, "episodes": 350},
+    "pushing": _BY_FEEDBACK,
+    "picking": _BY_FEEDBACK,
+    "pick_and_place": _BY_FEEDBACK,
+    "stacking2": {"protocols": ("P1", "P5"), "episodes": 350, "rounds": 0},
 }
 """What differs from the usual lesson of imitation, by task."""
 

@@ -211,13 +211,27 @@ class Hand:
             Shape (9,) [rad], within the bounds of a command.
         """
         joints, _ = self.solve(tips, near)
-        torques = carrying(joints, self.weights) + pressing(joints, self.height, forces)
-        wanted = joints + np.minimum(np.maximum(torques, -self._limit), self._limit) / self._gains
+        wanted = joints + self.more(joints, forces)
         if self._last is not None:
             stride = np.minimum(np.maximum(joints - self._last, -STRIDE), STRIDE)
             wanted += self._lead * stride
         self._last = joints
-        clipped: Floats = np.minimum(np.maximum(wanted, _LOW), _HIGH)
+        return self.bounded(wanted)
+
+    def more(self, joints: Floats, forces: Floats) -> Floats:
+        """Say what is added to joints so that they carry the fingers and press, shape (9,) [rad].
+
+        Args:
+            joints: Shape (9,) [rad].
+            forces: On what fingertips touch, shape (3, 3) [N].
+        """
+        torques = carrying(joints, self.weights) + pressing(joints, self.height, forces)
+        added: Floats = np.minimum(np.maximum(torques, -self._limit), self._limit) / self._gains
+        return added
+
+    def bounded(self, joints: Floats) -> Floats:
+        """Bring joint positions within the bounds of a command, shape (9,) [rad]."""
+        clipped: Floats = np.minimum(np.maximum(joints, _LOW), _HIGH)
         return clipped
 
     def strength(self, joints: Floats, forces: Floats) -> float:

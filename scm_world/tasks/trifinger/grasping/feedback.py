@@ -1,0 +1,211 @@
+"""A grasp by feedback: what it does next follows from where things are, not from the time."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, smallest, turn_about_z
+from scm_world.tasks.trifinger.grasping.choice import Choice
+from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS
+from scm_world.tasks.trifinger.grasping.ways import Move, Planner
+
+FREE = np.zeros((3, 3))
+TRAVEL, CLOSE = 0.022, 0.006  # [m] per control step, of fingertips far from a block, and beside it
+CARRY, TURN = 0.0045, 0.03  # [m], [rad] per control step, of a block
+RISE = 0.0015  # [m] per control step, upwards or downwards
+FREE_GAIN, GAIN = 0.35, 0.15  # shares of an error that are corrected in a control step
+AHEAD = 0.02  # [m] that a command may be from where a fingertip is
+TOUCHING, SLIPPED = 0.004, 0.02  # [m] across and along a face, of fingertips that hold a block
+BESIDE, ASIDE = 0.012, 0.015  # [m] likewise, beyond the opening, of those that come to it
+NEAR, FAR = 0.008, 0.025  # [m] from above a grip: fingertips come down; they go up first
+FUNNEL = 2.5  # how much higher fingertips are for what they are too far aside
+LAG, TWIST = 0.015, 0.2  # [m], [rad] that a held block may be behind its command
+BACK = 0.0005  # [m] by which slipping fingertips are brought back
+PUSHED = 0.06  # [rad] that a command changes in a step while fingers press
+ARRIVED = np.array([0.005, 0.06])  # [m, rad] of a block that is let go of
+AGAIN, STUCK, RETREAT = 25, 45, 14
+"""Control steps until another plan, until fingers count as stuck, and that they then go back."""
+
+
+@final
+class Following:
+    """What is done in one episode, step by step.
+
+    The only memory is the job: which block is taken, by which grip, and where to. All else is read
+    from the world in each step: fingertips go above the grip, down, towards the faces, and press;
+    then the block goes towards its goal, higher than that as long as it is away from it. The last
+    block is not let go of. A command is the command before, corrected by a share of the error: so
+    forces need not be known exactly.
+
+    Args:
+        world: With blocks that have goals.
+    """
+
+    def __init__(self, world: Any) -> None:
+        self._sight = Sight(world)
+        self._tool: str | None = None
+        self._move: Move | None = None
+        self._idle = self._still = self._waiting = self._back = 0
+
+    def command(self, world: Any) -> Floats:
+        """Give the joint positions to command now, shape (9,) [rad]."""
+        sight = self._sight
+        sight.look(world)
+        hand, joints = sight.hand, sight.joints
+        before = _commanded(world, sight)
+        tips = hand.tips(joints).reshape(3, 3)
+        move = self._planned()
+        if self._back > 0:
+            self._back -= 1
+            place = hand.tips(np.array(hardware.REST)).reshape(3, 3)
+            place[:, 2] = 0.12
+            return self._to(place, TRAVEL, tips, before)
+        if move is None:
+            place = tips.copy()
+            place[:, 2] = np.maximum(tips[:, 2], 0.09)
+            return self._to(place, TRAVEL, tips, before)
+        body, grip, used = self._body(), move.grip, np.array(move.grip.used)
+        own = body.own(tips)
+        inward, away = np.sign(grip.inward), own - grip.touch
+        across = -(away * inward).sum(axis=1)
+        along = np.linalg.norm(away + across[:, None] * inward, axis=1)
+        gap, side = across[used].max(), along[used].max()
+        if gap < TOUCHING and side < SLIPPED:
+            self._waiting = 0
+            return self._carry(move, body, tips, before)
+        self._waiting += 1
+        if gap < grip.opening + BESIDE and side < ASIDE:
+            share = min(max((side - 0.004) / 0.008, 0.0), 1.0)  # that it stays open
+            opening = grip.opening * share - 0.003 * (1.0 - share)
+            return self._to(self._place(move, body, opening), CLOSE, tips, before)
+        return self._to(self._way(move, body, tips, own), TRAVEL, tips, before)
+
+    # --- which block, and where to -----------------------------------------------------------
+
+    def _body(self) -> Cuboid:
+        return self._sight.body(str(self._tool))
+
+    def _planned(self) -> Move | None:
+        """Keep the job until the block has arrived, has fallen over, or fingers are stuck."""
+        move, self._idle = self._move, self._idle - 1
+        if move is not None:
+            body = self._body()
+            error = math.dist(move.end.place, body.place), abs(self._turn(move, body))
+            self._still = self._still + 1 if bool((np.array(error) < ARRIVED).all()) else 0
+            stuck = self._waiting > STUCK
+            if stuck:
+                self._back = RETREAT
+            if stuck or (move.release and self._still > 3) or math.hypot(*body.lean) > 0.6:
+                move = self._move = None
+                self._idle = 0
+        if move is None and self._idle <= 0 and self._back <= 0:
+            job = Choice(self._sight, holds=True).job()
+            self._idle, self._still, self._waiting = AGAIN, 0, 0
+            if job is not None:
+                self._tool, self._move = job.tool, job.move
+        return self._move
+
+    @staticmethod
+    def _turn(move: Move, body: Cuboid) -> float:
+        """Say how far a block has still to be turned [rad]."""
+        return smallest(move.start.yaw + move.turn - body.yaw)
+
+    # --- fingers without a block -------------------------------------------------------------
+
+    def _place(self, move: Move, body: Cuboid, opening: float) -> Floats:
+        planner = Planner(self._sight.hand, self._sight.joints, ())
+        return planner.place(move.grip, body, opening).reshape(3, 3)
+
+    def _to(self, place: Floats, rate: float, tips: Floats, before: Floats) -> Floats:
+        """Bring fingertips nearer to places, shape (3, 3) [m]."""
+        hand, joints = self._sight.hand, self._sight.joints
+        more = hand.more(joints, FREE)
+        last = tips + np.clip(hand.tips(before - more).reshape(3, 3) - tips, -AHEAD, AHEAD)
+        way = place - tips
+        farthest = float(np.linalg.norm(way, axis=1).max())
+        aim = last + way * min(FREE_GAIN, rate / max(farthest, 1e-9))
+        return hand.bounded(hand.solve(aim.ravel(), joints)[0] + more)
+
+    def _way(self, move: Move, body: Cuboid, tips: Floats, own: Floats) -> Floats:
+        """Say where fingertips go that are not beside the block yet, shape (3, 3) [m].
+
+        They go away from faces first, then up, then above the grip, then down a funnel.
+        """
+        used = np.array(move.grip.used)
+        place = self._place(move, body, move.grip.opening)
+        far = float(np.linalg.norm((place - tips)[used, :2], axis=1).max())
+        rise = np.minimum(move.above - place[used, 2], FUNNEL * max(far - NEAR, 0.0))
+        place[used, 2] += rise
+        if far <= FAR:
+            return place
+        free = min(max((float(tips[used, 2].min()) - move.above + 0.035) / 0.02, 0.0), 1.0)
+        if free == 1.0:
+            return place
+        outside = np.abs(own[:, :2]) - body.half[:2]
+        axis, each = outside.argmax(axis=1), np.arange(3)
+        clear = outside[each, axis] - TIP_RADIUS
+        normal = np.zeros((3, 3))
+        normal[each, axis] = np.sign(own[each, axis])
+        beside = np.clip((body.top + 0.01 - tips[:, 2]) / 0.01, 0.0, 1.0)
+        push = np.clip((0.014 - clear) / 0.008, 0.0, 1.0) * beside
+        back = tips + 0.02 * push[:, None] * (normal @ turn_about_z(body.yaw).T)
+        up = float(np.clip(1.0 - beside * (0.008 - clear) / 0.006, 0.0, 1.0).min())
+        place[:, :2] = free * place[:, :2] + (1.0 - free) * back[:, :2]
+        place[:, 2] = up * place[:, 2] + (1.0 - up) * tips[:, 2]
+        return place
+
+    # --- fingers with a block ----------------------------------------------------------------
+
+    def _carry(self, move: Move, body: Cuboid, tips: Floats, before: Floats) -> Floats:
+        """Press, and bring the block nearer to its end."""
+        sight, grip = self._sight, move.grip
+        hand, joints, tool = sight.hand, sight.joints, str(self._tool)
+        used, shares = np.array(grip.used), np.abs(grip.inward).max(axis=1)
+        press = min(sight.wanted(tool), move.strength)
+        forces = press * grip.inward @ turn_about_z(body.yaw).T
+        forces[:, 2] += sight.weight(tool) * shares / shares.sum()
+        more = hand.more(joints, forces)
+        own = body.own(tips)
+        at = body.world(own + np.clip(grip.touch - own, -BACK, BACK))
+        last = hand.tips(before - more).reshape(3, 3)
+        lag = np.clip((last - at)[used].mean(axis=0), -LAG, LAG)
+        middle = at[used].mean(axis=0)
+        arms = at - middle
+        across = np.stack([-arms[:, 1], arms[:, 0]], axis=-1)
+        turned = (across * (last - at - lag)[:, :2])[used].sum() / (across**2)[used].sum()
+        rate, turning = self._speed(move, body, press)
+        yaw = min(max(float(turned), -TWIST), TWIST) + turning
+        aim = middle + lag + rate + arms @ turn_about_z(yaw).T
+        lean = 2.0 * GAIN * body.lean
+        aim[:, :2] -= arms[:, 2:] * lean
+        aim[:, 2] += arms[:, :2] @ lean
+        aim[~used] = self._place(move, body, 0.0)[~used]
+        found = hand.bounded(hand.solve(aim.ravel(), joints)[0] + more)
+        return np.clip(found, before - PUSHED, before + PUSHED)
+
+    def _speed(self, move: Move, body: Cuboid, press: float) -> tuple[Floats, float]:
+        """Choose how a block moves in this control step, shape (3,) [m], and turns [rad]."""
+        error, turn = move.end.place - body.place, self._turn(move, body)
+        far = math.hypot(error[0], error[1])
+        burden = self._sight.burden(str(self._tool)) / max(press, 1e-9)
+        pace = CARRY * max(min(max((0.7 - burden) / 0.5, 0.0), 1.0) ** 2, 0.3)
+        lifted = min(max(body.bottom / 0.006, 0.05), 1.0) if far > 0.015 else 1.0
+        higher = min(max(max(far / 0.01, abs(turn) / 0.15) - 0.5, 0.0), 1.0)
+        height = move.end.place[2] + higher * max(move.height - move.end.place[2], 0.0)
+        flat = error[:2] * min(GAIN, pace * lifted / max(far, 1e-9))
+        rise = min(max(GAIN * (height - body.place[2]), -RISE), RISE)
+        turning = min(max(GAIN * turn, -TURN), TURN) * lifted * pace / CARRY
+        return np.array([*flat, rise]), turning
+
+
+def _commanded(world: Any, sight: Sight) -> Floats:
+    """Give the joint positions that were commanded last, shape (9,) [rad]."""
+    if world.index == 0:
+        return sight.joints
+    last: Floats = np.array(world.evaluate(("action",))["action"])
+    return sight.hand.solve(last, sight.joints)[0] if "effector" in world.action_mode else last
