@@ -12,7 +12,7 @@ from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, smallest, turn_about_z
 from scm_world.tasks.trifinger.grasping.choice import Choice
 from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS
-from scm_world.tasks.trifinger.grasping.ways import Move, Planner
+from scm_world.tasks.trifinger.grasping.ways import CLEARANCE, Move, Planner
 
 FREE = np.zeros((3, 3))
 TRAVEL, CLOSE = 0.022, 0.006  # [m] per control step, of fingertips far from a block, and beside it
@@ -194,7 +194,10 @@ class Following:
         far = math.hypot(error[0], error[1])
         burden = self._sight.burden(str(self._tool)) / max(press, 1e-9)
         pace = CARRY * max(min(max((0.7 - burden) / 0.5, 0.0), 1.0) ** 2, 0.3)
-        lifted = min(max(body.bottom / 0.006, 0.05), 1.0) if far > 0.015 else 1.0
+        below = min(move.height - float(body.place[2]), 0.014 - body.bottom)
+        if move.height > max(move.end.place[2], move.start.place[2] + CLEARANCE):
+            below = move.height - float(body.place[2])  # something is in the way
+        lifted = min(max((0.014 - below) / 0.006, 0.05), 1.0) if far > 0.015 else 1.0
         higher = min(max(max(far / 0.01, abs(turn) / 0.15) - 0.5, 0.0), 1.0)
         height = move.end.place[2] + higher * max(move.height - move.end.place[2], 0.0)
         flat = error[:2] * min(GAIN, pace * lifted / max(far, 1e-9))
