@@ -17,7 +17,7 @@ from scm_world.tasks.trifinger.grasping.ways import CLEARANCE, Move, Planner
 FREE = np.zeros((3, 3))
 TRAVEL, CLOSE = 0.022, 0.006  # [m] per control step, of fingertips far from a block, and beside it
 CARRY, TURN = 0.0045, 0.03  # [m], [rad] per control step, of a block
-RISE = 0.0015  # [m] per control step, upwards or downwards
+RISE = 0.0012  # [m] per control step, upwards or downwards
 FREE_GAIN, GAIN = 0.35, 0.15  # shares of an error that are corrected in a control step
 AHEAD = 0.02  # [m] that a command may be from where a fingertip is
 TOUCHING, SLIPPED = 0.004, 0.02  # [m] across and along a face, of fingertips that hold a block
@@ -27,7 +27,7 @@ FUNNEL = 2.5  # how much higher fingertips are for what they are too far aside
 LAG, TWIST = 0.015, 0.2  # [m], [rad] that a held block may be behind its command
 BACK = 0.0005  # [m] by which slipping fingertips are brought back
 PUSHED = 0.06  # [rad] that a command changes in a step while fingers press
-ARRIVED = np.array([0.005, 0.06])  # [m, rad] of a block that is let go of
+ARRIVED = np.array([0.003, 0.04])  # [m, rad] of a block that is let go of
 AGAIN, STUCK, RETREAT = 25, 45, 14
 """Control steps until another plan, until fingers count as stuck, and that they then go back."""
 
@@ -51,6 +51,7 @@ class Following:
         self._tool: str | None = None
         self._move: Move | None = None
         self._idle = self._still = self._waiting = self._back = 0
+        self._opens = False
 
     def command(self, world: Any) -> Floats:
         """Give the joint positions to command now, shape (9,) [rad]."""
@@ -75,6 +76,9 @@ class Following:
         across = -(away * inward).sum(axis=1)
         along = np.linalg.norm(away + across[:, None] * inward, axis=1)
         gap, side = across[used].max(), along[used].max()
+        if self._opens:
+            self._waiting += 1
+            return self._to(self._place(move, body, grip.opening), CLOSE, tips, before)
         if gap < TOUCHING and side < SLIPPED:
             self._waiting = 0
             return self._carry(move, body, tips, before)
@@ -100,15 +104,23 @@ class Following:
             stuck = self._waiting > STUCK
             if stuck:
                 self._back = RETREAT
-            if stuck or (move.release and self._still > 3) or math.hypot(*body.lean) > 0.6:
+            self._opens |= move.release and self._still > 3
+            if stuck or (self._opens and self._open(move, body)) or math.hypot(*body.lean) > 0.6:
                 move = self._move = None
                 self._idle = 0
         if move is None and self._idle <= 0 and self._back <= 0:
             job = Choice(self._sight, holds=True).job()
-            self._idle, self._still, self._waiting = AGAIN, 0, 0
+            self._idle, self._still, self._waiting, self._opens = AGAIN, 0, 0, False
             if job is not None:
                 self._tool, self._move = job.tool, job.move
         return self._move
+
+    def _open(self, move: Move, body: Cuboid) -> bool:
+        """Tell whether fingers have let go."""
+        used = np.array(move.grip.used)
+        tips = self._sight.hand.tips(self._sight.joints).reshape(3, 3)
+        away = np.abs(tips - self._place(move, body, 0.0))[used].max(axis=1)
+        return bool(away.min() > 0.8 * move.grip.opening)
 
     @staticmethod
     def _turn(move: Move, body: Cuboid) -> float:
@@ -166,7 +178,7 @@ class Following:
         sight, grip = self._sight, move.grip
         hand, joints, tool = sight.hand, sight.joints, str(self._tool)
         used, shares = np.array(grip.used), np.abs(grip.inward).max(axis=1)
-        press = min(sight.wanted(tool), move.strength)
+        press = min(1.5 * sight.wanted(tool), move.strength)
         forces = press * grip.inward @ turn_about_z(body.yaw).T
         forces[:, 2] += sight.weight(tool) * shares / shares.sum()
         more = hand.more(joints, forces)
