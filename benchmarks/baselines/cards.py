@@ -12,6 +12,9 @@ from scm_world.policies import PolicyAbout
 SCORES = {"last_fractional_success": "last fractional success", "success": "success"}
 """Columns of the table, and what they are called."""
 
+MAIN = next(iter(SCORES))
+"""The score of which seeds and ceilings are given."""
+
 COMMAND, RESULTS, LIMITS = "command", "scores", "limits"
 """Entries of a card that are written when a policy is published."""
 
@@ -29,8 +32,9 @@ scm-world evaluate zoo:pushing --protocols P0,P5
 ```
 
 Scores are means over episodes with 95 % intervals; [Evaluation](evaluation.md) says what the
-protocols are and how scores are estimated. `scm-world list --zoo` lists them. This page is written
-by `python -m benchmarks.baselines.publish`.
+protocols are and how scores are estimated. `scm-world list --zoo` lists them. Columns of seeds have the
+same score of other seeds of the same training; a column with the name of a script says what can be
+reached by one that sees the whole world. This page is written by `python -m benchmarks.baselines.publish`.
 """
 
 
@@ -105,18 +109,33 @@ def _table(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
     engines = list(dict.fromkeys(row["engine"] for row in listed))
     found = {(row["protocol"], row["engine"]): row for row in listed}
     varied = {row["protocol"]: row.get("varied", "") for row in listed}
-    heads = [f"{word}, {engine}" for engine in engines for word in SCORES.values()]
+    more: dict[str, str] = {}
+    if any("seeds" in row for row in listed):
+        more["seeds"] = "seeds"
+    if ceilings := {row["ceiling"]["name"] for row in listed if "ceiling" in row}:
+        more["ceiling"] = f"`{ceilings.pop()}`"
+    words = [*SCORES.values(), *more.values()]
+    heads = [f"{word}, {engine}" for engine in engines for word in words]
     yield f"| {' | '.join(('protocol', 'varied', *heads, 'episodes'))} |"
     yield "|---|---|" + "---:|" * (len(heads) + 1)
     for protocol, what in varied.items():
         cells = [
-            str(_interval(found[protocol, engine][metric])) if (protocol, engine) in found else "–"
+            _score(found[protocol, engine].get(entry)) if (protocol, engine) in found else "–"
             for engine in engines
-            for metric in SCORES
+            for entry in (*SCORES, *more)
         ]
         counts = {row["n"] for row in listed if row["protocol"] == protocol}
         episodes = ", ".join(map(str, sorted(counts)))
         yield f"| {' | '.join((protocol, what.replace('|', chr(92) + '|'), *cells, episodes))} |"
+
+
+def _score(entry: Any) -> str:
+    """Write an interval, the means of several seeds, or a ceiling."""
+    if isinstance(entry, list):
+        return ", ".join(f"{one:.2f}" for one in entry)
+    if entry is None or "name" in entry:
+        return "–" if entry is None else f"{entry['value']:.2f}"
+    return str(_interval(entry))
 
 
 def _interval(row: Mapping[str, Any]) -> Interval:

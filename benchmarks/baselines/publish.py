@@ -7,7 +7,8 @@
 ``RUN`` is the folder of a training run, or a policy file; ``EVALUATION`` a folder that
 ``scm-world evaluate`` wrote about this very file, on one engine or both. The policy without its
 value network becomes ``scm_world/policies/zoo/NAME.safetensors``, and ``docs/zoo.md`` is written
-anew.
+anew. Other runs of the same agent in the evaluation are the seeds beside it; the scripted policy
+``--ceiling``, an agent in it too, says what can be reached in a protocol.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from benchmarks.baselines.cards import COMMAND, LIMITS, RESULTS, SCORES, page_text
+from benchmarks.baselines.cards import COMMAND, LIMITS, MAIN, RESULTS, SCORES, page_text
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation import Evaluation
 from scm_world.output.durable import write_whole
@@ -31,12 +32,15 @@ LARGEST = 1_000_000  # [bytes] of a file in the package
 PAGE = Path(__file__).parents[2] / "docs" / "zoo.md"
 
 
-def scores_of(path: Path, results: Iterable[Path]) -> list[dict[str, Any]]:
+def scores_of(
+    path: Path, results: Iterable[Path], ceiling: str | None = None
+) -> list[dict[str, Any]]:
     """List the scores of a policy file in evaluations: a row for each engine and protocol.
 
     Args:
         path: Of the file.
         results: Folders of evaluations.
+        ceiling: An agent in them that sees the whole world, if any.
 
     Raises:
         UnreadableFile: An evaluation is damaged, or not of this file.
@@ -45,13 +49,13 @@ def scores_of(path: Path, results: Iterable[Path]) -> list[dict[str, Any]]:
     content = sha256(path.read_bytes()).hexdigest()
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for folder in results:
-        for row in _rows(folder, content):
+        for row in _rows(folder, content, ceiling):
             if found.setdefault((row["engine"], row["protocol"]), row) is not row:
                 raise ModelError([f"{folder}: {row['protocol']} on {row['engine']} is there twice"])
     return list(found.values())
 
 
-def _rows(folder: Path, content: str) -> Iterable[dict[str, Any]]:
+def _rows(folder: Path, content: str, ceiling: str | None) -> Iterable[dict[str, Any]]:
     evaluation = Evaluation.load(folder)
     agents = [one for one in evaluation.about["agents"] if one["policy"].get("sha256") == content]
     if not agents:
@@ -62,12 +66,19 @@ def _rows(folder: Path, content: str) -> Iterable[dict[str, Any]]:
     varied = {one["name"]: one.get("doc", "") for one in evaluation.about["protocols"]}
     for engine in mine.engines:
         for protocol in mine.only(engine=engine).protocols:
-            scores = {
+            scores: dict[str, Any] = {
                 metric: mine.score(protocol, metric, agent=agent, engine=engine).as_dict()
                 for metric in SCORES
             }
             n = len(mine.only(engine=engine, protocol=protocol))
             where = {"engine": engine, "protocol": protocol, "varied": varied[protocol], "n": n}
+            there = {"protocol": protocol, "engine": engine}
+            if len(runs := evaluation.runs(agent)) > 1:
+                each = [evaluation.only(agent=agent, run=one, **there) for one in runs]
+                scores["seeds"] = [float(one.columns[MAIN].mean()) for one in each]
+            if ceiling is not None:
+                best = evaluation.only(agent=ceiling, **there).score(protocol, MAIN)
+                scores["ceiling"] = {"name": ceiling, "value": best.value}
             yield {**where, **scores}
 
 
@@ -101,6 +112,7 @@ def published(
     *,
     command: str | None = None,
     limits: Sequence[str] = (),
+    ceiling: str | None = None,
 ) -> MlpPolicy:
     """Give what goes into the zoo: a policy without its value network, with its scores.
 
@@ -109,6 +121,7 @@ def published(
         results: Folders of evaluations.
         command: That trained it; from its card if None.
         limits: What has to be known, in sentences.
+        ceiling: See ``scores_of``.
 
     Raises:
         UnreadableFile: A file is damaged, or an evaluation is not of this policy.
@@ -118,7 +131,7 @@ def published(
     about: PolicyAbout = policy.about.with_card(
         **{
             COMMAND: command or policy.about.card.get(COMMAND) or command_of(policy.about.card),
-            RESULTS: scores_of(source, results),
+            RESULTS: scores_of(source, results, ceiling),
             LIMITS: [*limits],
         }
     )
@@ -163,10 +176,10 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--results", type=Path, nargs="+", required=True, help="of evaluations")
     parser.add_argument("--command", help="that trained it; from its recipe by default")
     parser.add_argument("--limit", action="append", default=[], help="sentence; one for each")
+    parser.add_argument("--ceiling", help="agent in the evaluations that sees the whole world")
     asked = parser.parse_args(words)
-    path = publish(
-        asked.source, asked.name, asked.results, command=asked.command, limits=asked.limit
-    )
+    more = {"command": asked.command, "limits": asked.limit, "ceiling": asked.ceiling}
+    path = publish(asked.source, asked.name, asked.results, **more)
     print(f"written: {path}, {PAGE}")
 
 

@@ -404,20 +404,25 @@ _BY_FEEDBACK: Fields = {
         **ENV,
         "delta_origin": "command",
         "observation_mode": "custom",
-        "observe": [*_SEEN, "tool_block.size"],
+        "observe": [
+            "joint_positions",
+            "end_effector_positions",
+            "action",
+            *(f"tool_block.{part}" for part in (*_POSE, "size")),
+            *(f"goal_block.{part}" for part in _POSE),
+        ],
     },
-    "protocols": ("P4", "P5", "P7", "P10"),
-    "episodes": 2_400,
-    "rounds": 1,
-    "more": 600,
-    "noise": 0.06,
+    "protocols": ("P7", "P10"),
+    "episodes": 3_000,
+    "rounds": 0,
+    "noise": 0.05,
     "keep": 0.5,
     "updates": 30_000,
     "batch": 1_024,
     "trials": {"protocols": ("P4", "P5", "P7", "P10"), "episodes": 20},
 }
-"""A teacher whose actions follow from the present, in much of A. With relative commands a network
-corrects errors until they are gone, whatever the fingers weigh."""
+"""A teacher whose actions follow from the present, in much of A, and what they follow from: no velocities or torques, in which engines
+differ most. With relative commands a network corrects errors until they are gone."""
 
 LESSONS: Mapping[str, Fields] = {
     "pushing": _BY_FEEDBACK,

@@ -108,6 +108,22 @@ def test_the_card_says_how_it_was_made_and_how_well_it_does(published: str, tmp_
     assert "## zoo:small" in page_text(zoo())
 
 
+def test_seeds_and_a_ceiling_stand_beside_the_scores(folder: Path, tmp_path: Path) -> None:
+    """Of the same evaluation: other runs of the agent, and one that sees the whole world."""
+    paths = [trained(tmp_path / f"{seed}.safetensors", seed=seed, card=CARD) for seed in (0, 1)]
+    made: Any = {"n": 2, "backend": "fake", "env": {"max_episode_length": 5}}
+    agents: Any = {"a": [str(path) for path in paths], "still": "still"}
+    found = evaluate(agents, "P5", **made)
+    found.save(tmp_path / "results", kind="csv")
+    page = tmp_path / "zoo.md"
+    publish(paths[0], "small", [tmp_path / "results"], page=page, ceiling="still")
+    scores: Any = card("small").card["scores"]
+    each = found.scores("last_fractional_success", agent="a")[:, 0].mean(axis=1)
+    assert scores[0]["seeds"] == pytest.approx(each.tolist())
+    assert scores[0]["ceiling"]["name"] == "still"
+    assert "| success, fake | seeds, fake | `still`, fake | episodes |" in page.read_text()
+
+
 def test_the_page_shows_the_zoo_of_the_package() -> None:
     """It was written with the policies that are there."""
     assert PAGE.read_text(encoding="utf-8") == page_text(zoo())

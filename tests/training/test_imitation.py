@@ -39,6 +39,9 @@ QUICK: dict[str, Any] = {
     "trials": {"protocols": []},
 }
 
+WIDTH = 59
+"""Numbers that a policy of the usual lesson of picking observes."""
+
 
 def shown(n: int = 2, learner: MlpPolicy | None = None, **changes: Any) -> Demonstrations:
     """Let a teacher show a few short episodes."""
@@ -49,7 +52,7 @@ def shown(n: int = 2, learner: MlpPolicy | None = None, **changes: Any) -> Demon
 def constant(action: float) -> MlpPolicy:
     """Make a network that always gives one action."""
     tensors = {
-        "layers.0.weight": np.zeros((9, 56), np.float32),
+        "layers.0.weight": np.zeros((9, WIDTH), np.float32),
         "layers.0.bias": np.full(9, action, np.float32),
     }
     return MlpPolicy.of(tensors, {"task": "picking"})
@@ -84,7 +87,7 @@ def test_demonstrations_follow_from_the_seed_and_the_number() -> None:
     """An episode is the same, whichever ones are shown with it."""
     both = shown(2)
     alone = demonstrated(lesson("picking", **QUICK), range(1, 2), backend="mujoco", seed=0)
-    assert both.observations.shape == (24, 56)
+    assert both.observations.shape == (24, WIDTH)
     assert both.actions.shape == (24, 9)
     np.testing.assert_array_equal(both.actions[12:], alone.actions)
     np.testing.assert_array_equal(both.observations[12:], alone.observations)
@@ -296,7 +299,7 @@ def test_a_clone_says_how_it_was_made(tmp_path: Path) -> None:
     found = clone(None, lesson("picking", **{**QUICK, "trials": trials}), out=tmp_path / "run")
     card = load_policy(found.best).about.card
     assert card["episodes"] in ({"shown": 2, "kept": 2}, {"shown": 3, "kept": 3})
-    assert card["lesson"]["teacher"] == "grasp"  # type: ignore[index,call-overload] # JSON
+    assert card["lesson"]["teacher"] == "hold"  # type: ignore[index,call-overload] # JSON
     assert "torch" in card["versions"]  # type: ignore[operator] # JSON
     assert found.score is not None
     assert json.loads((tmp_path / "run" / "clone.json").read_text())["seed"] == 0
