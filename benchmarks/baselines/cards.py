@@ -32,9 +32,10 @@ scm-world evaluate zoo:pushing --protocols P0,P5
 ```
 
 Scores are means over episodes with 95 % intervals; [Evaluation](evaluation.md) says what the
-protocols are and how scores are estimated. `scm-world list --zoo` lists them. Columns of seeds have the
-same score of other seeds of the same training; a column with the name of a script says what can be
-reached by one that sees the whole world. This page is written by `python -m benchmarks.baselines.publish`.
+protocols are and how scores are estimated. Columns of seeds have the same score of several seeds of
+the same training; a column with the name of a script says what one reaches that sees the whole
+world. `scm-world list --zoo` lists the policies. This page is written by
+`python -m benchmarks.baselines.publish`.
 """
 
 

@@ -26,6 +26,7 @@ from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation import Evaluation
 from scm_world.output.durable import write_whole
 from scm_world.policies import MlpPolicy, PolicyAbout, file_of, load_policy, save_policy, zoo
+from scm_world.training.imitation import lesson
 from scm_world.training.recipe import Recipe, recipe
 
 LARGEST = 1_000_000  # [bytes] of a file in the package
@@ -86,8 +87,12 @@ def command_of(card: Mapping[str, Any]) -> str:
     """Give the command that trains such a policy, from its card.
 
     Raises:
-        UnknownOption: The card does not say how, or in another way than a preset does.
+        UnknownOption: The card does not say how, or in another way than a preset or a lesson does.
     """
+    learned = card.get("lesson")
+    if learned is not None and learned == lesson(learned["task"]).about():
+        words = ["scm-world", "clone", learned["task"], "--backend", card["backend"]]
+        return shlex.join([*words, "--seed", str(card["seed"])])
     preset = _preset(card)
     if preset is None or card.get("start") is not None:
         raise UnknownOption("command", None, ("the one that trained it: --command '…'",))
@@ -178,8 +183,8 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--limit", action="append", default=[], help="sentence; one for each")
     parser.add_argument("--ceiling", help="agent in the evaluations that sees the whole world")
     asked = parser.parse_args(words)
-    more = {"command": asked.command, "limits": asked.limit, "ceiling": asked.ceiling}
-    path = publish(asked.source, asked.name, asked.results, **more)
+    more: dict[str, Any] = {"limits": asked.limit, "ceiling": asked.ceiling}
+    path = publish(asked.source, asked.name, asked.results, command=asked.command, **more)
     print(f"written: {path}, {PAGE}")
 
 

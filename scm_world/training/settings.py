@@ -398,37 +398,52 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
 }
 """What differs from that, by task and algorithm."""
 
-_BY_FEEDBACK: Fields = {
-    "teacher": "hold",
-    "env": {
-        **ENV,
-        "delta_origin": "command",
-        "observation_mode": "custom",
-        "observe": [
-            "joint_positions",
-            "end_effector_positions",
-            "action",
-            *(f"tool_block.{part}" for part in (*_POSE, "size")),
-            *(f"goal_block.{part}" for part in _POSE),
-        ],
-    },
-    "protocols": ("P7", "P10"),
-    "episodes": 3_000,
-    "rounds": 0,
-    "noise": 0.05,
-    "keep": 0.5,
-    "updates": 30_000,
-    "batch": 1_024,
-    "trials": {"protocols": ("P4", "P5", "P7", "P10"), "episodes": 20},
-}
-"""A teacher whose actions follow from the present, in much of A, and what they follow from: no velocities or torques, in which engines
-differ most. With relative commands a network corrects errors until they are gone."""
+
+def _poses(*bodies: str) -> list[str]:
+    return [f"{body}.{part}" for body in bodies for part in _POSE]
+
+
+def _by_feedback(*seen: str, **changes: Any) -> Fields:
+    """Let a teacher show much of A whose actions follow from the present, and observe just that.
+
+    Neither velocities nor torques are observed, in which engines differ most. With relative
+    commands a network corrects errors until they are gone, whatever the fingers weigh.
+
+    Args:
+        seen: Variables that are observed besides those of the robot.
+        changes: Further fields of the lesson.
+    """
+    observe = ["joint_positions", "end_effector_positions", "action", *seen]
+    env = {**ENV, "delta_origin": "command", "observation_mode": "custom", "observe": observe}
+    trials = {"protocols": ("P4", "P5", "P7", "P10"), "episodes": 20}
+    return {
+        "teacher": "hold",
+        "env": env,
+        "protocols": ("P7", "P10"),
+        "episodes": 3_000,
+        "rounds": 0,
+        "noise": 0.05,
+        "keep": 0.5,
+        "updates": 30_000,
+        "batch": 1_024,
+        "trials": trials,
+        **changes,
+    }
+
+
+_ONE = [*_poses("tool_block"), "tool_block.size", *_poses("goal_block")]
+_TWO = [*_poses("tool_block_1", "tool_block_2", "goal_tower"), "block.size"]
 
 LESSONS: Mapping[str, Fields] = {
-    "pushing": _BY_FEEDBACK,
-    "picking": _BY_FEEDBACK,
-    "pick_and_place": _BY_FEEDBACK,
-    "stacking2": {"protocols": ("P1", "P5"), "episodes": 350, "rounds": 0},
+    "pushing": _by_feedback(*_ONE),
+    "picking": _by_feedback(*_ONE),
+    "pick_and_place": _by_feedback(*_ONE, "obstacle.size", "obstacle.cartesian_position"),
+    "stacking2": _by_feedback(
+        *_TWO,
+        protocols=("P5", "P7"),
+        episodes=1_500,
+        trials={"protocols": ("P0", "P5", "P7"), "episodes": 20},
+    ),
 }
 """What differs from the usual lesson of imitation, by task."""
 
