@@ -342,6 +342,29 @@ _CARRYING: Fields = {
 _PICKING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_center": 0.0}}
 _PLACING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_goal": 0.0}}
 
+
+def _reacting(*seen: str) -> Fields:
+    """Let a network observe what a grasp by feedback reacts to, and act relative to its command.
+
+    Neither velocities nor torques are observed, in which engines differ most. With relative
+    commands a network corrects errors until they are gone, whatever the fingers weigh.
+
+    Args:
+        seen: Variables that are observed besides those of the robot.
+    """
+    observe = ["joint_positions", "end_effector_positions", "action", *seen]
+    return {"delta_origin": "command", "observation_mode": "custom", "observe": observe}
+
+
+def _poses(*bodies: str) -> list[str]:
+    return [f"{body}.{part}" for body in bodies for part in _POSE]
+
+
+_BLOCK = [*_poses("tool_block"), "tool_block.size", *_poses("goal_block")]
+_ONE = _reacting(*_BLOCK)
+_OVER = _reacting(*_BLOCK, "obstacle.size", "obstacle.cartesian_position")
+_TWO = _reacting(*_poses("tool_block_1", "tool_block_2", "goal_tower"), "block.size")
+
 _FROM_A_CLONE: Fields = {
     "network": {"activation": "relu", "log_std": -3.0},
     "rate": {"initial": 3e-5},
@@ -387,38 +410,24 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
         },
     },
     "picking": {
-        None: {"env": {"task_options": _PICKING}, "curriculum": 1},
+        None: {"env": {"task_options": _PICKING, **_ONE}, "curriculum": 1},
         "ppo": _FROM_A_CLONE,
     },
     "pick_and_place": {
-        None: {"env": {"task_options": _PLACING}, "curriculum": 1},
+        None: {"env": {"task_options": _PLACING, **_OVER}, "curriculum": 1},
         "ppo": _FROM_A_CLONE,
     },
-    "stacking2": {None: {"curriculum": 1}, "ppo": _FROM_A_CLONE},
+    "stacking2": {None: {"env": _TWO, "curriculum": 1}, "ppo": _FROM_A_CLONE},
 }
 """What differs from that, by task and algorithm."""
 
 
-def _poses(*bodies: str) -> list[str]:
-    return [f"{body}.{part}" for body in bodies for part in _POSE]
-
-
-def _by_feedback(*seen: str, **changes: Any) -> Fields:
-    """Let a teacher show much of A whose actions follow from the present, and observe just that.
-
-    Neither velocities nor torques are observed, in which engines differ most. With relative
-    commands a network corrects errors until they are gone, whatever the fingers weigh.
-
-    Args:
-        seen: Variables that are observed besides those of the robot.
-        changes: Further fields of the lesson.
-    """
-    observe = ["joint_positions", "end_effector_positions", "action", *seen]
-    env = {**ENV, "delta_origin": "command", "observation_mode": "custom", "observe": observe}
+def _by_feedback(env: Fields, **changes: Any) -> Fields:
+    """Let a teacher whose actions follow from the present show much of A."""
     trials = {"protocols": ("P4", "P5", "P7", "P10"), "episodes": 20}
     return {
         "teacher": "hold",
-        "env": env,
+        "env": {**ENV, **env},
         "protocols": ("P7", "P10"),
         "episodes": 3_000,
         "rounds": 0,
@@ -431,15 +440,12 @@ def _by_feedback(*seen: str, **changes: Any) -> Fields:
     }
 
 
-_ONE = [*_poses("tool_block"), "tool_block.size", *_poses("goal_block")]
-_TWO = [*_poses("tool_block_1", "tool_block_2", "goal_tower"), "block.size"]
-
 LESSONS: Mapping[str, Fields] = {
-    "pushing": _by_feedback(*_ONE),
-    "picking": _by_feedback(*_ONE),
-    "pick_and_place": _by_feedback(*_ONE, "obstacle.size", "obstacle.cartesian_position"),
+    "pushing": _by_feedback(_ONE),
+    "picking": _by_feedback(_ONE),
+    "pick_and_place": _by_feedback(_OVER),
     "stacking2": _by_feedback(
-        *_TWO,
+        _TWO,
         protocols=("P5", "P7"),
         episodes=1_500,
         trials={"protocols": ("P0", "P5", "P7"), "episodes": 20},
