@@ -342,28 +342,18 @@ _CARRYING: Fields = {
 _PICKING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_center": 0.0}}
 _PLACING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_goal": 0.0}}
 
-
-def _reacting(*seen: str) -> Fields:
-    """Let a network observe what a grasp by feedback reacts to, and act relative to its command.
-
-    Neither velocities nor torques are observed, in which engines differ most. With relative
-    commands a network corrects errors until they are gone, whatever the fingers weigh.
-
-    Args:
-        seen: Variables that are observed besides those of the robot.
-    """
-    observe = ["joint_positions", "end_effector_positions", "action", *seen]
-    return {"delta_origin": "command", "observation_mode": "custom", "observe": observe}
-
-
-def _poses(*bodies: str) -> list[str]:
-    return [f"{body}.{part}" for body in bodies for part in _POSE]
-
-
-_BLOCK = [*_poses("tool_block"), "tool_block.size", *_poses("goal_block")]
-_ONE = _reacting(*_BLOCK)
-_OVER = _reacting(*_BLOCK, "obstacle.size", "obstacle.cartesian_position")
-_TWO = _reacting(*_poses("tool_block_1", "tool_block_2", "goal_tower"), "block.size")
+_REACTING: Fields = {
+    "delta_origin": "command",
+    "observation_mode": "custom",
+    "observe": [
+        *("joint_positions", "end_effector_positions", "action"),
+        *(f"tool_block.{part}" for part in (*_POSE, "size")),
+        *(f"goal_block.{part}" for part in _POSE),
+    ],
+}
+"""What a grasp by feedback reacts to, and actions relative to its command. Neither velocities nor
+torques are observed, in which engines differ most. With relative commands a network corrects errors
+until they are gone, whatever the fingers weigh."""
 
 _FROM_A_CLONE: Fields = {
     "network": {"activation": "relu", "log_std": -3.0},
@@ -410,46 +400,38 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
         },
     },
     "picking": {
-        None: {"env": {"task_options": _PICKING, **_ONE}, "curriculum": 1},
+        None: {"env": {"task_options": _PICKING, **_REACTING}, "curriculum": 1},
         "ppo": _FROM_A_CLONE,
     },
     "pick_and_place": {
-        None: {"env": {"task_options": _PLACING, **_OVER}, "curriculum": 1},
+        None: {"env": {"task_options": _PLACING}, "curriculum": 1},
         "ppo": _FROM_A_CLONE,
     },
-    "stacking2": {None: {"env": _TWO, "curriculum": 1}, "ppo": _FROM_A_CLONE},
+    "stacking2": {None: {"curriculum": 1}, "ppo": _FROM_A_CLONE},
 }
 """What differs from that, by task and algorithm."""
 
+_BY_FEEDBACK: Fields = {
+    "teacher": "hold",
+    "env": {**ENV, **_REACTING},
+    "protocols": ("P7", "P10"),
+    "episodes": 3_000,
+    "rounds": 0,
+    "noise": 0.05,
+    "keep": 0.5,
+    "updates": 30_000,
+    "batch": 1_024,
+    "trials": {"protocols": ("P4", "P5", "P7", "P10"), "episodes": 20},
+}
+"""A teacher whose actions follow from the present shows much of A."""
 
-def _by_feedback(env: Fields, **changes: Any) -> Fields:
-    """Let a teacher whose actions follow from the present show much of A."""
-    trials = {"protocols": ("P4", "P5", "P7", "P10"), "episodes": 20}
-    return {
-        "teacher": "hold",
-        "env": {**ENV, **env},
-        "protocols": ("P7", "P10"),
-        "episodes": 3_000,
-        "rounds": 0,
-        "noise": 0.05,
-        "keep": 0.5,
-        "updates": 30_000,
-        "batch": 1_024,
-        "trials": trials,
-        **changes,
-    }
-
+_PLACED: Fields = {"protocols": ("P1", "P5"), "episodes": 400, "rounds": 0}
 
 LESSONS: Mapping[str, Fields] = {
-    "pushing": _by_feedback(_ONE),
-    "picking": _by_feedback(_ONE),
-    "pick_and_place": _by_feedback(_OVER),
-    "stacking2": _by_feedback(
-        _TWO,
-        protocols=("P5", "P7"),
-        episodes=1_500,
-        trials={"protocols": ("P0", "P5", "P7"), "episodes": 20},
-    ),
+    "pushing": _BY_FEEDBACK,
+    "picking": _BY_FEEDBACK,
+    "pick_and_place": _PLACED,
+    "stacking2": {**_PLACED, "episodes": 350},
 }
 """What differs from the usual lesson of imitation, by task."""
 

@@ -32,6 +32,7 @@ QUICK: dict[str, Any] = {
     "env": SHORT,
     "keep": 0.0,
     "episodes": 2,
+    "rounds": 1,
     "more": 1,
     "updates": 20,
     "batch": 8,
@@ -39,7 +40,7 @@ QUICK: dict[str, Any] = {
     "trials": {"protocols": []},
 }
 
-WIDTH = 59
+WIDTH = 44
 """Numbers that a policy of the usual lesson of picking observes."""
 
 
