@@ -103,7 +103,8 @@ def as_policy(given: Any, world: Any = None) -> Policy:
         given: A policy, actions, ``"random"``, ``"mpc"`` (plans), or None: the idle
             action of the first step. Of the block-building robot also
             ``"sweep"`` (to the middle), ``"across"`` (one finger), ``"grasp"`` (blocks, to their
-            goals), ``"hold"`` (likewise, but the last block is not let go of).
+            goals), ``"hold"`` (likewise, but the last block is not let go of), ``"feedback"``
+            (likewise, without a plan in time).
         world: In which it acts, if that is known already.
 
     Raises:

@@ -412,7 +412,7 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
 """What differs from that, by task and algorithm."""
 
 _BY_FEEDBACK: Fields = {
-    "teacher": "hold",
+    "teacher": "feedback",
     "env": {**ENV, **_REACTING},
     "protocols": ("P7", "P10"),
     "episodes": 3_000,

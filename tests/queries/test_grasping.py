@@ -14,7 +14,7 @@ from scm_world.policies.scripted import as_policy
 from scm_world.queries import World
 from scm_world.tasks import Picking
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.grasping import Grasp, Pace
+from scm_world.tasks.trifinger.grasping import Feedback, Grasp, Pace
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, body_of, smallest, turns
 from scm_world.tasks.trifinger.grasping.hand import Hand, carrying, pressing
 from scm_world.tasks.trifinger.grasping.ways import grips
@@ -41,7 +41,7 @@ def world_of(task: Any, engine: str, mode: str = MODE) -> World:
 
 
 @engines
-@pytest.mark.parametrize("policy", ["grasp", "hold"])
+@pytest.mark.parametrize("policy", ["grasp", "feedback"])
 @pytest.mark.parametrize("task", TASKS)
 def test_it_solves_the_tasks(engine: str, policy: str, task: str) -> None:
     """The blocks fill their goals at the end of the episode, by a plan and by feedback."""
@@ -81,10 +81,10 @@ def test_it_goes_where_the_goal_goes() -> None:
     assert world["tool_block.cartesian_position"][2] == pytest.approx(0.17, abs=0.003)
 
 
-@pytest.mark.parametrize("holds", [False, True])
-def test_it_tries_again(holds: bool) -> None:
+@pytest.mark.parametrize("made", [Grasp, Feedback])
+def test_it_tries_again(made: Any) -> None:
     """A block that is taken out of the hand is picked up anew."""
-    world, policy = world_of(Picking(), "mujoco"), Grasp(holds=holds)
+    world, policy = world_of(Picking(), "mujoco"), made()
     for _ in range(60):
         world.step(policy(world))
     assert world["tool_block.cartesian_position"][2] > 0.05
@@ -98,10 +98,10 @@ def test_it_tries_again(holds: bool) -> None:
 
 
 @engines
-@pytest.mark.parametrize("holds", [False, True])
-def test_it_begins_anew_with_an_episode(engine: str, holds: bool) -> None:
+@pytest.mark.parametrize("made", [Grasp, Feedback])
+def test_it_begins_anew_with_an_episode(engine: str, made: Any) -> None:
     """One instance gives the same episode again, bit for bit, wherever it was interrupted."""
-    world, policy = world_of("picking", engine), Grasp(holds=holds)
+    world, policy = world_of("picking", engine), made()
     first = world.rollout(policy, steps=60)
     world.rollout(policy, steps=33, do={"tool_block.mass": 0.05})
     assert world.rollout(policy, steps=60) == first
@@ -111,7 +111,7 @@ def test_it_begins_anew_with_an_episode(engine: str, holds: bool) -> None:
 
 def test_by_feedback_it_says_how_to_mend_what_others_did() -> None:
     """Whatever is done for some steps, a block comes to its goal: no plan in time is lost."""
-    world, policy = world_of("pushing", "mujoco", "joint_positions"), Grasp(holds=True)
+    world, policy = world_of("pushing", "mujoco", "joint_positions"), Feedback()
     random = np.random.default_rng(0)
     for step in range(250):
         action = policy(world)

@@ -300,7 +300,7 @@ def test_a_clone_says_how_it_was_made(tmp_path: Path) -> None:
     found = clone(None, lesson("picking", **{**QUICK, "trials": trials}), out=tmp_path / "run")
     card = load_policy(found.best).about.card
     assert card["episodes"] in ({"shown": 2, "kept": 2}, {"shown": 3, "kept": 3})
-    assert card["lesson"]["teacher"] == "hold"  # type: ignore[index,call-overload] # JSON
+    assert card["lesson"]["teacher"] == "feedback"  # type: ignore[index,call-overload] # JSON
     assert "torch" in card["versions"]  # type: ignore[operator] # JSON
     assert found.score is not None
     assert json.loads((tmp_path / "run" / "clone.json").read_text())["seed"] == 0

@@ -210,3 +210,8 @@ class Sight:
     def wanted(self, tool: str) -> float:
         """Choose with which force a block should be pressed [N]."""
         return FIRM + MARGIN * self.burden(tool)
+
+
+def unit(world: Any) -> tuple[int, int]:
+    """Say which episode this is."""
+    return world.noise.seed, world.episode

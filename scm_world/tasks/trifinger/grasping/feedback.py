@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from typing import Any, final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from scm_world._types import Floats
+from scm_world.errors import ActionError
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, smallest, turn_about_z
+from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, smallest, turn_about_z, unit
 from scm_world.tasks.trifinger.grasping.choice import Choice
-from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS
+from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand
 from scm_world.tasks.trifinger.grasping.ways import CLEARANCE, Move, Planner
 
 FREE = np.zeros((3, 3))
@@ -30,6 +32,40 @@ PUSHED = 0.06  # [rad] that a command changes in a step while fingers press
 ARRIVED = np.array([0.003, 0.04])  # [m, rad] of a block that is let go of
 AGAIN, STUCK, RETREAT = 25, 45, 14
 """Control steps until another plan, until fingers count as stuck, and that they then go back."""
+
+
+@final
+class Feedback:
+    """Takes blocks to their goals like ``Grasp``, by feedback, and does not let go of the last one.
+
+    What it does follows from where things are and from its last command, not from the time. So a
+    network can imitate it, and it goes on from wherever somebody else has led. It remembers which
+    block it takes, by which grip, and where to.
+
+    One instance serves any number of episodes and of worlds.
+    """
+
+    def __init__(self) -> None:
+        self._programs: WeakKeyDictionary[Any, Following] = WeakKeyDictionary()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle without what is going on."""
+        return Feedback, ()
+
+    def __call__(self, world: Any) -> Floats:
+        """Give the action of the present step.
+
+        Raises:
+            ActionError: Actions are torques, or the task has no blocks that have goals.
+        """
+        if world.action_mode == "joint_torques":
+            problem = "a grasp needs joint or fingertip positions as actions, not torques"
+            raise ActionError(problem, world.action_mode)
+        program = self._programs.get(world)
+        if program is None or not program.goes_on(world):
+            program = self._programs[world] = Following(world)
+        command = program.command(world)
+        return program.hand.tips(command) if "effector" in world.action_mode else command
 
 
 @final
@@ -52,10 +88,20 @@ class Following:
         self._move: Move | None = None
         self._idle = self._still = self._waiting = self._back = 0
         self._opens = False
+        self._unit, self._next = unit(world), world.index
+
+    @property
+    def hand(self) -> Hand:
+        """The robot."""
+        return self._sight.hand
+
+    def goes_on(self, world: Any) -> bool:
+        """Tell whether the present is the step after the last one."""
+        return bool(world.index == self._next and self._unit == unit(world))
 
     def command(self, world: Any) -> Floats:
         """Give the joint positions to command now, shape (9,) [rad]."""
-        sight = self._sight
+        sight, self._next = self._sight, world.index + 1
         sight.look(world)
         hand, joints = sight.hand, sight.joints
         before = _commanded(world, sight)

@@ -14,9 +14,15 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
-from scm_world.tasks.trifinger.grasping.bodies import QUARTER, Cuboid, Sight, smallest, turn_about_z
-from scm_world.tasks.trifinger.grasping.choice import Choice, Job
-from scm_world.tasks.trifinger.grasping.feedback import Following
+from scm_world.tasks.trifinger.grasping.bodies import (
+    QUARTER,
+    Cuboid,
+    Sight,
+    smallest,
+    turn_about_z,
+    unit,
+)
+from scm_world.tasks.trifinger.grasping.choice import Choice, Job, lifted
 from scm_world.tasks.trifinger.grasping.ways import Grip, Planner
 
 Step = tuple[Floats, Floats]
@@ -128,17 +134,18 @@ class Hold:
                 return
             yield self.step()
 
-    def stay(self, sight_of_goal: str, rate: float) -> Iterator[Step]:
+    def stay(self, sight_of_goal: str, rate: float, beside: Floats) -> Iterator[Step]:
         """Keep the block where its goal is, wherever that goes, until it is lost.
 
         Args:
             sight_of_goal: Name of the goal.
             rate: How far the block follows per control step [m].
+            beside: Where it is held, seen from the goal, shape (3,) [m].
         """
         while not self.lost:
             yield self.step()
             self._watch()
-            way = self._sight.body(sight_of_goal).place - self._wanted.place
+            way = self._sight.body(sight_of_goal).place + beside - self._wanted.place
             share = min(rate / max(math.dist(way, np.zeros(3)), 1e-9), 1.0)
             self._wanted = self._wanted.at(self._wanted.place + share * way, self._wanted.yaw)
 
@@ -226,9 +233,8 @@ class Grasp:
 
     Args:
         pace: How fast it is; ``Pace()`` if None.
-        holds: Whether the last block is not let go of, but held at its goal. What it does then
-            follows from the present, and not from the time (see ``Following``), so that a network
-            can imitate it; it has a pace of its own.
+        holds: Whether the last block is not let go of, but held at its goal. That is easier to
+            imitate: what fingers do while they let go depends on what they did before.
 
     Example:
         >>> from scm_world.queries import World
@@ -263,35 +269,31 @@ class Grasp:
 
 @final
 class _Grasping:
-    """What is done in one episode: by feedback, or as a generator of steps."""
+    """What is done in one episode, as a generator of steps."""
 
     def __init__(self, world: Any, pace: Pace, *, holds: bool) -> None:
-        self._pace = pace
-        self._following = Following(world) if holds else None
+        self._pace, self._holds = pace, holds
         self._sight = Sight(world)
-        self._unit, self._next = _unit(world), world.index
+        self._unit, self._next = unit(world), world.index
         self._tips = self._sight.hand.tips(self._sight.joints)
         self._steps = self._work()
 
     def goes_on(self, world: Any) -> bool:
         """Tell whether the present is the step after the last one."""
-        return world.index == self._next and self._unit == _unit(world)
+        return world.index == self._next and self._unit == unit(world)
 
     def action(self, world: Any) -> Floats:
         """Give the action of the present step."""
         self._next = world.index + 1
         self._sight.look(world)
+        self._tips, forces = next(self._steps)
         hand = self._sight.hand
-        if self._following is not None:
-            command = self._following.command(world)
-        else:
-            self._tips, forces = next(self._steps)
-            command = hand.command(self._tips, forces, self._sight.joints)
+        command = hand.command(self._tips, forces, self._sight.joints)
         return hand.tips(command) if "effector" in world.action_mode else command
 
     def _work(self) -> Iterator[Step]:
         while True:
-            job = Choice(self._sight).job()
+            job = Choice(self._sight, holds=self._holds).job()
             if job is None:
                 yield from self._rise(SAFE)
                 for _ in range(AGAIN):
@@ -348,7 +350,7 @@ class _Grasping:
             yield from hold.carry(station, rate, self._pace.turn)
         if not move.release:
             goal = next(goal for block, goal in sight.pairs if block == tool)
-            yield from hold.stay(goal, self._pace.carry)
+            yield from hold.stay(goal, self._pace.carry, lifted(self._holds))
         yield from hold.settle()
         for share in LETTING_GO:
             yield hold.step(share)
@@ -370,8 +372,3 @@ class _Grasping:
         calm = max(self._pace.carry * light, length / time)
         slow = max(length / (LEISURE * time), SLOWEST)
         return float(min(calm, slow, self._pace.carry))
-
-
-def _unit(world: Any) -> tuple[int, int]:
-    """Say which episode this is."""
-    return world.noise.seed, world.episode
