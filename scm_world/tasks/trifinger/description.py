@@ -95,7 +95,7 @@ def described(
             geoms.append(_capsule(name, parent, hardware.COLLISION[part], grip))
         tip = Body(
             f"robot_finger_{finger}_tip", parent, hardware.TIP_ORIGIN, _UNTURNED,
-            hardware.TIP_MASS, hardware.TIP_INERTIA, hardware.TIP_CENTER[backend], _UNTURNED,
+            hardware.TIP_MASS, hardware.TIP_INERTIA, _ZERO, _UNTURNED,
         )  # fmt: skip
         bodies.append(tip)
         geoms.append(_capsule(tip.name, len(bodies) - 1, hardware.COLLISION["tip"], grip))
