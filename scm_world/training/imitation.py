@@ -310,7 +310,7 @@ def demonstrated(
             scores.append(float(info[told[0]]))
     finally:
         runner.close()
-    kept = np.array(scores) >= lesson.keep
+    kept = np.array(scores) >= lesson.keep if learner is None else np.full(len(scores), True)
     empty = slice(0, 0)
     return Demonstrations(
         np.concatenate([seen[0][empty], *(one for one, k in zip(seen, kept, strict=True) if k)]),
@@ -406,7 +406,7 @@ def _recorded(recording: Recording, keep: float) -> Demonstrations:
 
 
 def fitted(
-    shown: Demonstrations, lesson: Lesson, *, seed: int
+    shown: Demonstrations, lesson: Lesson, *, seed: int, last: bool = True
 ) -> tuple[dict[str, NDArray[np.float32]], float]:
     """Fit a network to demonstrations, by Adam on Huber's loss.
 
@@ -441,10 +441,11 @@ def fitted(
             width = hidden
         network = torch.nn.Sequential(*layers, torch.nn.Linear(width, done.shape[1]))
         optimizer = torch.optim.Adam(network.parameters(), lr=lesson.rate)
+        updates = lesson.updates if last else max(lesson.updates // 3, 1)
         falling = torch.optim.lr_scheduler.CosineAnnealingLR(
-            optimizer, lesson.updates, eta_min=0.01 * lesson.rate
+            optimizer, updates, eta_min=0.01 * lesson.rate
         )
-        for _ in range(lesson.updates):
+        for _ in range(updates):
             rows = torch.randint(0, len(seen), (lesson.batch,))
             loss = torch.nn.functional.smooth_l1_loss(network(seen[rows]), done[rows])
             optimizer.zero_grad(set_to_none=True)
@@ -452,7 +453,7 @@ def fitted(
             optimizer.step()
             falling.step()
             losses.append(loss.item())
-    last = float(np.mean(losses[-max(lesson.updates // 10, 1) :]))
+    last = float(np.mean(losses[-max(updates // 10, 1) :]))
     if not np.isfinite(last):
         raise ModelError(["the loss is no finite number any more: take a smaller rate"])
     arrays = [tensor.detach().numpy().astype(np.float64) for tensor in network.parameters()]
@@ -578,7 +579,7 @@ def clone(
                 pairs = joined(shown)
                 ended = f"{int(pairs.kept.sum())} of {len(pairs.kept)} episodes"
                 say(f"round {round_}: learns from {len(pairs):,} control steps, of {ended}")
-                tensors, loss = fitted(pairs, lesson, seed=number)
+                tensors, loss = fitted(pairs, lesson, seed=number, last=round_ == lesson.rounds)
                 made_with = {**versions(engine), "torch": str(torch.__version__)}
                 card = {
                     "lesson": lesson.about(),

@@ -30,8 +30,9 @@ LAG, TWIST = 0.015, 0.2  # [m], [rad] that a held block may be behind its comman
 BACK = 0.0005  # [m] by which slipping fingertips are brought back
 PUSHED = 0.06  # [rad] that a command changes in a step while fingers press
 ARRIVED = np.array([0.003, 0.04])  # [m, rad] of a block that is let go of
-AGAIN, STUCK, RETREAT = 25, 45, 14
-"""Control steps until another plan, until fingers count as stuck, and that they then go back."""
+AGAIN, LOOK, STUCK, RETREAT = 25, 8, 45, 14
+"""Control steps until another plan if there is none, and while fingers hold nothing; until they
+count as stuck, and that they then go back."""
 
 
 @final
@@ -154,9 +155,11 @@ class Following:
             if stuck or (self._opens and self._open(move, body)) or math.hypot(*body.lean) > 0.6:
                 move = self._move = None
                 self._idle = 0
-        if move is None and self._idle <= 0 and self._back <= 0:
+        looks = move is None or (self._waiting % LOOK == LOOK - 1 and not self._opens)
+        if looks and self._idle <= 0 and self._back <= 0:
             job = Choice(self._sight, holds=True).job()
-            self._idle, self._still, self._waiting, self._opens = AGAIN, 0, 0, False
+            if move is None:
+                self._idle, self._still, self._waiting, self._opens = AGAIN, 0, 0, False
             if job is not None:
                 self._tool, self._move = job.tool, job.move
         return self._move

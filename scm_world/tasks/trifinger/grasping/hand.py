@@ -8,6 +8,7 @@ from typing import final
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from scm_world._types import Floats, Value
 from scm_world.geometry.penetration import box_capsule_kernel, capsule_capsule_kernel
@@ -156,6 +157,41 @@ def pressing(joints: Floats, height: float, forces: Floats) -> Floats:
     return out
 
 
+@njit(cache=True)
+def _poses_kernel(
+    tips: Floats,
+    near: Floats,
+    height: float,
+    halves: Floats,
+    centers: Floats,
+    turns: Floats,
+    joints: Floats,
+    reached: NDArray[np.bool_],
+    depths: Floats,
+) -> None:
+    """Write what ``Hand.poses`` returns into the last three."""
+    fingers = np.empty(N_FINGERS, dtype=np.bool_)
+    for row in range(len(tips)):
+        inverse_kernel(tips[row], height, near[row], joints[row], fingers)
+        reached[row] = fingers.all()
+        depths[row] = deepest_kernel(joints[row], height, halves, centers, turns)
+
+
+@njit(cache=True)
+def _strengths_kernel(
+    joints: Floats, height: float, weights: Floats, limit: float, forces: Floats, out: Floats
+) -> None:
+    """Write what ``Hand.strengths`` returns into ``out`` (n,)."""
+    for row in range(len(joints)):
+        own, unit = carrying(joints[row], weights), pressing(joints[row], height, forces[row])
+        least = math.inf
+        for joint in range(len(own)):
+            if abs(unit[joint]) > 1e-9:
+                room = limit - own[joint] * np.sign(unit[joint])
+                least = min(least, room / abs(unit[joint]))
+        out[row] = max(least, 0.0)
+
+
 @final
 class Hand:
     """The robot as it is at the moment: its height, its weight and its controller.
@@ -234,9 +270,35 @@ class Hand:
         clipped: Floats = np.minimum(np.maximum(joints, _LOW), _HIGH)
         return clipped
 
-    def strength(self, joints: Floats, forces: Floats) -> float:
-        """Tell how many times some forces, shape (3, 3), the fingers can exert."""
-        own, unit = carrying(joints, self.weights), pressing(joints, self.height, forces)
-        room = self._limit - own * np.sign(unit)
-        asked = np.abs(unit) > 1e-9
-        return max(float((room[asked] / np.abs(unit[asked])).min(initial=np.inf)), 0.0)
+    def poses(
+        self, tips: Floats, near: Floats, boxes: Solids
+    ) -> tuple[Floats, NDArray[np.bool_], Floats]:
+        """Find joints for fingertips, and how deep fingers then lie in one another and in boxes.
+
+        Args:
+            tips: Shape (n, 9) [m].
+            near: Joint positions to stay close to, shape (n, 9) [rad].
+            boxes: What they may run into.
+
+        Returns:
+            Joints, shape (n, 9) [rad]; whether all fingertips are reached, shape (n,); and the
+            depths, shape (n,) [m].
+        """
+        joints, reached, depths = (
+            np.empty(tips.shape),
+            np.empty(len(tips), bool),
+            np.empty(len(tips)),
+        )
+        _poses_kernel(tips, near, self.height, *boxes, joints, reached, depths)
+        return joints, reached, depths
+
+    def strengths(self, joints: Floats, forces: Floats) -> Floats:
+        """Tell how many times some forces the fingers can exert, shape (n,).
+
+        Args:
+            joints: Shape (n, 9) [rad].
+            forces: Shape (n, 3, 3).
+        """
+        strengths = np.empty(len(joints))
+        _strengths_kernel(joints, self.height, self.weights, self._limit, forces, strengths)
+        return strengths

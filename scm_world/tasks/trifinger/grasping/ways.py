@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import permutations, product
-from typing import final
+from typing import Any, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, solids, turn_about_z
-from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand, deepest_kernel
+from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand
 
 LEVELS = (0.15, 0.4, 0.0)
 """How high the fingertips are above the middle of a block, in halves of its height."""
@@ -56,37 +58,60 @@ class Grip:
         return points
 
 
-def grips(block: Cuboid) -> Iterator[Grip]:
-    """List the ways to hold a block: one finger against two, or against one."""
+@final
+@dataclass(frozen=True)
+class Grips:
+    """A table of grips; see ``Grip``.
+
+    Attributes:
+        touch: Shape (n, 3, 3) [m].
+        inward: Shape (n, 3, 3).
+        used: Shape (n, 3).
+        opening: Shape (n,) [m].
+    """
+
+    touch: Floats
+    inward: Floats
+    used: NDArray[np.bool_]
+    opening: Floats
+
+    def only(self, rows: Any) -> Grips:
+        """Return some of them, by a mask or by their numbers."""
+        rows = np.asarray(rows)
+        rows = rows if rows.size else np.empty(0, dtype=np.int64)
+        return Grips(self.touch[rows], self.inward[rows], self.used[rows], self.opening[rows])
+
+    def grip(self, row: int) -> Grip:
+        """Return one of them."""
+        one, two, three = self.used[row].tolist()
+        return Grip(self.touch[row], self.inward[row], (one, two, three), float(self.opening[row]))
+
+
+@lru_cache(maxsize=64)
+def gripped(x: float, y: float, z: float) -> Grips:
+    """List the ways to hold a block with these half edges [m]: one finger against two, or one."""
+    half, found = (x, y, z), list[tuple[Floats, Floats, float]]()
     for axis, level, opening in product((0, 1), LEVELS, OPENINGS):
-        out, along = block.half[axis] + TIP_RADIUS, block.half[1 - axis]
-        z = min(level * block.half[2], block.half[2] - TIP_RADIUS)
+        out, along = half[axis] + TIP_RADIUS, half[1 - axis]
+        up = min(level * z, z - TIP_RADIUS)
+        places: list[tuple[tuple[_Point, _Point, _Point], _Point]] = []
         for side, spread in product((out, -out), SPREADS):
             wide = min(max(spread * along, NARROWEST), along - EDGE)
-            three = ((side, 0.0, z), (-side, wide, z), (-side, -wide, z))
-            yield from _orders(axis, three, (1.0, 0.5, 0.5), opening)
-        two = ((out, 0.0, z), (-out, 0.0, z), (0.0, 0.0, z))
-        yield from _orders(axis, two, (1.0, 1.0, 0.0), opening)
-
-
-def _orders(
-    axis: int, places: Sequence[_Point], shares: Sequence[float], opening: float
-) -> Iterator[Grip]:
-    """List in which way three fingers can be at three places.
-
-    Args:
-        axis: Across which the block is pressed.
-        places: Across it, along the face, and upwards [m].
-        shares: Of the force.
-        opening: See ``Grip``.
-    """
-    for order in permutations(range(3)):
-        touch, inward = np.empty((3, 3)), np.zeros((3, 3))
-        for finger, (across, along, up), share in zip(order, places, shares, strict=True):
-            touch[finger] = (across, along, up) if axis == 0 else (along, across, up)
-            inward[finger, axis] = -np.sign(across) * share
-        one, two, three = (bool(row.any()) for row in inward)
-        yield Grip(touch, inward, (one, two, three), opening)
+            three = ((side, 0.0, up), (-side, wide, up), (-side, -wide, up))
+            places.append((three, (1.0, 0.5, 0.5)))
+        two = ((out, 0.0, up), (-out, 0.0, up), (0.0, 0.0, up))
+        places.append((two, (1.0, 1.0, 0.0)))
+        for (three, shares), order in product(places, permutations(range(3))):
+            touch, inward = np.empty((3, 3)), np.zeros((3, 3))
+            touch[list(order)] = [p if axis == 0 else (p[1], p[0], p[2]) for p in three]
+            inward[list(order), axis] = [
+                -np.sign(p[0]) * share for p, share in zip(three, shares, strict=True)
+            ]
+            found.append((touch, inward, opening))
+    touches, presses, openings = zip(*found, strict=True)
+    inward: Floats = np.array(presses)
+    used: NDArray[np.bool_] = np.any(inward != 0.0, axis=2)
+    return Grips(np.array(touches), inward, used, np.array(openings))
 
 
 Way = tuple[Cuboid, float]
@@ -109,6 +134,7 @@ TIGHT = 0.1
 REACHING = 0.5  # [1/m]
 MEETING = 0.3
 PLENTY = 0.05
+BEGUN, NEARBY = 0.5, 0.03  # [1], [m]
 """What makes a way better or worse. A force that is just enough is worth 1."""
 
 
@@ -171,26 +197,42 @@ class Planner:
             The best way, or None if the fingers can go none.
         """
         ways = [
-            (end, turn, self._height(start, end))
+            (start.at(end.place, start.yaw + turn), turn, self._height(start, end), end)
             for end, turn in ends
             if all(end.depth_in(other) < CROWDED for other in self._others)
         ]
-        best: Move | None = None
-        for grip in grips(start) if ways else ():
-            over = self._above(start)  # how it is taken hold of: with which force, how easily
-            opens = self._opens(grip, start, over)
-            strength = self._strength(grip, start) if opens else 0.0
-            ease = FIRMNESS * grip.firm - TIGHT * (grip.opening < max(OPENINGS))
-            ease += self._transit(grip, start, over) if opens else 0.0
-            for end, turn, height in ways if strength > 0.0 else ():
-                above = self._above(start, *[end] * release)
-                worth = ease - TURNING * abs(turn) + 1.0 + 3.0 * PLENTY
-                move = Move(grip, start, end, turn, height, above, strength, worth, release)
-                if best is None or worth > best.worth:
-                    move = self._judged(move, wanted)
-                    if move.strength > 0.0 and (best is None or move.worth > best.worth):
-                        best = move
-        return best
+        over = self._above(start)
+        table = gripped(*start.half.tolist()) if ways else gripped(*start.half.tolist()).only([])
+        table = table.only(self._opens(table, start, over))
+        first = self._strengths(table, start)
+        table, first = table.only(first > 0.0), first[first > 0.0]
+        ease = FIRMNESS * table.used.all(axis=1) - TIGHT * (table.opening < max(OPENINGS))
+        ease += self._transit(table, start, over) + self._nearness(table, start)
+        worths, strengths = (
+            np.full((len(ease), len(ways)), -np.inf),
+            np.zeros((len(ease), len(ways))),
+        )
+        for way, (on, turn, height, _) in enumerate(ways):
+            opens = np.full(len(ease), True)
+            if release:
+                opens = self._opens(table, on, self._above(start, on))
+            begin, last = (np.array([*body.place[:2], height]) for body in (start, on))
+            middle = (begin + last) / 2.0, start.yaw + turn / 2.0
+            rows, held = np.flatnonzero(opens), first[opens]
+            for body in (on, on.at(last, on.yaw), start.at(*middle), start.at(begin, start.yaw)):
+                held = np.minimum(held, self._strengths(table.only(rows), body))
+                rows, held = rows[held > 0.0], held[held > 0.0]
+            share = held / wanted
+            enough = np.minimum(share, 1.0) + PLENTY * np.minimum(share, 3.0)
+            worths[rows, way] = ease[rows] - TURNING * abs(turn) + enough
+            strengths[rows, way] = held
+        if not np.isfinite(worths).any():
+            return None
+        row, way = divmod(int(worths.argmax()), len(ways))
+        _, turn, height, end = ways[way]
+        above = self._above(start, *[end] * release)
+        numbers = float(strengths[row, way]), float(worths[row, way])
+        return Move(table.grip(row), start, end, turn, height, above, *numbers, release)
 
     def place(self, grip: Grip, body: Cuboid, opening: float, above: float | None = None) -> Floats:
         """Place the fingertips about a block.
@@ -231,52 +273,64 @@ class Planner:
 
     # --- judging ------------------------------------------------------------------------------
 
-    def _judged(self, move: Move, wanted: float) -> Move:
-        """Judge a way as a whole; its strength is 0 if the fingers cannot go it."""
-        grip, start, height = move.grip, move.start, move.height
-        on = start.at(move.end.place, start.yaw + move.turn)
-        opens = not move.release or self._opens(grip, on, self._above(start, on))
-        strength = min(move.strength, self._strength(grip, on)) if opens else 0.0
-        first, last = (np.array([*body.place[:2], height]) for body in (start, on))
-        for share in (1.0, 0.5, 0.0):
-            if strength > 0.0:
-                over = start.at(first + share * (last - first), start.yaw + share * move.turn)
-                strength = min(strength, self._strength(grip, over))
-        enough = min(strength / wanted, 1.0) + PLENTY * min(strength / wanted, 3.0)
-        worth = move.worth - 1.0 - 3.0 * PLENTY + enough
-        return Move(
-            grip, start, move.end, move.turn, height, move.above, strength, worth, move.release
+    def _tips(
+        self, table: Grips, body: Cuboid, opening: Floats | float, above: float | None = None
+    ) -> Floats:
+        """Place the fingertips about a block for each grip, shape (n, 9) [m]; see ``place``."""
+        points = table.touch - np.reshape(opening, (-1, 1, 1)) * np.sign(table.inward)
+        tips = body.place + points @ turn_about_z(body.yaw).T
+        if above is not None:
+            tips[..., 2] = above
+        placed: Floats = np.where(table.used[..., None], tips, self._aside).reshape(-1, 9)
+        return placed
+
+    def _strengths(self, table: Grips, body: Cuboid) -> Floats:
+        """Find with which force grips can hold a block somewhere, shape (n,) [N]; 0 if not."""
+        joints, reached, depth = self._poses(
+            self._tips(table, body, 0.0), block=body, margin=-TOUCH
         )
+        forces = table.inward @ turn_about_z(body.yaw).T
+        strengths = self._hand.strengths(joints, forces)
+        return np.where(reached & (depth <= 0.0), strengths, 0.0)
 
-    def _strength(self, grip: Grip, body: Cuboid) -> float:
-        """Find with which force a grip can hold a block somewhere [N]; 0 if it cannot."""
-        joints, reached = self._hand.solve(self.place(grip, body, 0.0), self._joints)
-        if not reached or self._depth(joints, body, -TOUCH) > 0.0:
-            return 0.0
-        return self._hand.strength(joints, grip.inward @ turn_about_z(body.yaw).T)
+    def _opens(self, table: Grips, body: Cuboid, above: float) -> NDArray[np.bool_]:
+        """Tell whether open fingers can be about a block, and above it, shape (n,)."""
+        tips = self._tips(table, body, table.opening)
+        joints, reached, depth = self._poses(tips, block=body, margin=OPEN)
+        opens = reached & (depth <= 0.0)
+        tips = self._tips(table.only(opens), body, table.opening[opens], above)
+        _, reached, depth = self._poses(tips, near=joints[opens])
+        opens[opens] = reached & (depth <= 0.0)
+        return opens
 
-    def _opens(self, grip: Grip, body: Cuboid, above: float) -> bool:
-        """Tell whether open fingers can be about a block, and above it."""
-        tips = self.place(grip, body, grip.opening)
-        joints, reached = self._hand.solve(tips, self._joints)
-        if not reached or self._depth(joints, body, OPEN) > 0.0:
-            return False
-        over, reached = self._hand.solve(self.place(grip, body, grip.opening, above), joints)
-        return reached and self._depth(over) <= 0.0
-
-    def _transit(self, grip: Grip, body: Cuboid, above: float) -> float:
-        """Judge the way to the block: fingers should not meet; the shorter, the better."""
+    def _transit(self, table: Grips, body: Cuboid, above: float) -> Floats:
+        """Judge ways to the block: fingers should not meet; the shorter, the better. Shape (n,)."""
         first = self._hand.tips(self._joints)
         first[2::3] = np.maximum(first[2::3], above)
-        last = self.place(grip, body, grip.opening, above)
-        worth = -REACHING * float(np.abs(last - first).max())
+        last = self._tips(table, body, table.opening, above)
+        worth = -REACHING * np.abs(last - first).max(axis=1, initial=0.0)
         for share in (0.3, 0.6, 0.9):
-            joints, _ = self._hand.solve((1.0 - share) * first + share * last, self._joints)
-            worth -= MEETING * (self._depth(joints) > 0.0)
+            _, _, depth = self._poses((1.0 - share) * first + share * last)
+            worth -= MEETING * (depth > 0.0)
         return worth
 
-    def _depth(self, joints: Floats, block: Cuboid | None = None, margin: float = 0.0) -> float:
-        """Measure how deep fingers lie in one another and in things [m]."""
+    def _nearness(self, table: Grips, body: Cuboid) -> Floats:
+        """Say how near fingertips are to where they take hold of a block, shape (n,)."""
+        tips = self._hand.tips(self._joints).reshape(3, 3)
+        away = np.linalg.norm(
+            self._tips(table, body, table.opening).reshape(-1, 3, 3) - tips, axis=2
+        )
+        far = np.max(away, axis=1, where=table.used, initial=0.0)
+        return BEGUN * np.exp(-0.5 * (far / NEARBY) ** 2)
+
+    def _poses(
+        self,
+        tips: Floats,
+        near: Floats | None = None,
+        block: Cuboid | None = None,
+        margin: float = 0.0,
+    ) -> tuple[Floats, NDArray[np.bool_], Floats]:
+        """Find joints for fingertips, and how deep fingers then lie in anything; see ``Hand``."""
         boxes = self._boxes
         if block is not None:
             half, place, axes = solids([block], margin)
@@ -285,4 +339,5 @@ class Planner:
                 np.concatenate([boxes[1], place]),
                 np.concatenate([boxes[2], axes]),
             )
-        return float(deepest_kernel(joints, self._hand.height, *boxes))
+        begin = np.broadcast_to(self._joints, tips.shape) if near is None else near
+        return self._hand.poses(tips, np.ascontiguousarray(begin), boxes)
