@@ -30,8 +30,9 @@ FRACTIONS = (
 )
 """The published scores: at the end, over the last steps, over all steps."""
 
-METRICS = (*FRACTIONS, "success", "return")
-"""What is measured of every episode, as far as the task says what success is."""
+METRICS = (*FRACTIONS, "success", "return", "published_overlap")
+"""What is measured of every episode, as far as the task says what success is. The last one is the
+fractional success at the end as CausalWorld 1.2 computes it, of axis-aligned boxes."""
 
 Watch = Callable[[ScmWorldEnv], Any]
 
@@ -188,6 +189,9 @@ class EpisodeRunner:
             if watch is not None:
                 watch(env)
         scores = scored(fractions, success=info.get(SUCCESS), total=float(total))
+        overlap = env.world.task.published_overlap(env.world.evaluate(()))
+        if overlap is not None:
+            scores["published_overlap"] = overlap
         return EpisodeRow(
             *who, engine, protocol.name, seed, episode, steps, scores, drawn, str(mark)
         )
@@ -267,11 +271,11 @@ def scored(fractions: list[float], *, success: bool | None, total: float) -> dic
         total: Sum of the rewards.
 
     Returns:
-        A number for each of ``METRICS`` that the task has.
+        A number for each of ``METRICS`` that the task has, but for ``published_overlap``.
 
     Example:
         >>> found = scored([0.0, 0.5, 1.0], success=True, total=2.5)
-        >>> [found[name] for name in METRICS]
+        >>> [found[name] for name in (*FRACTIONS, "success", "return")]
         [1.0, 0.5, 0.5, 1.0, 2.5]
 
     Source:

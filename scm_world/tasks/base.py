@@ -356,6 +356,10 @@ class Task(ABC):
         """
         raise UnknownOption("goals of", self.name, ("a task with goals",))
 
+    def published_overlap(self, values: Values) -> float | None:
+        """Compute the fractional success as CausalWorld 1.2 does; None if it has no such task."""
+        return None
+
     def fulfilled(self, fraction: ArrayLike) -> Any:
         """Tell whether a fractional success counts as success, shape (...)."""
         return np.asarray(fraction) >= 1.0

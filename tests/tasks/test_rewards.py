@@ -155,6 +155,7 @@ def test_the_predecessor_measured_the_hull() -> None:
     for world, expected in ((ours, 2.0 * (np.sqrt(2.0) - 1.0)), (theirs, 1.0)):
         place(world, (0.0, 0.0, 0.0), yaw=np.pi / 4)
         assert world["fractional_success"] == pytest.approx(expected, abs=1e-9)
+        assert world.task.published_overlap(world.evaluate(())) == pytest.approx(1.0, abs=1e-9)
 
 
 def test_reaching_rewards_tips_that_come_nearer() -> None:

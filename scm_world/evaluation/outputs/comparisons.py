@@ -28,6 +28,7 @@ WORDS: Mapping[str, str] = {
     "full_integrated_fractional_success": "fractional success over the whole episode",
     "success": "success rate",
     "return": "return",
+    "published_overlap": "overlap at the end as CausalWorld has it",
 }
 
 

@@ -168,9 +168,16 @@ class Building(TriFingerTask):
 
     def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
         """Compute how much of the desired boxes the achieved ones fill, shape (...)."""
+        return self._fraction(achieved, desired, aligned=self.conventions.aligned_boxes)
+
+    def published_overlap(self, values: Values) -> float | None:
+        """Compute the overlap of the axis-aligned boxes around blocks and around goals."""
+        return float(self._fraction(*self.goals(values), aligned=True))
+
+    def _fraction(self, achieved: ArrayLike, desired: ArrayLike, *, aligned: bool) -> Floats:
         have, want = np.asarray(achieved, dtype=float), np.asarray(desired, dtype=float)
         shape = np.broadcast_shapes(have.shape[:-1], want.shape[:-1])
-        overlap = aabb_overlap_fraction if self.conventions.aligned_boxes else _exact
+        overlap = aabb_overlap_fraction if aligned else _exact
         rows = [
             np.broadcast_to(boxes, (*shape, boxes.shape[-1])).reshape(
                 -1, boxes.shape[-1] // BOX, BOX

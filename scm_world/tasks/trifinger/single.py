@@ -224,12 +224,10 @@ class OneBlock(Building):
             doc="Fraction of the volume of the goal that the block fills.",
         )
 
-    def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
-        """Compute how much of the desired poses the achieved ones fill, shape (...)."""
+    def _fraction(self, achieved: ArrayLike, desired: ArrayLike, *, aligned: bool) -> Floats:
         if self.shape is None:
-            return super().fraction(achieved, desired)
-        exact = not self.conventions.aligned_boxes
-        overlap = shapes.hull_filled if exact else shapes.hull_aligned
+            return super()._fraction(achieved, desired, aligned=aligned)
+        overlap = shapes.hull_aligned if aligned else shapes.hull_filled
         corners = np.array(self.shape.vertices)
 
         def filled(have: Floats, want: Floats) -> float:

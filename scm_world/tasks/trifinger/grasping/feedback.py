@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, final
 from weakref import WeakKeyDictionary
 
@@ -14,7 +15,7 @@ from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, smallest, turn_about_z, unit
 from scm_world.tasks.trifinger.grasping.choice import Choice
 from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand
-from scm_world.tasks.trifinger.grasping.ways import CLEARANCE, Move, Planner
+from scm_world.tasks.trifinger.grasping.ways import CLEARANCE, OPENINGS, Grip, Move, Planner
 
 FREE = np.zeros((3, 3))
 TRAVEL, CLOSE = 0.022, 0.006  # [m] per control step, of fingertips far from a block, and beside it
@@ -26,13 +27,14 @@ TOUCHING, SLIPPED = 0.004, 0.02  # [m] across and along a face, of fingertips th
 BESIDE, ASIDE = 0.012, 0.015  # [m] likewise, beyond the opening, of those that come to it
 NEAR, FAR = 0.008, 0.025  # [m] from above a grip: fingertips come down; they go up first
 FUNNEL = 2.5  # how much higher fingertips are for what they are too far aside
+UNEVEN = 0.012  # [m] by which the fingers of two faces may be aside of one another
+PRESS = 2.0  # [N] with which a block is pressed, if fingers can, whatever it weighs
 LAG, TWIST = 0.015, 0.2  # [m], [rad] that a held block may be behind its command
 BACK = 0.0005  # [m] by which slipping fingertips are brought back
 PUSHED = 0.06  # [rad] that a command changes in a step while fingers press
 ARRIVED = np.array([0.003, 0.04])  # [m, rad] of a block that is let go of
-AGAIN, LOOK, STUCK, RETREAT = 25, 8, 45, 14
-"""Control steps until another plan if there is none, and while fingers hold nothing; until they
-count as stuck, and that they then go back."""
+AGAIN, STUCK, RETREAT = 25, 45, 14
+"""Control steps until another plan, until fingers count as stuck, and that they then go back."""
 
 
 @final
@@ -126,7 +128,12 @@ class Following:
         if self._opens:
             self._waiting += 1
             return self._to(self._place(move, body, grip.opening), CLOSE, tips, before)
-        if gap < TOUCHING and side < SLIPPED:
+        holds = gap < TOUCHING and side < SLIPPED
+        other = None if holds else held(body, own)
+        if other is not None and (other.firm or not grip.firm):
+            holds, move = True, replace(move, grip=other)
+            self._move = move
+        if holds:
             self._waiting = 0
             return self._carry(move, body, tips, before)
         self._waiting += 1
@@ -155,11 +162,9 @@ class Following:
             if stuck or (self._opens and self._open(move, body)) or math.hypot(*body.lean) > 0.6:
                 move = self._move = None
                 self._idle = 0
-        looks = move is None or (self._waiting % LOOK == LOOK - 1 and not self._opens)
-        if looks and self._idle <= 0 and self._back <= 0:
+        if move is None and self._idle <= 0 and self._back <= 0:
             job = Choice(self._sight, holds=True).job()
-            if move is None:
-                self._idle, self._still, self._waiting, self._opens = AGAIN, 0, 0, False
+            self._idle, self._still, self._waiting, self._opens = AGAIN, 0, 0, False
             if job is not None:
                 self._tool, self._move = job.tool, job.move
         return self._move
@@ -227,7 +232,7 @@ class Following:
         sight, grip = self._sight, move.grip
         hand, joints, tool = sight.hand, sight.joints, str(self._tool)
         used, shares = np.array(grip.used), np.abs(grip.inward).max(axis=1)
-        press = min(1.5 * sight.wanted(tool), move.strength)
+        press = min(PRESS, move.strength)
         forces = press * grip.inward @ turn_about_z(body.yaw).T
         forces[:, 2] += sight.weight(tool) * shares / shares.sum()
         more = hand.more(joints, forces)
@@ -265,6 +270,24 @@ class Following:
         rise = min(max(GAIN * (height - body.place[2]), -RISE), RISE)
         turning = min(max(GAIN * turn, -TURN), TURN) * lifted * pace / CARRY
         return np.array([*flat, rise]), turning
+
+
+def held(body: Cuboid, own: Floats) -> Grip | None:
+    """See how fingertips hold a block, from where they are in its frame, shape (3, 3) [m]."""
+    each = np.arange(3)
+    for axis in (0, 1):
+        along, out = own[:, 1 - axis], body.half[axis] + TIP_RADIUS
+        on_face = np.abs(np.delete(own, axis, axis=1)) < np.delete(body.half, axis)
+        touches = (np.abs(np.abs(own[:, axis]) - out) < TOUCHING) & on_face.all(axis=1)
+        side = np.where(touches, np.sign(own[:, axis]), 0.0)
+        one, two = side > 0.0, side < 0.0
+        if one.any() and two.any() and abs(along[one].mean() - along[two].mean()) < UNEVEN:
+            touch, inward = own.copy(), np.zeros((3, 3))
+            touch[touches, axis] = side[touches] * out
+            inward[each, axis] = two / two.sum() - one / one.sum()
+            first, second, third = touches.tolist()
+            return Grip(touch, inward, (first, second, third), OPENINGS[0])
+    return None
 
 
 def _commanded(world: Any, sight: Sight) -> Floats:

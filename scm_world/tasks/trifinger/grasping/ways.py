@@ -109,9 +109,9 @@ def gripped(x: float, y: float, z: float) -> Grips:
             ]
             found.append((touch, inward, opening))
     touches, presses, openings = zip(*found, strict=True)
-    inward: Floats = np.array(presses)
-    used: NDArray[np.bool_] = np.any(inward != 0.0, axis=2)
-    return Grips(np.array(touches), inward, used, np.array(openings))
+    inwards: Floats = np.array(presses)
+    used: NDArray[np.bool_] = np.any(inwards != 0.0, axis=2)
+    return Grips(np.array(touches), inwards, used, np.array(openings))
 
 
 Way = tuple[Cuboid, float]
@@ -134,7 +134,6 @@ TIGHT = 0.1
 REACHING = 0.5  # [1/m]
 MEETING = 0.3
 PLENTY = 0.05
-BEGUN, NEARBY = 0.5, 0.03  # [1], [m]
 """What makes a way better or worse. A force that is just enough is worth 1."""
 
 
@@ -207,7 +206,7 @@ class Planner:
         first = self._strengths(table, start)
         table, first = table.only(first > 0.0), first[first > 0.0]
         ease = FIRMNESS * table.used.all(axis=1) - TIGHT * (table.opening < max(OPENINGS))
-        ease += self._transit(table, start, over) + self._nearness(table, start)
+        ease += self._transit(table, start, over)
         worths, strengths = (
             np.full((len(ease), len(ways)), -np.inf),
             np.zeros((len(ease), len(ways))),
@@ -308,20 +307,11 @@ class Planner:
         first = self._hand.tips(self._joints)
         first[2::3] = np.maximum(first[2::3], above)
         last = self._tips(table, body, table.opening, above)
-        worth = -REACHING * np.abs(last - first).max(axis=1, initial=0.0)
+        worth: Floats = -REACHING * np.abs(last - first).max(axis=1, initial=0.0)
         for share in (0.3, 0.6, 0.9):
             _, _, depth = self._poses((1.0 - share) * first + share * last)
             worth -= MEETING * (depth > 0.0)
         return worth
-
-    def _nearness(self, table: Grips, body: Cuboid) -> Floats:
-        """Say how near fingertips are to where they take hold of a block, shape (n,)."""
-        tips = self._hand.tips(self._joints).reshape(3, 3)
-        away = np.linalg.norm(
-            self._tips(table, body, table.opening).reshape(-1, 3, 3) - tips, axis=2
-        )
-        far = np.max(away, axis=1, where=table.used, initial=0.0)
-        return BEGUN * np.exp(-0.5 * (far / NEARBY) ** 2)
 
     def _poses(
         self,
