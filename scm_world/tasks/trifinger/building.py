@@ -25,6 +25,7 @@ from scm_world.tasks.trifinger.base import (
     observe_tool,
 )
 from scm_world.tasks.trifinger.feasibility import fingers_reach
+from scm_world.tasks.trifinger.views import seen
 from scm_world.variables import Function, Measured, Variable
 from scm_world.variables.mechanisms import Stacked
 
@@ -127,6 +128,8 @@ class Building(TriFingerTask):
         yield succeeded()
         yield from self.terms
         yield reward(self.weights)
+        for goal, tool in self.targets().items() if self.views else ():
+            yield seen(tool, goal)
 
     def fractional_success(self) -> Measured:
         """Declare how much of the goals is filled."""

@@ -9,7 +9,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from scm_world._types import ArrayLike, Floats
-from scm_world.errors import ModelError
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.hulls import Hull, extents
 from scm_world.tasks.base import checked
@@ -83,6 +83,8 @@ class OneBlock(Building):
             raise ModelError(
                 [f"shape must be a Hull: load_hull(path) or hull_of(points); {shape!r}"]
             )
+        if shape is not None and self.views:
+            raise UnknownOption("views", True, ("False: a view is of a box, not of a hull",))
         self.shape = shape
         self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASSES.bounds)
         self._turns = {

@@ -21,7 +21,7 @@ FREE = np.zeros((3, 3))
 TRAVEL, CLOSE = 0.022, 0.006  # [m] per control step, of fingertips far from a block, and beside it
 CARRY, TURN = 0.0045, 0.03  # [m], [rad] per control step, of a block
 RISE = 0.0012  # [m] per control step, upwards or downwards
-FREE_GAIN, GAIN = 0.35, 0.15  # shares of an error that are corrected in a control step
+FREE_GAIN, GAIN, HOLD = 0.35, 0.15, 0.4  # shares of an error that are corrected in a control step
 AHEAD = 0.02  # [m] that a command may be from where a fingertip is
 TOUCHING, SLIPPED = 0.004, 0.02  # [m] across and along a face, of fingertips that hold a block
 BESIDE, ASIDE = 0.012, 0.015  # [m] likewise, beyond the opening, of those that come to it
@@ -245,8 +245,9 @@ class Following:
         across = np.stack([-arms[:, 1], arms[:, 0]], axis=-1)
         turned = (across * (last - at - lag)[:, :2])[used].sum() / (across**2)[used].sum()
         rate, turning = self._speed(move, body, press)
-        yaw = min(max(float(turned), -TWIST), TWIST) + turning
-        aim = middle + lag + rate + arms @ turn_about_z(yaw).T
+        yaw = min(max(float(turned), -TWIST), TWIST)
+        firmer = HOLD * (middle + lag + arms @ turn_about_z(yaw).T - last)
+        aim = last + firmer + rate + arms @ (turn_about_z(yaw + turning) - turn_about_z(yaw)).T
         lean = 2.0 * GAIN * body.lean
         aim[:, :2] -= arms[:, 2:] * lean
         aim[:, 2] += arms[:, :2] @ lean

@@ -1,0 +1,97 @@
+"""A block as a hand sees it: in a frame that is the same however the block's own axes are named.
+
+A box looks the same after half a turn, and after a quarter with two edges exchanged. What is
+observed of its pose is not: a learner has to find out that four quaternions are one place. With the
+task option ``views=True`` each block that has a goal has a readout ``BLOCK.view`` without that
+ambiguity. Its axes are those of the block's vertical sides, the first one within 45 degrees of x.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from scm_world._types import Floats
+from scm_world.geometry.rotations import rotation_kernel
+from scm_world.variables import Box, Function, Measured
+
+QUARTER = 0.5 * math.pi
+_POSE = ("size", "cartesian_position", "orientation")
+
+
+@njit(cache=True)
+def _upright(orientation: Floats) -> tuple[int, float, float, float]:
+    """Return which own axis is the vertical one, the yaw [rad] of the next one, and the lean."""
+    turn = np.empty((3, 3))
+    rotation_kernel(orientation, turn)
+    up = 0
+    for axis in range(3):
+        if abs(turn[2, axis]) > abs(turn[2, up]):
+            up = axis
+    x, sign = (up + 1) % 3, (1.0 if turn[2, up] > 0.0 else -1.0)
+    return up, math.atan2(turn[1, x], turn[0, x]), sign * turn[0, up], sign * turn[1, up]
+
+
+@njit(cache=True)
+def view(
+    tips: Floats,
+    size: Floats,
+    position: Floats,
+    orientation: Floats,
+    goal_position: Floats,
+    goal_orientation: Floats,
+) -> Floats:
+    """Compute what a hand sees of a block that has a goal.
+
+    Args:
+        tips: Shape (9,) [m].
+        size: Edges of the block, shape (3,) [m].
+        position: Of its center, shape (3,) [m].
+        orientation: Quaternion (x, y, z, w), shape (4,).
+        goal_position: Of the goal; so too what follows.
+        goal_orientation: Shape (4,).
+
+    Returns:
+        Shape (20,): the three fingertips (9) [m] and the goal (3) [m] from the block's center along
+        its axes; its edges along these and upwards (3) [m]; their yaw, in [-pi/4, pi/4] (1) [rad];
+        how far the goal is turned, up to half turns and up to quarters (2) [rad]; and x and y of
+        the unit vector that points upwards in the block, along its axes (2).
+    """
+    up, yaw, lean_x, lean_y = _upright(orientation)
+    _, goal_yaw, _, _ = _upright(goal_orientation)
+    quarters = round(yaw / QUARTER)
+    own = yaw - quarters * QUARTER
+    cos, sin = math.cos(own), math.sin(own)
+    out = np.empty(20)
+    for point in range(4):
+        at = 3 * point
+        if point < 3:
+            x, y, z = tips[at] - position[0], tips[at + 1] - position[1], tips[at + 2] - position[2]
+        else:
+            x, y = goal_position[0] - position[0], goal_position[1] - position[1]
+            z = goal_position[2] - position[2]
+        out[at], out[at + 1], out[at + 2] = cos * x + sin * y, cos * y - sin * x, z
+    first, second = (up + 1) % 3, (up + 2) % 3
+    if int(quarters) % 2 != 0:
+        first, second = second, first
+    out[12], out[13], out[14], out[15] = size[first], size[second], size[up], own
+    turn = goal_yaw - yaw
+    out[16] = turn - 2.0 * QUARTER * round(turn / (2.0 * QUARTER))
+    out[17] = turn - QUARTER * round(turn / QUARTER)
+    out[18], out[19] = cos * lean_x + sin * lean_y, cos * lean_y - sin * lean_x
+    return out
+
+
+def seen(block: str, goal: str) -> Measured:
+    """Declare the view of a block that has a goal."""
+    parts = tuple(f"{block}.{part}" for part in _POSE)
+    return Measured(
+        name=f"{block}.view",
+        shape=(20,),
+        bounds=Box(-4.0, 4.0),
+        parents=("end_effector_positions", *parts, *(f"{goal}.{part}" for part in _POSE[1:])),
+        mechanism=Function(view),
+        doc="Fingertips, goal, edges, yaw, turn and lean of the block, in its own frame.",
+    )
