@@ -38,7 +38,7 @@ from scm_world.env.observer import (
     reward_scale,
 )
 from scm_world.env.rendering import Looks, Window
-from scm_world.env.vector import box
+from scm_world.env.vector import Vector, box
 from scm_world.errors import ActionError, ModelError, UnknownOption
 from scm_world.geometry.clipping import scaled_clip_kernel
 from scm_world.graph import flatten
@@ -98,7 +98,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         context: Where the parameters that can be intervened on are: ``"none"``,
             ``"observation"``: appended to the vector; ``"privileged"``: in a dictionary beside
             it. The noise of the sensors does not reach them.
-        keypoints: Append the eight corners of every block and every goal.
+        keypoints: Append the eight corners of every block and every goal; ``"view"``: what a hand
+            sees of every block that has a goal, see ``scm_world.tasks.trifinger.views``.
         cameras: Names (``"60"``, ``"120"``, ``"300"``, ``"overview"``) or cameras, for
             ``"pixel"``; the three of the robot if None.
         image_size: Height and width of pictures, or both in one [pixels].
@@ -161,7 +162,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         observe: Sequence[str] = (),
         include: Sequence[str] = (),
         context: str = "none",
-        keypoints: bool = False,
+        keypoints: bool | str = False,
         cameras: Sequence[str | Camera] | None = None,
         image_size: int | tuple[int, int] | None = None,
         stack: str = STACKS[0],
@@ -419,6 +420,16 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
     def observe(self) -> Observation:
         """Give the observation of the present."""
         return self.present()[0]
+
+    def observe_values(self, values: Values) -> NDArray[np.float32]:
+        """Give the observation of other values of what is ``observed``, without noise.
+
+        Raises:
+            UnknownOption: The observation is no vector.
+        """
+        if not isinstance(self._observer, Vector):
+            raise UnknownOption("observation of values", self._how.mode, ("a vector",))
+        return self._observer.observe_values(values)
 
     def present(self) -> tuple[Observation, dict[str, Any]]:
         """Give the observation and the info of the present, as after an intervention."""

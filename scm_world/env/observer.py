@@ -16,11 +16,12 @@ from scm_world.env.vector import (
     CORNERS,
     KEYPOINTS,
     WIDE,
-    Keypoints,
     Layouts,
     ObservedPart,
     Vector,
+    View,
     bounds,
+    keypoints,
     spread,
 )
 from scm_world.errors import UnknownOption
@@ -173,7 +174,7 @@ class Observing:
     names: Sequence[str] = ()
     include: Sequence[str] = ()
     context: str = "none"
-    keypoints: bool = False
+    keypoints: bool | str = False
     cameras: Sequence[str | Camera] | None = None
     image_size: int | tuple[int, int] | None = None
     stack: str = STACKS[0]
@@ -285,13 +286,14 @@ def _vector(world: Simulation, declaration: CompiledTask, how: Observing) -> Vec
         names += [name for name in declaration.model if name not in declaration.parts]
     names = list(dict.fromkeys((*names, *how.include)))
     parts = _parts(world, declaration, names)
-    corners = _keypoints(declaration) if how.keypoints else None
-    if corners is not None:
-        parts.append(ObservedPart(KEYPOINTS, -np.ones(corners.size), np.ones(corners.size)))  # [m]
+    points = _keypoints(declaration, how.keypoints) if how.keypoints else None
+    if points is not None:
+        reach = np.full(points[1], 1.0 if how.keypoints is True else 4.0)  # [m], [rad]
+        parts.append(ObservedPart(KEYPOINTS, -reach, reach))
     if how.context == "observation":
         rest = [name for name in context(declaration) if name not in names]
         parts += _quiet(_parts(world, declaration, rest))
-    return Vector(world, declaration, parts, normalize=how.normalize, keypoints=corners)
+    return Vector(world, declaration, parts, normalize=how.normalize, keypoints=points)
 
 
 def _parts(
@@ -323,11 +325,13 @@ def _quiet(parts: Iterable[ObservedPart]) -> list[ObservedPart]:
     return [replace(part, sensed=False) for part in parts]
 
 
-def _keypoints(declaration: CompiledTask) -> Keypoints:
+def _keypoints(declaration: CompiledTask, asked: bool | str) -> View:
     task = declaration.task
-    if not task.tools():
-        raise UnknownOption("keypoints", True, ("False: the task has no blocks",))
-    return Keypoints((*task.tools(), *task.targets()))
+    one_of("keypoints", asked, (False, True, "view"))
+    view = keypoints((*task.tools(), *task.targets())) if asked is True else task.view()
+    if not task.tools() or view is None:
+        raise UnknownOption("keypoints", asked, ("False: the task has no blocks, or no boxes",))
+    return view
 
 
 __all__ = ["CORNERS", "Observation", "Observer", "Observing", "context", "observer", "published"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -101,7 +101,10 @@ def _ends(model: SCM, bound: Any) -> tuple[Any, Any]:
 # --- corners --------------------------------------------------------------------------------------
 
 KEYPOINTS = "keypoints"
-"""What the corners are called among the parts of an observation."""
+"""What corners or a view are called among the parts of an observation."""
+
+View = tuple[tuple[str, ...], int, Callable[[Values], Floats]]
+"""Names of variables, how many numbers are computed from them, and the function that does so."""
 
 CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
 """The corners of a box with edges of length 1, shape (8, 3)."""
@@ -130,27 +133,15 @@ def corners(size: Floats, position: Floats, orientation: Floats) -> Floats:
     return found
 
 
-@final
-class Keypoints:
-    """The corners of some bodies of a world.
+def keypoints(bodies: tuple[str, ...]) -> View:
+    """Describe the corners of some boxes: body by body, shape (24 n,) [m]."""
 
-    Args:
-        bodies: Names of blocks and goals.
-
-    Attributes:
-        names: The variables that they are computed from.
-        size: How many numbers they are: 24 for each body.
-    """
-
-    def __init__(self, bodies: tuple[str, ...]) -> None:
-        self._bodies = bodies
-        self.names = tuple(f"{body}.{part}" for body in bodies for part in _POSE)
-        self.size = CORNERS.size * len(bodies)
-
-    def observe(self, now: Values) -> Floats:
-        """Give the corners body by body, shape (24 n,) [m]."""
-        parts = [np.array([now[f"{body}.{part}"] for body in self._bodies]) for part in _POSE]
+    def observe(now: Values) -> Floats:
+        parts = [np.array([now[f"{body}.{part}"] for body in bodies]) for part in _POSE]
         return corners(*parts).ravel()
+
+    names = tuple(f"{body}.{part}" for body in bodies for part in _POSE)
+    return names, CORNERS.size * len(bodies), observe
 
 
 # --- vectors --------------------------------------------------------------------------------------
@@ -194,7 +185,7 @@ class Vector:
         declaration: Of the structure for which the layout holds.
         parts: In their order.
         normalize: Whether the numbers are scaled to [-1, 1].
-        keypoints: Where the corners come from, if they are a part.
+        keypoints: How corners or a view are computed, if they are a part.
 
     Attributes:
         names: The variables that have to be computed.
@@ -209,13 +200,13 @@ class Vector:
         parts: Sequence[ObservedPart],
         *,
         normalize: bool,
-        keypoints: Keypoints | None = None,
+        keypoints: View | None = None,
     ) -> None:
         self._world, self._keypoints = world, keypoints
         self._slices = _places(parts)
         self.layouts: Layouts = {"observation": self._slices}
         self.names = tuple(part.name for part in parts if part.name != KEYPOINTS)
-        self.names += () if keypoints is None else keypoints.names
+        self.names += () if keypoints is None else keypoints[0]
         low = np.concatenate([part.low for part in parts])
         high = np.concatenate([part.high for part in parts])
         bounded = (low > -WIDE) & (high < WIDE)
@@ -282,11 +273,20 @@ class Vector:
         raw = numbers[0].take(self._read)
         raw[self._shifts != 0.0] += self._shift
         if self._keypoints is not None:
-            raw = np.insert(raw, self._slices[KEYPOINTS].start, self._keypoints.observe(now))
+            raw = np.insert(raw, self._slices[KEYPOINTS].start, self._keypoints[2](now))
         raw = self._sensed(raw) if self._noise else raw
         scale_rows(raw[None], FIRST, np.arange(raw.size), np.zeros(raw.size), self._scales, found)
         for place in self._turns:
             found[:, place] *= _signs(found[:, place])
+        return shown
+
+    def observe_values(self, values: Values) -> NDArray[np.float32]:
+        """Give the observation of other values of what is observed, without noise, shape (n,)."""
+        seen = {} if self._keypoints is None else {KEYPOINTS: self._keypoints[2](values)}
+        raw = np.concatenate([np.ravel({**values, **seen}[name]) for name in self._slices])
+        found: NDArray[np.float32] = np.empty((1, self._size), dtype=np.float32)
+        scale_rows(raw[None], FIRST, np.arange(raw.size), np.zeros(raw.size), self._scales, found)
+        shown: NDArray[np.float32] = found[0]
         return shown
 
     def _sensed(self, raw: Floats) -> Floats:

@@ -356,6 +356,30 @@ class Task(ABC):
         """
         raise UnknownOption("goals of", self.name, ("a task with goals",))
 
+    def view(self) -> tuple[tuple[str, ...], int, Callable[[Values], Floats]] | None:
+        """Describe what a hand sees of the system, if the task knows such a thing.
+
+        Returns:
+            Names of variables, how many numbers it is, and a function of their values that gives
+            these numbers.
+        """
+        return None
+
+    def symmetries(
+        self, values: Values, names: Iterable[str]
+    ) -> Iterable[tuple[Values, Sequence[int]]]:
+        """List scenes in which the same is right as in this one, but for the order of actions.
+
+        Args:
+            values: Of the variables.
+            names: Of those that are wanted.
+
+        Returns:
+            For each such scene the values of these variables, and which number of an action in
+            the present scene each number of the action there is; none where there is no symmetry.
+        """
+        return ()
+
     def published_overlap(self, values: Values) -> float | None:
         """Compute the fractional success as CausalWorld 1.2 does; None if it has no such task."""
         return None

@@ -42,8 +42,6 @@ class Common(TypedDict, total=False):
         success: What counts in place of the usual goal: ``(function, "parent", …)``, a function of
             variables of the task that gives a number in [0, 1], or 0 and 1. It becomes
             ``fractional_success``, and more than 0.9 of it is ``success``.
-        views: Whether each block that has a goal has a readout ``BLOCK.view``: what a hand sees of
-            it, in its own frame; see ``scm_world.tasks.trifinger.views``.
     """
 
     weights: str | Mapping[str, float]
@@ -53,7 +51,6 @@ class Common(TypedDict, total=False):
     terms: Iterable[Measured | str]
     joint_positions: Sequence[float] | None
     success: Any
-    views: bool
 
 
 def resolve(

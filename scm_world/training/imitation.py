@@ -87,7 +87,9 @@ class Lesson(Frozen):
             episode has one between 0 and that.
         share: Of the control steps in which the network acts in those rounds, on average.
         stretch: Control steps that it acts at a stretch, on average.
-        keep: Fractional success of an episode, in the end, that is learned from.
+        keep: Fractional success of an episode of the teacher, in the end, that is learned from.
+        symmetric: Whether each control step is also shown as the task's symmetries have it: the
+            robot with three fingers looks the same after a third of a turn.
         observations: Of the network: ``"plain"``, or ``"privileged"``: with every causal parameter.
         network: What learns.
         updates: Steps of the optimizer, each time.
@@ -112,6 +114,7 @@ class Lesson(Frozen):
     share: Annotated[float, Field(ge=0.0, le=0.5)] = 0.3
     stretch: Annotated[float, Field(ge=1.0, allow_inf_nan=False)] = 10.0
     keep: Share = 0.9
+    symmetric: bool = False
     observations: Observations = "plain"
     network: Network = Field(default_factory=lambda: Network(activation="relu"))
     updates: Count = 20_000
@@ -310,7 +313,7 @@ def demonstrated(
             scores.append(float(info[told[0]]))
     finally:
         runner.close()
-    kept = np.array(scores) >= lesson.keep if learner is None else np.full(len(scores), True)
+    kept = np.array(scores) >= lesson.keep
     empty = slice(0, 0)
     return Demonstrations(
         np.concatenate([seen[0][empty], *(one for one, k in zip(seen, kept, strict=True) if k)]),
@@ -336,6 +339,11 @@ def _episode(
     while not over:
         right = np.clip(env.toward(teacher(env.world)), -1.0, 1.0)
         pairs.append((np.array(observation, np.float32), right.astype(np.float32)))
+        if lesson.symmetric:
+            values = env.world.evaluate(())
+            for scene, order in env.world.task.symmetries(values, env.observed or ()):
+                seen = env.observe_values(scene)
+                pairs.append((seen, right[list(order)].astype(np.float32)))
         if learner is not None and random.uniform() < 1.0 / lesson.stretch:
             learns = random.uniform() < share
         action = learner(observation) if learner is not None and learns else right
@@ -406,7 +414,7 @@ def _recorded(recording: Recording, keep: float) -> Demonstrations:
 
 
 def fitted(
-    shown: Demonstrations, lesson: Lesson, *, seed: int, last: bool = True
+    shown: Demonstrations, lesson: Lesson, *, seed: int
 ) -> tuple[dict[str, NDArray[np.float32]], float]:
     """Fit a network to demonstrations, by Adam on Huber's loss.
 
@@ -441,11 +449,10 @@ def fitted(
             width = hidden
         network = torch.nn.Sequential(*layers, torch.nn.Linear(width, done.shape[1]))
         optimizer = torch.optim.Adam(network.parameters(), lr=lesson.rate)
-        updates = lesson.updates if last else max(lesson.updates // 3, 1)
         falling = torch.optim.lr_scheduler.CosineAnnealingLR(
-            optimizer, updates, eta_min=0.01 * lesson.rate
+            optimizer, lesson.updates, eta_min=0.01 * lesson.rate
         )
-        for _ in range(updates):
+        for _ in range(lesson.updates):
             rows = torch.randint(0, len(seen), (lesson.batch,))
             loss = torch.nn.functional.smooth_l1_loss(network(seen[rows]), done[rows])
             optimizer.zero_grad(set_to_none=True)
@@ -453,7 +460,7 @@ def fitted(
             optimizer.step()
             falling.step()
             losses.append(loss.item())
-    last = float(np.mean(losses[-max(updates // 10, 1) :]))
+    last = float(np.mean(losses[-max(lesson.updates // 10, 1) :]))
     if not np.isfinite(last):
         raise ModelError(["the loss is no finite number any more: take a smaller rate"])
     arrays = [tensor.detach().numpy().astype(np.float64) for tensor in network.parameters()]
@@ -579,7 +586,7 @@ def clone(
                 pairs = joined(shown)
                 ended = f"{int(pairs.kept.sum())} of {len(pairs.kept)} episodes"
                 say(f"round {round_}: learns from {len(pairs):,} control steps, of {ended}")
-                tensors, loss = fitted(pairs, lesson, seed=number, last=round_ == lesson.rounds)
+                tensors, loss = fitted(pairs, lesson, seed=number)
                 made_with = {**versions(engine), "torch": str(torch.__version__)}
                 card = {
                     "lesson": lesson.about(),

@@ -342,18 +342,29 @@ _CARRYING: Fields = {
 _PICKING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_center": 0.0}}
 _PLACING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_goal": 0.0}}
 
-_REACTING: Fields = {
-    "delta_origin": "command",
-    "observation_mode": "custom",
-    "observe": [
-        *("joint_positions", "end_effector_positions", "action"),
-        *(f"tool_block.{part}" for part in (*_POSE, "size")),
-        *(f"goal_block.{part}" for part in _POSE),
-    ],
-}
-"""What a grasp by feedback reacts to, and actions relative to its command. Neither velocities nor
-torques are observed, in which engines differ most. With relative commands a network corrects errors
-until they are gone, whatever the fingers weigh."""
+
+def _reacting(*pairs: tuple[str, str], **task_options: Any) -> Fields:
+    """Return what a grasp by feedback reacts to, and actions relative to its command.
+
+    Neither velocities nor torques are observed, in which engines differ most. With relative
+    commands a network corrects errors until they are gone, whatever the fingers weigh.
+
+    Args:
+        pairs: Blocks, each with its goal.
+        task_options: Further ones.
+    """
+    robot = ("joint_positions", "end_effector_positions", "action")
+    return {
+        **({"task_options": task_options} if task_options else {}),
+        "delta_origin": "command",
+        "observation_mode": "custom",
+        "observe": [*robot, *(f"{body}.cartesian_position" for pair in pairs for body in pair)],
+        "keypoints": "view",
+    }
+
+
+_ONE = ("tool_block", "goal_block")
+_TWO = tuple((f"tool_block_{k}", f"goal_block_{k}") for k in (1, 2))
 
 _FROM_A_CLONE: Fields = {
     "network": {"activation": "relu", "log_std": -3.0},
@@ -400,38 +411,37 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
         },
     },
     "picking": {
-        None: {"env": {"task_options": _PICKING, **_REACTING}, "curriculum": 1},
+        None: {"env": _reacting(_ONE, **_PICKING), "curriculum": 1},
         "ppo": _FROM_A_CLONE,
     },
     "pick_and_place": {
-        None: {"env": {"task_options": _PLACING}, "curriculum": 1},
+        None: {"env": _reacting(_ONE, **_PLACING), "curriculum": 1},
         "ppo": _FROM_A_CLONE,
     },
-    "stacking2": {None: {"curriculum": 1}, "ppo": _FROM_A_CLONE},
+    "stacking2": {None: {"env": _reacting(*_TWO), "curriculum": 1}, "ppo": _FROM_A_CLONE},
 }
 """What differs from that, by task and algorithm."""
 
 _BY_FEEDBACK: Fields = {
     "teacher": "feedback",
-    "env": {**ENV, **_REACTING},
+    "env": {**ENV, **_reacting(_ONE)},
     "protocols": ("P7", "P10"),
-    "episodes": 3_000,
+    "episodes": 1_500,
     "rounds": 0,
     "noise": 0.05,
     "keep": 0.5,
+    "symmetric": True,
     "updates": 30_000,
     "batch": 1_024,
     "trials": {"protocols": ("P4", "P5", "P7", "P10"), "episodes": 20},
 }
 """A teacher whose actions follow from the present shows much of A."""
 
-_PLACED: Fields = {"protocols": ("P1", "P5"), "episodes": 400, "rounds": 0}
-
 LESSONS: Mapping[str, Fields] = {
     "pushing": _BY_FEEDBACK,
     "picking": _BY_FEEDBACK,
-    "pick_and_place": _PLACED,
-    "stacking2": {**_PLACED, "episodes": 350},
+    "pick_and_place": _BY_FEEDBACK,
+    "stacking2": {**_BY_FEEDBACK, "env": {**ENV, **_reacting(*_TWO)}},
 }
 """What differs from the usual lesson of imitation, by task."""
 

@@ -100,7 +100,6 @@ class TriFingerTask(Task):
             one another as it likes, under the conventions of the predecessor.
         start: Where the robot begins, shape (9,) [rad].
         success: What counts in place of the usual goal, if anything; see ``Common``.
-        views: Whether blocks have a ``view``; see ``Common``.
     """
 
     action_modes = tuple(ACTIONS)
@@ -121,7 +120,6 @@ class TriFingerTask(Task):
     unchecked: ClassVar[tuple[str, ...]] = ()
     rest: ClassVar[tuple[float, ...]] = hardware.REST
     success: Any = None
-    views: bool = False
 
     def __init__(self, **common: Unpack[Common]) -> None:
         unknown = sorted(common.keys() - Common.__annotations__.keys())
@@ -129,7 +127,6 @@ class TriFingerTask(Task):
             raise UnknownOption(f"option of {self.name}", unknown[0], self.arguments())
         self.terms = further_terms(common.get("terms", ()), self.default_weights, self.ready_terms)
         self.weights = resolve(self.default_weights, self.paper_weights, common, self.terms)
-        self.views = bool(common.get("views", False))
         if common.get("success") is not None:
             self.success = common["success"]
         given = common.get("joint_positions")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,7 +26,8 @@ from scm_world.tasks.trifinger.base import (
     observe_tool,
 )
 from scm_world.tasks.trifinger.feasibility import fingers_reach
-from scm_world.tasks.trifinger.views import seen
+from scm_world.tasks.trifinger.symmetry import swapped, turned
+from scm_world.tasks.trifinger.views import SIZE, view
 from scm_world.variables import Function, Measured, Variable
 from scm_world.variables.mechanisms import Stacked
 
@@ -128,8 +130,6 @@ class Building(TriFingerTask):
         yield succeeded()
         yield from self.terms
         yield reward(self.weights)
-        for goal, tool in self.targets().items() if self.views else ():
-            yield seen(tool, goal)
 
     def fractional_success(self) -> Measured:
         """Declare how much of the goals is filled."""
@@ -172,6 +172,27 @@ class Building(TriFingerTask):
     def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
         """Compute how much of the desired boxes the achieved ones fill, shape (...)."""
         return self._fraction(achieved, desired, aligned=self.conventions.aligned_boxes)
+
+    def view(self) -> tuple[tuple[str, ...], int, Callable[[Values], Floats]] | None:
+        """Describe what a hand sees of the blocks that have goals, in their own frames."""
+        parts = [
+            (TIPS, *(f"{tool}.{part}" for part in _POSE), *(f"{goal}.{p}" for p in _POSE[1:]))
+            for goal, tool in self.targets().items()
+        ]
+
+        def seen(values: Values) -> Floats:
+            return np.concatenate([view(*(values[name] for name in names)) for names in parts])
+
+        return tuple(dict.fromkeys(itertools.chain(*parts))), SIZE * len(parts), seen
+
+    def symmetries(
+        self, values: Values, names: Iterable[str]
+    ) -> Iterable[tuple[Values, Sequence[int]]]:
+        """Turn the scene by one and by two thirds of a turn; actions are of joints."""
+        bodies = (*self.tools(), *self.targets())
+        for thirds in (1, 2):
+            order = swapped(np.arange(float(hardware.N_JOINTS)), thirds).astype(int).tolist()
+            yield turned(values, names, thirds, bodies), order
 
     def published_overlap(self, values: Values) -> float | None:
         """Compute the overlap of the axis-aligned boxes around blocks and around goals."""

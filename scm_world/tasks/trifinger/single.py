@@ -8,8 +8,8 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from scm_world._types import ArrayLike, Floats
-from scm_world.errors import ModelError, UnknownOption
+from scm_world._types import ArrayLike, Floats, Values
+from scm_world.errors import ModelError
 from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.hulls import Hull, extents
 from scm_world.tasks.base import checked
@@ -83,8 +83,6 @@ class OneBlock(Building):
             raise ModelError(
                 [f"shape must be a Hull: load_hull(path) or hull_of(points); {shape!r}"]
             )
-        if shape is not None and self.views:
-            raise UnknownOption("views", True, ("False: a view is of a box, not of a hull",))
         self.shape = shape
         self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASSES.bounds)
         self._turns = {
@@ -225,6 +223,10 @@ class OneBlock(Building):
             mechanism=Function(shapes.hull_filled if exact else shapes.hull_aligned),
             doc="Fraction of the volume of the goal that the block fills.",
         )
+
+    def view(self) -> tuple[tuple[str, ...], int, Callable[[Values], Floats]] | None:
+        """Describe what a hand sees of the block, if that is a box."""
+        return super().view() if self.shape is None else None
 
     def _fraction(self, achieved: ArrayLike, desired: ArrayLike, *, aligned: bool) -> Floats:
         if self.shape is None:

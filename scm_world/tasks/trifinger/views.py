@@ -15,10 +15,10 @@ from numba import njit
 
 from scm_world._types import Floats
 from scm_world.geometry.rotations import rotation_kernel
-from scm_world.variables import Box, Function, Measured
 
 QUARTER = 0.5 * math.pi
-_POSE = ("size", "cartesian_position", "orientation")
+SIZE = 20
+"""Of a view."""
 
 
 @njit(cache=True)
@@ -64,7 +64,7 @@ def view(
     quarters = round(yaw / QUARTER)
     own = yaw - quarters * QUARTER
     cos, sin = math.cos(own), math.sin(own)
-    out = np.empty(20)
+    out = np.empty(SIZE)
     for point in range(4):
         at = 3 * point
         if point < 3:
@@ -82,16 +82,3 @@ def view(
     out[17] = turn - QUARTER * round(turn / QUARTER)
     out[18], out[19] = cos * lean_x + sin * lean_y, cos * lean_y - sin * lean_x
     return out
-
-
-def seen(block: str, goal: str) -> Measured:
-    """Declare the view of a block that has a goal."""
-    parts = tuple(f"{block}.{part}" for part in _POSE)
-    return Measured(
-        name=f"{block}.view",
-        shape=(20,),
-        bounds=Box(-4.0, 4.0),
-        parents=("end_effector_positions", *parts, *(f"{goal}.{part}" for part in _POSE[1:])),
-        mechanism=Function(view),
-        doc="Fingertips, goal, edges, yaw, turn and lean of the block, in its own frame.",
-    )
