@@ -138,6 +138,8 @@ def clone(
         protocols: What varies in them: names with commas.
         noise: Largest noise of actions in them.
         rounds: Further rounds, in which the network acts, too.
+        backend: Physics backend, or several with commas, which take turns; by default that of the
+            task.
         out: Folder for all files; by default under scm-world-results.
     """
     from scm_world.policies.cards import COMMON, FORM, OPTIONS, PolicyAbout

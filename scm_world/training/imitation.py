@@ -340,8 +340,8 @@ def _episode(
         right = np.clip(env.toward(teacher(env.world)), -1.0, 1.0)
         pairs.append((np.array(observation, np.float32), right.astype(np.float32)))
         if lesson.symmetric:
-            values = env.world.evaluate(())
-            for scene, order in env.world.task.symmetries(values, env.observed or ()):
+            names = env.observed or ()
+            for scene, order in env.world.task.symmetries(env.world.evaluate(names), names):
                 seen = env.observe_values(scene)
                 pairs.append((seen, right[list(order)].astype(np.float32)))
         if learner is not None and random.uniform() < 1.0 / lesson.stretch:
@@ -537,6 +537,8 @@ def clone(
     network acts now and then, the actions of the teacher are recorded (DAgger), and the network is
     fitted to all demonstrations.
 
+    With several backends, files of episodes come from them in turns.
+
     The policy of a round is written before it is evaluated. If ``out`` holds a part of the same
     work, it resumes after the last whole file of episodes, the last fit or the last evaluation.
     The result follows from the lesson, the seed, the backend and the versions.
@@ -548,7 +550,7 @@ def clone(
         lesson: What is shown, and how it is learned.
         out: Folder for all files.
         seed: Of everything that is drawn.
-        backend: Its name.
+        backend: Its name, or several with commas; evaluations are on the first one.
         progress: Called with how many episodes have been shown, and how many will be.
         tell: Called with a sentence about each event.
 
@@ -565,13 +567,13 @@ def clone(
     """
     torch: Any = load("torch", "torch", "train")
     number, folder, say = whole_number("seed", seed, least=0), Path(out), tell or (lambda _: None)
-    shown, digest, engine = [], None, ""
+    shown, digest, engines = [], None, [""]
     if source is not None:
         given, lesson = given_demonstrations(source, lesson)
         shown.append(given)
         digest = sha256(given.observations.tobytes() + given.actions.tobytes()).hexdigest()
     else:
-        engine = _checked(lesson, backend, number)
+        engines = [_checked(lesson, name, number) for name in backend.split(",")]
     identity = {"lesson": lesson.about(), "seed": number, "backend": backend, "recording": digest}
     policies: list[MlpPolicy] = []
     with locked(folder), torch_threads(1):
@@ -587,7 +589,9 @@ def clone(
                 ended = f"{int(pairs.kept.sum())} of {len(pairs.kept)} episodes"
                 say(f"round {round_}: learns from {len(pairs):,} control steps, of {ended}")
                 tensors, loss = fitted(pairs, lesson, seed=number)
-                made_with = {**versions(engine), "torch": str(torch.__version__)}
+                made_with = {"torch": str(torch.__version__)}
+                for engine in engines:
+                    made_with |= versions(engine)
                 card = {
                     "lesson": lesson.about(),
                     "seed": number,
@@ -609,7 +613,8 @@ def clone(
             if "trials" not in policy.about.card:
                 scores: dict[str, float] = {}
                 if lesson.trials.protocols:
-                    given_to = (lesson.task, lesson.options, lesson.trials, backend)
+                    first = backend.partition(",")[0]
+                    given_to = (lesson.task, lesson.options, lesson.trials, first)
                     _, scores = scored(policy, *given_to)
                     say(f"round {round_}: {words(scores)}")
                 save_policy(path, policy, policy.about.with_card(trials=scores))
@@ -641,9 +646,16 @@ def _checked(lesson: Lesson, backend: str, seed: int) -> str:
 
 
 def _collected(
-    folder: Path, lesson: Lesson, progress: Progress | None, *, round_: int, **how: Any
+    folder: Path,
+    lesson: Lesson,
+    progress: Progress | None,
+    *,
+    backend: str,
+    round_: int,
+    **how: Any,
 ) -> list[Demonstrations]:
     """Record a round of demonstrations, or read the ones of an earlier call."""
+    backends = backend.split(",")
     first = 0 if round_ == 0 else lesson.episodes + (round_ - 1) * lesson.more
     stop = first + (lesson.episodes if round_ == 0 else lesson.more)
     found = []
@@ -653,7 +665,8 @@ def _collected(
         made(path.parent)
         if not path.exists():
             stream = io.BytesIO()
-            shown = demonstrated(lesson, numbers, round_=round_, **how)
+            by = backends[begin // SHARD % len(backends)]
+            shown = demonstrated(lesson, numbers, backend=by, round_=round_, **how)
             np.savez(stream, allow_pickle=False, **vars(shown))
             write_durably(path, stream.getvalue())
         found.append(_load(path))

@@ -10,7 +10,6 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import UnknownOption
-from scm_world.geometry.rotations import canonical, quaternion_product
 from scm_world.tasks.trifinger.kinematics import N_FINGERS
 
 JOINTS = ("joint_positions", "joint_velocities", "joint_torques", "action")
@@ -44,7 +43,7 @@ def turned(
     angle = 2.0 * math.pi / 3.0 * thirds
     cos, sin = math.cos(angle), math.sin(angle)
     axes = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    by = np.array([0.0, 0.0, math.sin(angle / 2.0), math.cos(angle / 2.0)])
+    half, rest = math.sin(angle / 2.0), math.cos(angle / 2.0)
 
     def one(name: str) -> Any:
         body, _, part = name.rpartition(".")
@@ -56,7 +55,11 @@ def turned(
         if part in ("cartesian_position", "linear_velocity"):
             return axes @ value
         if part == "orientation":
-            return canonical(quaternion_product(by, value))
+            x, y, z, w = value.tolist()
+            turn = np.array(
+                [rest * x - half * y, rest * y + half * x, rest * z + half * w, rest * w - half * z]
+            )
+            return turn if turn[3] >= 0.0 else -turn
         if part in UNTURNED and body in bodies:
             return value
         allowed = (*JOINTS, "end_effector_positions", "poses and sizes of blocks and goals")
