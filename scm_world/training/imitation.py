@@ -341,9 +341,13 @@ def _episode(
         pairs.append((np.array(observation, np.float32), right.astype(np.float32)))
         if lesson.symmetric:
             names = env.observed or ()
-            for scene, order in env.world.task.symmetries(env.world.evaluate(names), names):
-                seen = env.observe_values(scene)
-                pairs.append((seen, right[list(order)].astype(np.float32)))
+            scenes = list(env.world.task.symmetries(env.world.evaluate(names), names))
+            if not scenes:
+                allowed = (f"False: {lesson.task} has no symmetries",)
+                raise UnknownOption("symmetric of a lesson", True, allowed)
+            for scene, order in scenes:
+                turned = right[list(order)].astype(np.float32)
+                pairs.append((env.observe_values(scene), turned))
         if learner is not None and random.uniform() < 1.0 / lesson.stretch:
             learns = random.uniform() < share
         action = learner(observation) if learner is not None and learns else right

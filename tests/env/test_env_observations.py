@@ -10,6 +10,7 @@ from envs import MADE, PUSHING, REACHING, make, roll
 
 from scm_world.backends.renderer import goal_pixels
 from scm_world.env.vector import WIDE, bounds, corners
+from scm_world.errors import UnknownOption
 from scm_world.geometry import from_rotation_vector, rotation_matrix
 from scm_world.graph import SCM
 from scm_world.tasks.trifinger.cameras import CAMERAS
@@ -127,6 +128,45 @@ def test_keypoints_follow_block_and_goal() -> None:
     env.reset(seed=0, options={"do": {"tool_block.cylindrical_position": [0.1, 0.0, 0.0325]}})
     found = env.unwrapped.observe()[env.unwrapped.layout["keypoints"]].reshape(2, 8, 3)
     np.testing.assert_allclose(found.mean(axis=1), [[0.1, 0, 0.0325], [0, 0.08, 0.0325]], atol=1e-7)
+
+
+def test_a_view_is_the_same_however_axes_are_named() -> None:
+    """Quarter turns with exchanged edges, and half turns of the goal, are one box and one view."""
+    env = make(keypoints="view", normalize_observations=False)
+
+    def seen(size: Any, turn: float, goal: float, place: float = 0.0) -> Any:
+        do = {
+            "block.size": size,
+            "tool_block.cylindrical_position": [0.05, place, size[2] / 2],
+            "tool_block.euler_orientation": [0.0, 0.0, turn],
+            "goal_block.euler_orientation": [0.0, 0.0, goal],
+        }
+        env.reset(seed=0, options={"do": do})
+        return env.unwrapped.observe()[env.unwrapped.layout["keypoints"]]
+
+    long, wide, quarter = [0.07, 0.055, 0.06], [0.055, 0.07, 0.06], np.pi / 2
+    view = seen(long, 0.3, 0.7)
+    np.testing.assert_allclose(view[12:18], [*long, 0.3, 0.4, 0.4], atol=1e-6)
+    for other in (
+        seen(long, 0.3 + np.pi, 0.7),
+        seen(long, 0.3, 0.7 - np.pi),
+        seen(wide, 0.3 - quarter, 0.7 - quarter),
+        seen(wide, 0.3 + quarter, 0.7 - quarter),
+    ):
+        np.testing.assert_allclose(other, view, atol=1e-6)
+    assert not np.allclose(seen(wide, 0.3, 0.7), view, atol=1e-3)
+    tips = env.unwrapped.world["end_effector_positions"].reshape(3, 3)
+    own = (tips - env.unwrapped.world["tool_block.cartesian_position"]) @ rotation_matrix(
+        from_rotation_vector(np.array([0.0, 0.0, 0.3]))
+    )
+    np.testing.assert_allclose(view[:9].reshape(3, 3), own, atol=1e-6)
+
+
+def test_a_view_needs_boxes() -> None:
+    """Anything else is refused with what is allowed."""
+    for id_, asked in ((PUSHING, "corner"), (REACHING, "view")):
+        with pytest.raises(UnknownOption, match="keypoints"):
+            make(id_, keypoints=asked)
 
 
 def test_no_sensor_noise_costs_no_bit() -> None:

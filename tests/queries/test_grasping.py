@@ -16,8 +16,9 @@ from scm_world.tasks import Picking
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping import Feedback, Grasp, Pace
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, body_of, smallest, turns
+from scm_world.tasks.trifinger.grasping.feedback import TOUCHING, held
 from scm_world.tasks.trifinger.grasping.hand import Hand, carrying, pressing
-from scm_world.tasks.trifinger.grasping.ways import grips
+from scm_world.tasks.trifinger.grasping.ways import gripped
 
 MODE = "end_effector_positions"
 ENGINES = [
@@ -182,20 +183,32 @@ def test_strength_ends_where_a_joint_does_all_it_can() -> None:
     """Forces of that strength need the largest torque at one joint, and more at none."""
     hand = Hand(world_of("picking", "fake").evaluate(()), 0.04)
     joints, forces = np.array(hardware.REST), np.eye(3)
-    strength = hand.strength(joints, forces)
+    (strength,) = hand.strengths(joints[None], forces[None])
     torques = carrying(joints, hand.weights) + strength * pressing(joints, hand.height, forces)
     assert np.abs(torques).max() == pytest.approx(0.97 * 0.36)
 
 
 def test_grips_are_balanced() -> None:
     """Fingers press against one another, at the faces, and do not turn the block."""
+    table = gripped(0.03, 0.035, 0.0325)
+    assert {*table.used.sum(axis=1).tolist()} == {2, 3}
+    np.testing.assert_allclose(table.inward.sum(axis=1), 0.0, atol=1e-12)
+    moments = np.cross(table.touch, table.inward).sum(axis=1)
+    np.testing.assert_allclose(moments, 0.0, atol=1e-12)
+
+
+def test_a_grip_is_seen_from_where_fingertips_are() -> None:
+    """Fingers on opposite faces hold a block; fingers beside it or at one corner do not."""
     block = Cuboid("block", np.array([0.03, 0.035, 0.0325]), np.zeros(3), 0.0)
-    listed = list(grips(block))
-    assert {sum(grip.used) for grip in listed} == {2, 3}
-    for grip in listed:
-        np.testing.assert_allclose(grip.inward.sum(axis=0), 0.0, atol=1e-12)
-        moments = np.cross(grip.touch, grip.inward).sum(axis=0)
-        np.testing.assert_allclose(moments, 0.0, atol=1e-12)
+    table = gripped(*block.half.tolist())
+    for row in range(len(table.opening)):
+        grip, moved = table.grip(row), 0.004 * np.ones(3)
+        found = held(block, grip.touch + moved * (grip.inward == 0.0))
+        assert found is not None
+        np.testing.assert_array_equal(found.inward[list(grip.used)], grip.inward[list(grip.used)])
+        assert held(block, grip.points(1.1 * TOUCHING)) is None
+    corner = np.array([[0.0395, 0.0, 0.0], [0.0, 0.0445, 0.0], [0.2, 0.0, 0.0]])
+    assert held(block, corner) is None
 
 
 def test_a_cube_has_four_ways_to_stand() -> None:

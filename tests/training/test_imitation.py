@@ -31,6 +31,7 @@ SHORT = {"max_episode_length": 12}
 QUICK: dict[str, Any] = {
     "env": SHORT,
     "keep": 0.0,
+    "symmetric": False,
     "episodes": 2,
     "rounds": 1,
     "more": 1,
@@ -40,7 +41,7 @@ QUICK: dict[str, Any] = {
     "trials": {"protocols": []},
 }
 
-WIDTH = 44
+WIDTH = 53
 """Numbers that a policy of the usual lesson of picking observes."""
 
 
@@ -122,6 +123,39 @@ def test_who_learns_acts_but_does_not_teach() -> None:
     together = shown(1, constant(0.9), noise=0.0, share=0.5, stretch=1.0)
     assert not np.array_equal(alone.observations, together.observations)
     assert not (together.actions == np.float32(0.9)).all(axis=1).any()
+
+
+def test_symmetric_scenes_are_shown_besides() -> None:
+    """Each control step is followed by the same one, turned by one and by two thirds of a turn."""
+    plain, more = shown(1), shown(1, symmetric=True)
+    assert len(more) == 3 * len(plain)
+    np.testing.assert_array_equal(more.observations[::3], plain.observations)
+    np.testing.assert_array_equal(more.actions[::3], plain.actions)
+    first, once, twice = (more.actions[k::3].reshape(-1, 3, 3) for k in range(3))
+    np.testing.assert_array_equal(once, first[:, [1, 2, 0]])
+    np.testing.assert_array_equal(twice, first[:, [2, 0, 1]])
+    assert not np.allclose(more.observations[1::3], plain.observations)
+
+
+def test_a_task_without_symmetries_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is silently left out of a lesson."""
+    monkeypatch.setattr("scm_world.tasks.Picking.symmetries", lambda *_: ())
+    with pytest.raises(UnknownOption, match=r"symmetric.*False"):
+        shown(1, symmetric=True)
+
+
+def test_backends_take_turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of episodes come from several backends in turns, each as from that one alone."""
+    pytest.importorskip("torch")
+    pytest.importorskip("pybullet")
+    monkeypatch.setattr(imitation, "SHARD", 1)
+    how = lesson("picking", **{**QUICK, "rounds": 0})
+    found = clone(None, how, out=tmp_path, backend="mujoco,bullet")
+    assert {"mujoco", "bullet"} <= {*load_policy(found.policy).about.card["versions"]}  # type: ignore[misc]
+    for k, backend in enumerate(("mujoco", "bullet")):
+        alone = demonstrated(how, range(k, k + 1), backend=backend, seed=0)
+        with np.load(tmp_path / "demonstrations" / f"00-{k:06}.npz") as file:
+            np.testing.assert_array_equal(file["observations"], alone.observations)
 
 
 def test_what_ends_badly_is_left_out() -> None:

@@ -28,7 +28,7 @@ _ZERO, _UNTURNED = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 
 def described(
-    structure: TriFingerStructure, parameters: Parameters, mode: ControlMode, backend: str
+    structure: TriFingerStructure, parameters: Parameters, mode: ControlMode
 ) -> tuple[ModelBodies, Integers]:
     """Describe bodies, joints, shapes and servos.
 
@@ -36,7 +36,6 @@ def described(
         structure: The bodies that there are.
         parameters: All of them.
         mode: What a command means.
-        backend: Name of the engine: fingertips have their mass in different places.
 
     Returns:
         The description, and where each of its coordinates stands in the state vector. Angular
