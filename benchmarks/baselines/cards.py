@@ -9,7 +9,11 @@ from typing import Any
 from scm_world.evaluation.statistics import Interval
 from scm_world.policies import PolicyAbout
 
-SCORES = {"last_fractional_success": "last fractional success", "success": "success"}
+SCORES = {
+    "last_fractional_success": "last fractional success",
+    "success": "success",
+    "published_overlap": "published overlap",
+}
 """Columns of the table, and what they are called."""
 
 MAIN = next(iter(SCORES))
@@ -34,7 +38,8 @@ scm-world evaluate zoo:pushing --protocols P0,P5
 Scores are means over episodes with 95 % intervals; [Evaluation](evaluation.md) says what the
 protocols are and how scores are estimated. Columns of seeds have the same score of several seeds of
 the same training; a column with the name of a script says what one reaches that sees the whole
-world. `scm-world list --zoo` lists the policies. This page is written by
+world. The published overlap is the score of CausalWorld's actors, see
+[metrics](evaluation.md). `scm-world list --zoo` lists the policies. This page is written by
 `python -m benchmarks.baselines.publish`.
 """
 
@@ -110,20 +115,19 @@ def _table(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
     engines = list(dict.fromkeys(row["engine"] for row in listed))
     found = {(row["protocol"], row["engine"]): row for row in listed}
     varied = {row["protocol"]: row.get("varied", "") for row in listed}
-    more: dict[str, str] = {}
+    more = {entry: word for entry, word in SCORES.items() if any(entry in row for row in listed)}
     if any("seeds" in row for row in listed):
         more["seeds"] = "seeds"
     if ceilings := {row["ceiling"]["name"] for row in listed if "ceiling" in row}:
         more["ceiling"] = f"`{ceilings.pop()}`"
-    words = [*SCORES.values(), *more.values()]
-    heads = [f"{word}, {engine}" for engine in engines for word in words]
+    heads = [f"{word}, {engine}" for engine in engines for word in more.values()]
     yield f"| {' | '.join(('protocol', 'varied', *heads, 'episodes'))} |"
     yield "|---|---|" + "---:|" * (len(heads) + 1)
     for protocol, what in varied.items():
         cells = [
             _score(found[protocol, engine].get(entry)) if (protocol, engine) in found else "–"
             for engine in engines
-            for entry in (*SCORES, *more)
+            for entry in more
         ]
         counts = {row["n"] for row in listed if row["protocol"] == protocol}
         episodes = ", ".join(map(str, sorted(counts)))

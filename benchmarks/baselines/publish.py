@@ -70,6 +70,7 @@ def _rows(folder: Path, content: str, ceiling: str | None) -> Iterable[dict[str,
             scores: dict[str, Any] = {
                 metric: mine.score(protocol, metric, agent=agent, engine=engine).as_dict()
                 for metric in SCORES
+                if metric in mine.metrics
             }
             n = len(mine.only(engine=engine, protocol=protocol))
             where = {"engine": engine, "protocol": protocol, "varied": varied[protocol], "n": n}

@@ -90,9 +90,10 @@ class Choice:
             end = end.at(end.place + lifted(self._kept == goal), end.yaw)
             ways = [(start.at(end.place, start.yaw + turn), turn) for turn in turns(start, end)]
             move = self._best(tool, start, ways, release=not hangs)
-            if move is not None and (not hangs or move.grip.firm):
+            swings = hangs and end.bottom > ON_FLOOR  # held by two fingers in the air
+            if move is not None and (move.grip.firm or not swings):
                 return Job(tool, move, len(self._todo))
-            detour = self._detour(tool, ways, release=not hangs) or move
+            detour = self._detour(tool, ways, release=not hangs, firm=swings) or move
             if detour is not None:
                 return Job(tool, detour, len(self._todo) + (detour is not move))
             found = self._make_way(tool, end)
@@ -140,13 +141,16 @@ class Choice:
                 return Job(other, move, len(self._todo) + 1)
         return None
 
-    def _detour(self, tool: str, ways: list[Way], *, release: bool = True) -> Move | None:
+    def _detour(
+        self, tool: str, ways: list[Way], *, release: bool = True, firm: bool = False
+    ) -> Move | None:
         """Find a way to put a block down from where it can be carried on, or out of the way.
 
         Args:
             tool: The block.
             ways: Where it should go in the end; nowhere if empty.
             release: Whether it is let go there.
+            firm: Whether all fingers must hold it there.
         """
         start = self._bodies[tool]
         for stop, turn in self._stops(tool, ways):
@@ -155,7 +159,7 @@ class Choice:
                 continue
             rest = [(end, full - turn) for end, full in ways]
             after = self._best(tool, stop, rest, release=release)
-            if not ways or (after is not None and (release or after.grip.firm)):
+            if not ways or (after is not None and (after.grip.firm or not firm)):
                 return move
         return None
 
