@@ -192,6 +192,8 @@ class Observing:
         if pictures and appended:
             raise UnknownOption("appendix of a picture", "numbers", ("context='privileged'",))
         one_of("stack", self.stack, STACKS)
+        if self.keypoints not in (False, True, "view"):
+            raise UnknownOption("keypoints", self.keypoints, ("False", "True", "view"))
         for option, usual in (("cameras", None), ("image_size", None), ("stack", STACKS[0])):
             value = getattr(self, option)
             if value != usual and not pictures:
@@ -327,7 +329,6 @@ def _quiet(parts: Iterable[ObservedPart]) -> list[ObservedPart]:
 
 def _keypoints(declaration: CompiledTask, asked: bool | str) -> View:
     task = declaration.task
-    one_of("keypoints", asked, (False, True, "view"))
     view = keypoints((*task.tools(), *task.targets())) if asked is True else task.view()
     if not task.tools() or view is None:
         raise UnknownOption("keypoints", asked, ("False: the task has no blocks, or no boxes",))
