@@ -343,28 +343,25 @@ _PICKING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_ce
 _PLACING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_goal": 0.0}}
 
 
-def _reacting(*pairs: tuple[str, str], **task_options: Any) -> Fields:
+def _reacting(**task_options: Any) -> Fields:
     """Return what a grasp by feedback reacts to, and actions relative to its command.
 
     Neither velocities nor torques are observed, in which engines differ most. With relative
     commands a network corrects errors until they are gone, whatever the fingers weigh.
 
     Args:
-        pairs: Blocks, each with its goal.
-        task_options: Further ones.
+        task_options: Arguments of the task, if any.
     """
     robot = ("joint_positions", "end_effector_positions", "action")
+    bodies = (f"{body}.cartesian_position" for body in ("tool_block", "goal_block"))
     return {
         **({"task_options": task_options} if task_options else {}),
         "delta_origin": "command",
         "observation_mode": "custom",
-        "observe": [*robot, *(f"{body}.cartesian_position" for pair in pairs for body in pair)],
+        "observe": [*robot, *bodies],
         "keypoints": "view",
     }
 
-
-_ONE = ("tool_block", "goal_block")
-_TWO = tuple((f"tool_block_{k}", f"goal_block_{k}") for k in (1, 2))
 
 _FROM_A_CLONE: Fields = {
     "network": {"activation": "relu", "log_std": -3.0},
@@ -411,20 +408,20 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
         },
     },
     "picking": {
-        None: {"env": _reacting(_ONE, **_PICKING), "curriculum": 1},
+        None: {"env": _reacting(**_PICKING), "curriculum": 1},
         "ppo": _FROM_A_CLONE,
     },
     "pick_and_place": {
-        None: {"env": _reacting(_ONE, **_PLACING), "curriculum": 1},
+        None: {"env": _reacting(**_PLACING), "curriculum": 1},
         "ppo": _FROM_A_CLONE,
     },
-    "stacking2": {None: {"env": _reacting(*_TWO), "curriculum": 1}, "ppo": _FROM_A_CLONE},
+    "stacking2": {None: {"curriculum": 1}, "ppo": _FROM_A_CLONE},
 }
 """What differs from that, by task and algorithm."""
 
 _BY_FEEDBACK: Fields = {
     "teacher": "feedback",
-    "env": {**ENV, **_reacting(_ONE)},
+    "env": {**ENV, **_reacting()},
     "protocols": ("P7", "P10"),
     "episodes": 1_500,
     "rounds": 0,
@@ -441,7 +438,7 @@ LESSONS: Mapping[str, Fields] = {
     "pushing": _BY_FEEDBACK,
     "picking": _BY_FEEDBACK,
     "pick_and_place": _BY_FEEDBACK,
-    "stacking2": {**_BY_FEEDBACK, "env": {**ENV, **_reacting(*_TWO)}},
+    "stacking2": {"protocols": ("P1", "P5"), "episodes": 350, "rounds": 0},
 }
 """What differs from the usual lesson of imitation, by task."""
 
