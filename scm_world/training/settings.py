@@ -412,7 +412,7 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
         "ppo": _FROM_A_CLONE,
     },
     "pick_and_place": {
-        None: {"env": _reacting(**_PLACING), "curriculum": 1},
+        None: {"env": {"task_options": _PLACING}, "curriculum": 1},
         "ppo": _FROM_A_CLONE,
     },
     "stacking2": {None: {"curriculum": 1}, "ppo": _FROM_A_CLONE},
@@ -434,11 +434,13 @@ _BY_FEEDBACK: Fields = {
 }
 """A teacher whose actions follow from the present shows much of A."""
 
+_PLACED: Fields = {"protocols": ("P1", "P5"), "episodes": 400, "rounds": 0}
+
 LESSONS: Mapping[str, Fields] = {
     "pushing": _BY_FEEDBACK,
     "picking": _BY_FEEDBACK,
-    "pick_and_place": _BY_FEEDBACK,
-    "stacking2": {"protocols": ("P1", "P5"), "episodes": 350, "rounds": 0},
+    "pick_and_place": _PLACED,
+    "stacking2": {**_PLACED, "episodes": 350},
 }
 """What differs from the usual lesson of imitation, by task."""
 

@@ -28,7 +28,8 @@ BESIDE, ASIDE = 0.012, 0.015  # [m] likewise, beyond the opening, of those that 
 NEAR, FAR = 0.008, 0.025  # [m] from above a grip: fingertips come down; they go up first
 FUNNEL = 2.5  # how much higher fingertips are for what they are too far aside
 UNEVEN = 0.012  # [m] by which the fingers of two faces may be aside of one another
-PRESS = 2.0  # [N] with which a block is pressed, if fingers can, whatever it weighs
+PRESS, LIGHT = 2.0, 1.5  # [N] with which a block is pressed, if fingers can, that wants less
+FIRMLY = 1.5  # with which a heavier one is pressed, as a multiple of what it wants
 LAG, TWIST = 0.015, 0.2  # [m], [rad] that a held block may be behind its command
 BACK = 0.0005  # [m] by which slipping fingertips are brought back
 PUSHED = 0.06  # [rad] that a command changes in a step while fingers press
@@ -232,7 +233,8 @@ class Following:
         sight, grip = self._sight, move.grip
         hand, joints, tool = sight.hand, sight.joints, str(self._tool)
         used, shares = np.array(grip.used), np.abs(grip.inward).max(axis=1)
-        press = min(PRESS, move.strength)
+        wanted = sight.wanted(tool)
+        press = min(PRESS if wanted < LIGHT else FIRMLY * wanted, move.strength)
         forces = press * grip.inward @ turn_about_z(body.yaw).T
         forces[:, 2] += sight.weight(tool) * shares / shares.sum()
         more = hand.more(joints, forces)
