@@ -15,7 +15,7 @@ from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, smallest, turn_about_z, unit
 from scm_world.tasks.trifinger.grasping.choice import Choice
 from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand
-from scm_world.tasks.trifinger.grasping.ways import CLEARANCE, OPENINGS, Grip, Move, Planner
+from scm_world.tasks.trifinger.grasping.ways import CLEARANCE, EDGE, OPENINGS, Grip, Move, Planner
 
 FREE = np.zeros((3, 3))
 TRAVEL, CLOSE = 0.022, 0.006  # [m] per control step, of fingertips far from a block, and beside it
@@ -280,7 +280,7 @@ def held(body: Cuboid, own: Floats) -> Grip | None:
     each = np.arange(3)
     for axis in (0, 1):
         along, out = own[:, 1 - axis], body.half[axis] + TIP_RADIUS
-        on_face = np.abs(np.delete(own, axis, axis=1)) < np.delete(body.half, axis)
+        on_face = np.abs(np.delete(own, axis, axis=1)) < np.delete(body.half, axis) - EDGE
         touches = (np.abs(np.abs(own[:, axis]) - out) < TOUCHING) & on_face.all(axis=1)
         side = np.where(touches, np.sign(own[:, axis]), 0.0)
         one, two = side > 0.0, side < 0.0
