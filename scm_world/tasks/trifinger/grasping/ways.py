@@ -77,8 +77,6 @@ class Grips:
 
     def only(self, rows: Any) -> Grips:
         """Return some of them, by a mask or by their numbers."""
-        rows = np.asarray(rows)
-        rows = rows if rows.size else np.empty(0, dtype=np.int64)
         return Grips(self.touch[rows], self.inward[rows], self.used[rows], self.opening[rows])
 
     def grip(self, row: int) -> Grip:
@@ -200,8 +198,9 @@ class Planner:
             for end, turn in ends
             if all(end.depth_in(other) < CROWDED for other in self._others)
         ]
-        over = self._above(start)
-        table = gripped(*start.half.tolist()) if ways else gripped(*start.half.tolist()).only([])
+        if not ways:
+            return None
+        over, table = self._above(start), gripped(*start.half.tolist())
         table = table.only(self._opens(table, start, over))
         first = self._strengths(table, start)
         table, first = table.only(first > 0.0), first[first > 0.0]
