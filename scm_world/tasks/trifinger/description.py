@@ -28,7 +28,7 @@ _ZERO, _UNTURNED = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 
 def described(
-    structure: TriFingerStructure, parameters: Parameters, mode: ControlMode
+    structure: TriFingerStructure, parameters: Parameters, mode: ControlMode, backend: str
 ) -> tuple[ModelBodies, Integers]:
     """Describe bodies, joints, shapes and servos.
 
@@ -36,6 +36,7 @@ def described(
         structure: The bodies that there are.
         parameters: All of them.
         mode: What a command means.
+        backend: Name of the engine: fingertips have their mass in different places.
 
     Returns:
         The description, and where each of its coordinates stands in the state vector. Angular
@@ -94,7 +95,7 @@ def described(
             geoms.append(_capsule(name, parent, hardware.COLLISION[part], grip))
         tip = Body(
             f"robot_finger_{finger}_tip", parent, hardware.TIP_ORIGIN, _UNTURNED,
-            hardware.TIP_MASS, hardware.TIP_INERTIA, _ZERO, _UNTURNED,
+            hardware.TIP_MASS, hardware.TIP_INERTIA, hardware.TIP_CENTER[backend], _UNTURNED,
         )  # fmt: skip
         bodies.append(tip)
         geoms.append(_capsule(tip.name, len(bodies) - 1, hardware.COLLISION["tip"], grip))

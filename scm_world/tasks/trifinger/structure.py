@@ -93,7 +93,7 @@ class TriFingerStructure:
     def described(self, parameters: Parameters, mode: ControlMode, backend: str) -> tuple[Any, Any]:
         """Describe all bodies; see ``description``."""
         module = import_module("scm_world.tasks.trifinger.description")
-        return module.described(self, parameters, mode)  # type: ignore[no-any-return]
+        return module.described(self, parameters, mode, backend)  # type: ignore[no-any-return]
 
     def hull(self, block: str) -> Hull | None:
         """Give the shape of a block that is no box; None for a box."""

@@ -252,6 +252,7 @@ def _add_robot(spec: mujoco.MjSpec, contact: tuple[float, float]) -> None:
             _add_capsule(body, finger, SHAPES[index - 1])
         tip = body.add_body(name=f"robot_finger_{finger}_tip", pos=hardware.TIP_ORIGIN)
         tip.mass, tip.inertia, tip.explicitinertial = hardware.TIP_MASS, hardware.TIP_INERTIA, True
+        tip.ipos = hardware.TIP_CENTER["mujoco"]
         _add_capsule(tip, finger, "tip")
     for purpose, limit in (("servo", _TORQUE_LIMIT), ("safety", 0.0)):
         for joint in (link_name(finger, index) for finger in FINGERS for index in (1, 2, 3)):
