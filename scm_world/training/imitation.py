@@ -87,7 +87,7 @@ class Lesson(Frozen):
             episode has one between 0 and that.
         share: Of the control steps in which the network acts in those rounds, on average.
         stretch: Control steps that it acts at a stretch, on average.
-        keep: Fractional success of an episode of the teacher, in the end, that is learned from.
+        keep: Fractional success of an episode, in the end, that is learned from.
         symmetric: Whether each control step is also shown as the task's symmetries have it: the
             robot with three fingers looks the same after a third of a turn.
         observations: Of the network: ``"plain"``, or ``"privileged"``: with every causal parameter.
