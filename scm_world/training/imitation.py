@@ -88,6 +88,8 @@ class Lesson(Frozen):
         share: Of the control steps in which the network acts in those rounds, on average.
         stretch: Control steps that it acts at a stretch, on average.
         keep: Fractional success of an episode, in the end, that is learned from.
+        settled: Control steps in a row that are as good as ``keep``, after which an episode ends;
+            None for the whole length of each.
         symmetric: Whether each control step is also shown as the task's symmetries have it: the
             robot with three fingers looks the same after a third of a turn.
         observations: Of the network: ``"plain"``, or ``"privileged"``: with every causal parameter.
@@ -114,6 +116,7 @@ class Lesson(Frozen):
     share: Annotated[float, Field(ge=0.0, le=0.5)] = 0.3
     stretch: Annotated[float, Field(ge=1.0, allow_inf_nan=False)] = 10.0
     keep: Share = 0.9
+    settled: Count | None = None
     symmetric: bool = False
     observations: Observations = "plain"
     network: Network = Field(default_factory=lambda: Network(activation="relu"))
@@ -307,7 +310,7 @@ def demonstrated(
             protocol = taught[number % len(taught)]
             random = np.random.default_rng([seed, round_, number])
             turn, observation = runner.begin(protocol, seed=SEED + seed, episode=number)
-            pairs, info = _episode(lesson, env, turn, observation, random, learner)
+            pairs, info = _episode(lesson, env, turn, observation, random, learner, told[0])
             seen.append(np.array([one for one, _ in pairs], np.float32))
             done.append(np.array([one for _, one in pairs], np.float32))
             scores.append(float(info[told[0]]))
@@ -330,12 +333,13 @@ def _episode(
     observation: Any,
     random: np.random.Generator,
     learner: MlpPolicy | None,
+    told: str,
 ) -> tuple[list[tuple[Any, Any]], dict[str, Any]]:
     """Run an episode; return what was observed and what the teacher would have done, and infos."""
     teacher, size = NAMED[lesson.teacher](), env.world.compiled.n_actions
     scale, share = lesson.noise * random.uniform(), lesson.share * random.uniform(0.0, 2.0)
     noises, learns, over, info = action_noise(random, size), False, False, dict[str, Any]()
-    pairs = []
+    pairs, row = [], 0
     while not over:
         right = np.clip(env.toward(teacher(env.world)), -1.0, 1.0)
         pairs.append((np.array(observation, np.float32), right.astype(np.float32)))
@@ -353,7 +357,8 @@ def _episode(
         action = learner(observation) if learner is not None and learns else right
         given: Any = np.clip(action + scale * next(noises), -1.0, 1.0)
         observation, _, terminated, truncated, info = env.step(given)
-        over = terminated or truncated
+        row = row + 1 if float(info[told]) >= lesson.keep else 0
+        over = terminated or truncated or row == lesson.settled
         if not over and turn.step(env):
             observation = env.observe()
     return pairs, info

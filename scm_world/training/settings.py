@@ -422,13 +422,15 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
 _BY_FEEDBACK: Fields = {
     "teacher": "feedback",
     "env": {**ENV, **_reacting()},
-    "protocols": ("P7", "P10"),
-    "episodes": 1_500,
+    "protocols": ("P7", "P10", "P10"),
+    "episodes": 6_000,
     "rounds": 0,
     "noise": 0.05,
     "keep": 0.5,
+    "settled": 60,
     "symmetric": True,
-    "updates": 30_000,
+    "network": {"activation": "relu", "hidden": (384, 384)},
+    "updates": 40_000,
     "batch": 1_024,
     "trials": {"protocols": ("P4", "P5", "P7", "P10"), "episodes": 20},
 }

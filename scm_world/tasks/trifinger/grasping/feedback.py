@@ -25,6 +25,8 @@ FREE_GAIN, GAIN, HOLD = 0.35, 0.15, 0.4  # shares of an error that are corrected
 AHEAD = 0.02  # [m] that a command may be from where a fingertip is
 TOUCHING, SLIPPED = 0.004, 0.02  # [m] across and along a face, of fingertips that hold a block
 BESIDE, ASIDE = 0.012, 0.015  # [m] likewise, beyond the opening, of those that come to it
+STRAIGHT, OBLIQUE = 0.008, 0.02  # [m] along a face, where they close and where they stay open
+INTO = 0.012  # [m] behind a face that fingers close towards: so they are not slow before they touch
 NEAR, FAR = 0.008, 0.025  # [m] from above a grip: fingertips come down; they go up first
 FUNNEL = 2.5  # how much higher fingertips are for what they are too far aside
 UNEVEN = 0.012  # [m] by which the fingers of two faces may be aside of one another
@@ -34,7 +36,7 @@ LAG, TWIST = 0.015, 0.2  # [m], [rad] that a held block may be behind its comman
 BACK = 0.0005  # [m] by which slipping fingertips are brought back
 PUSHED = 0.06  # [rad] that a command changes in a step while fingers press
 ARRIVED = np.array([0.003, 0.04])  # [m, rad] of a block that is let go of
-AGAIN, STUCK, RETREAT = 25, 45, 14
+AGAIN, STUCK, RETREAT = 25, 100, 14
 """Control steps until another plan, until fingers count as stuck, and that they then go back."""
 
 
@@ -139,8 +141,10 @@ class Following:
             return self._carry(move, body, tips, before)
         self._waiting += 1
         if gap < grip.opening + BESIDE and side < ASIDE:
-            share = min(max((side - 0.004) / 0.008, 0.0), 1.0)  # that it stays open
-            opening = grip.opening * share - 0.003 * (1.0 - share)
+            share = min(
+                max((side - STRAIGHT) / (OBLIQUE - STRAIGHT), 0.0), 1.0
+            )  # that it stays open
+            opening = grip.opening * share - INTO * (1.0 - share)
             return self._to(self._place(move, body, opening), CLOSE, tips, before)
         return self._to(self._way(move, body, tips, own), TRAVEL, tips, before)
 
