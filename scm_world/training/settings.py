@@ -422,7 +422,7 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
 _BY_FEEDBACK: Fields = {
     "teacher": "feedback",
     "env": {**ENV, **_reacting()},
-    "protocols": ("P7", "P10", "P10"),
+    "protocols": ("P7", "P10"),
     "episodes": 6_000,
     "rounds": 0,
     "noise": 0.05,

@@ -141,10 +141,7 @@ class Following:
             return self._carry(move, body, tips, before)
         self._waiting += 1
         if gap < grip.opening + BESIDE and side < ASIDE:
-            share = min(
-                max((side - STRAIGHT) / (OBLIQUE - STRAIGHT), 0.0), 1.0
-            )  # that it stays open
-            opening = grip.opening * share - INTO * (1.0 - share)
+            opening = float(np.interp(side, (STRAIGHT, OBLIQUE), (-INTO, grip.opening)))
             return self._to(self._place(move, body, opening), CLOSE, tips, before)
         return self._to(self._way(move, body, tips, own), TRAVEL, tips, before)
 
