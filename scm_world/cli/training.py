@@ -120,6 +120,7 @@ def clone(
     observations: options.Observations = None,
     backend: options.Backend = None,
     seed: options.Seed = 0,
+    workers: options.ManyWorkers = 0,
     out: Path | None = None,
     changes: options.Changes = None,
     quiet: options.Quiet = False,
@@ -146,6 +147,7 @@ def clone(
     from scm_world.policies.scripted import NAMED
     from scm_world.training import imitation
     from scm_world.training.recipe import recipe
+    from scm_world.work.processes import cores
 
     fields = _fields(
         changes,
@@ -174,6 +176,7 @@ def clone(
             out=folder,
             seed=seed,
             backend=used,
+            workers=workers or cores(),
             progress=tell,
             tell=None if quiet else partial(console.say, stderr=True),
         )

@@ -6,6 +6,7 @@ import io
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, final
@@ -49,6 +50,7 @@ from scm_world.training.settings import (
     refused,
 )
 from scm_world.variables.spaces import Frozen
+from scm_world.work.executors import Executor, opened
 
 SHARD = 25
 """Episodes in a file."""
@@ -537,6 +539,7 @@ def clone(
     out: Path | str,
     seed: int = 0,
     backend: str = "mujoco",
+    workers: int | None = None,
     progress: Progress | None = None,
     tell: Tell | None = None,
 ) -> Cloned:
@@ -560,6 +563,8 @@ def clone(
         out: Folder for all files.
         seed: Of everything that is drawn.
         backend: Its name, or several with commas; evaluations are on the first one.
+        workers: How many files of 25 demonstrations are recorded at the same time; None is one, in
+            this process. It changes nothing in the result.
         progress: Called with how many episodes have been shown, and how many will be.
         tell: Called with a sentence about each event.
 
@@ -585,13 +590,13 @@ def clone(
         engines = [_checked(lesson, name, number) for name in backend.split(",")]
     identity = {"lesson": lesson.about(), "seed": number, "backend": backend, "recording": digest}
     policies: list[MlpPolicy] = []
-    with locked(folder), torch_threads(1):
+    with locked(folder), torch_threads(1), opened(None, workers) as executor:
         open_folder(folder / "clone.json", "scm_world/clone/1", identity, identity, say)
         for round_ in range(lesson.rounds + 1):
             how: dict[str, Any] = {"backend": backend, "seed": number, "round_": round_}
             if source is None:
                 learner = policies[-1] if policies else None
-                shown += _collected(folder, lesson, progress, learner=learner, **how)
+                shown += _collected(folder, lesson, executor, progress, learner=learner, **how)
             path = made(folder / "rounds") / f"{round_:02}.safetensors"
             if not path.exists():
                 pairs = joined(shown)
@@ -657,28 +662,38 @@ def _checked(lesson: Lesson, backend: str, seed: int) -> str:
 def _collected(
     folder: Path,
     lesson: Lesson,
+    executor: Executor,
     progress: Progress | None,
     *,
     backend: str,
     round_: int,
     **how: Any,
 ) -> list[Demonstrations]:
-    """Record a round of demonstrations, or read the ones of an earlier call."""
+    """Record a round of demonstrations; files that an earlier call has written are read."""
     backends = backend.split(",")
     first = 0 if round_ == 0 else lesson.episodes + (round_ - 1) * lesson.more
     stop = first + (lesson.episodes if round_ == 0 else lesson.more)
-    found = []
-    for begin in range(first, stop, SHARD):
-        numbers = range(begin, min(begin + SHARD, stop))
-        path = folder / "demonstrations" / f"{round_:02}-{begin:06}.npz"
-        made(path.parent)
-        if not path.exists():
-            stream = io.BytesIO()
-            by = backends[begin // SHARD % len(backends)]
-            shown = demonstrated(lesson, numbers, backend=by, round_=round_, **how)
-            np.savez(stream, allow_pickle=False, **vars(shown))
-            write_durably(path, stream.getvalue())
-        found.append(_load(path))
+    begins = range(first, stop, SHARD)
+    made(folder / "demonstrations")
+    paths = [folder / "demonstrations" / f"{round_:02}-{begin:06}.npz" for begin in begins]
+    jobs = [
+        (range(begin, min(begin + SHARD, stop)), backends[begin // SHARD % len(backends)])
+        for begin in begins
+    ]
+    missing = [place for place, path in enumerate(paths) if not path.exists()]
+    done = first + sum(len(jobs[i][0]) for i in range(len(jobs)) if i not in missing)
+    show = partial(partial, _shown, lesson=lesson, round_=round_, **how)
+    for number, shown in executor.run(show, [jobs[place] for place in missing]):
+        stream = io.BytesIO()
+        np.savez(stream, allow_pickle=False, **vars(shown))
+        write_durably(paths[missing[number]], stream.getvalue())
+        done += len(jobs[missing[number]][0])
         if progress is not None:
-            progress(numbers.stop, lesson.episodes + lesson.rounds * lesson.more)
-    return found
+            progress(done, lesson.episodes + lesson.rounds * lesson.more)
+    return [_load(path) for path in paths]
+
+
+def _shown(job: tuple[range, str], *, lesson: Lesson, **how: Any) -> Demonstrations:
+    """Record the episodes of a file, on its backend."""
+    numbers, backend = job
+    return demonstrated(lesson, numbers, backend=backend, **how)

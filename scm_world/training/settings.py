@@ -440,7 +440,7 @@ _PLACED: Fields = {"protocols": ("P1", "P5"), "episodes": 400, "rounds": 0}
 
 LESSONS: Mapping[str, Fields] = {
     "pushing": _BY_FEEDBACK,
-    "picking": _BY_FEEDBACK,
+    "picking": {**_BY_FEEDBACK, "noise": 0.02, "episodes": 4_000},
     "pick_and_place": _PLACED,
     "stacking2": {**_PLACED, "episodes": 350},
 }

@@ -32,6 +32,7 @@ QUICK: dict[str, Any] = {
     "env": SHORT,
     "keep": 0.0,
     "symmetric": False,
+    "settled": None,
     "episodes": 2,
     "rounds": 1,
     "more": 1,
@@ -137,6 +138,19 @@ def test_symmetric_scenes_are_shown_besides() -> None:
     assert not np.allclose(more.observations[1::3], plain.observations)
 
 
+def test_an_episode_ends_once_it_is_settled() -> None:
+    """It is the beginning of the whole one, and its score is the one there."""
+    whole, less = shown(1), shown(1, settled=3)
+    assert (len(whole), len(less)) == (12, 3)  # keep is 0: every control step is good enough
+    np.testing.assert_array_equal(less.observations, whole.observations[:3])
+    np.testing.assert_array_equal(less.actions, whole.actions[:3])
+    never = shown(1, settled=3, keep=1.0, protocols=["P0"])
+    assert never.scores[0] < 1.0
+    assert not never.kept.any()
+    with pytest.raises(UnknownOption, match="settled"):
+        lesson("picking", settled=0)
+
+
 def test_a_task_without_symmetries_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is silently left out of a lesson."""
     monkeypatch.setattr("scm_world.tasks.Picking.symmetries", lambda *_: ())
@@ -156,6 +170,8 @@ def test_backends_take_turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         alone = demonstrated(how, range(k, k + 1), backend=backend, seed=0)
         with np.load(tmp_path / "demonstrations" / f"00-{k:06}.npz") as file:
             np.testing.assert_array_equal(file["observations"], alone.observations)
+    again = clone(None, how, out=tmp_path / "2", backend="mujoco,bullet", workers=2)
+    assert again.policy.read_bytes() == found.policy.read_bytes()
 
 
 def test_what_ends_badly_is_left_out() -> None:
