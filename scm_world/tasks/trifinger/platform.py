@@ -171,7 +171,7 @@ class TriFingerPlatform(InMemory):
         from trifinger_simulation.tasks.move_cube import Pose
 
         first: PhysicalState = self._first
-        pose = Pose(_turned(first.positions[0], 1), _facing(first.orientations[0], 1))
+        pose = Pose(turned(first.positions[0], 1), facing_there(first.orientations[0], 1))
         usual = np.array(Platform.spaces.robot_position.default, dtype=np.float64)
         self._platform = Platform(initial_object_pose=pose)
         robot = self._platform.simfinger
@@ -202,7 +202,7 @@ class TriFingerPlatform(InMemory):
                     body, link, lateralFriction=float(found[name, "friction"]),
                     physicsClientId=client,
                 )  # fmt: skip
-        pybullet.setGravity(*_turned(found["world", "gravity"], 1), physicsClientId=client)
+        pybullet.setGravity(*turned(found["world", "gravity"], 1), physicsClientId=client)
         spec = controller_spec(found)
         robot.position_gains, robot.velocity_gains = np.tile(spec.kp, 3), np.tile(spec.kd, 3)
         robot.safety_kd, robot.max_motor_torque = np.tile(spec.safety, 3), spec.limit
@@ -226,7 +226,7 @@ class TriFingerPlatform(InMemory):
         state.joint_velocities[:] = slopes @ np.array(robot.velocity)
         state.joint_torques[:] = np.linalg.lstsq(slopes.T, np.array(robot.torque), rcond=None)[0]
         pose, time = seen.filtered_object_pose, 1e-3 * seen.cameras[0].timestamp
-        place, facing = _turned(pose.position, -1), _facing(pose.orientation, -1)
+        place, facing = turned(pose.position, -1), facing_there(pose.orientation, -1)
         if self._seen is not None and time > self._seen[0]:
             elapsed, undone = time - self._seen[0], self._seen[2] * (-1.0, -1.0, -1.0, 1.0)
             state.linear_velocities[0] = (place - self._seen[1]) / elapsed
@@ -246,7 +246,7 @@ class TriFingerPlatform(InMemory):
         for finger, tip in enumerate(tips):
             part = slice(3 * finger, 3 * finger + 3)
             near_, _ = kinematics.inverse_kinematics_one_finger(
-                finger, _turned(tip, 1), found, tolerance=NEAR, max_iterations=100
+                finger, turned(tip, 1), found, tolerance=NEAR, max_iterations=100
             )
             found[part] = np.clip(near_[part], limits.low[part], limits.high[part])
         return found
@@ -255,10 +255,10 @@ class TriFingerPlatform(InMemory):
         """Give the joint positions of this package's robot with the tips of the platform."""
         tips = np.array(self._platform.forward_kinematics(joints))
         height = float(self._parameters["robot", "height"])
-        return inverse(_turned(tips, -1).ravel(), height, near).joint_positions
+        return inverse(turned(tips, -1).ravel(), height, near).joint_positions
 
 
-def _turned(points: Any, sign: int) -> Floats:
+def turned(points: Any, sign: int) -> Floats:
     """Turn points about z: 1 to the platform's world, -1 back."""
     cos, sin = math.cos(TURN), sign * math.sin(TURN)
     turned: Floats = np.asarray(points) @ np.array(
@@ -267,8 +267,8 @@ def _turned(points: Any, sign: int) -> Floats:
     return turned
 
 
-def _facing(orientation: Any, sign: int) -> Floats:
-    """Turn an orientation about z, with w >= 0."""
+def facing_there(orientations: Any, sign: int) -> Floats:
+    """Turn orientations about z likewise, with w >= 0."""
     turn = np.array([0.0, 0.0, sign * math.sin(TURN / 2), math.cos(TURN / 2)])
-    found = quaternion_product(turn, np.asarray(orientation, dtype=np.float64))
-    return found if found[3] >= 0.0 else -found
+    found = quaternion_product(turn, np.asarray(orientations, dtype=np.float64))
+    return np.where(found[..., 3:] >= 0.0, found, -found)
