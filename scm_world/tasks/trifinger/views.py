@@ -22,7 +22,7 @@ SIZE = 20
 
 
 @njit(cache=True)
-def _upright(orientation: Floats) -> tuple[int, float, float, float]:
+def upright(orientation: Floats) -> tuple[int, float, float, float]:
     """Return which own axis is the vertical one, the yaw [rad] of the next one, and the lean."""
     turn = np.empty((3, 3))
     rotation_kernel(orientation, turn)
@@ -59,8 +59,8 @@ def view(
         how far the goal is turned, up to half turns and up to quarters (2) [rad]; and x and y of
         the unit vector that points upwards in the block, along its axes (2).
     """
-    up, yaw, lean_x, lean_y = _upright(orientation)
-    _, goal_yaw, _, _ = _upright(goal_orientation)
+    up, yaw, lean_x, lean_y = upright(orientation)
+    _, goal_yaw, _, _ = upright(goal_orientation)
     quarters = round(yaw / QUARTER)
     own = yaw - quarters * QUARTER
     cos, sin = math.cos(own), math.sin(own)

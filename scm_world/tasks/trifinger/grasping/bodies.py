@@ -13,8 +13,8 @@ from scm_world._types import Floats, Value
 from scm_world.errors import ActionError
 from scm_world.geometry import overlap_volume
 from scm_world.geometry.penetration import box_box_kernel
-from scm_world.geometry.rotations import rotation_kernel
 from scm_world.tasks.trifinger.grasping.hand import Hand
+from scm_world.tasks.trifinger.views import upright
 
 QUARTER = math.pi / 2.0
 SKY = 10.0  # [m] above and below everything
@@ -92,14 +92,12 @@ class Cuboid:
 
 def body_of(name: str, values: Mapping[str, Value]) -> Cuboid:
     """See a box: which of its faces is below, and how it is turned about the vertical."""
-    axes = np.empty((3, 3))
-    rotation_kernel(np.asarray(values[f"{name}.orientation"], dtype=np.float64), axes)
-    up = int(np.argmax(np.abs(axes[2])))
-    x, y = (up + 1) % 3, (up + 2) % 3
-    half = 0.5 * np.asarray(values[f"{name}.size"], dtype=np.float64)[[x, y, up]]
+    orientation = np.asarray(values[f"{name}.orientation"], dtype=np.float64)
+    up, yaw, lean_x, lean_y = upright(orientation)
+    edges = [(up + 1) % 3, (up + 2) % 3, up]
+    half = 0.5 * np.asarray(values[f"{name}.size"], dtype=np.float64)[edges]
     place = np.array(values[f"{name}.cartesian_position"], dtype=np.float64)
-    lean = axes[:2, up] if axes[2, up] > 0.0 else -axes[:2, up]
-    return Cuboid(name, half, place, math.atan2(axes[1, x], axes[0, x]), lean)
+    return Cuboid(name, half, place, yaw, np.array([lean_x, lean_y]))
 
 
 def turns(block: Cuboid, goal: Cuboid) -> tuple[float, ...]:
