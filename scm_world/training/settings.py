@@ -436,13 +436,13 @@ _BY_FEEDBACK: Fields = {
 }
 """A teacher whose actions follow from the present shows much of A."""
 
-_PLACED: Fields = {"protocols": ("P1", "P5"), "episodes": 400, "rounds": 0}
+_LIFTED: Fields = {**_BY_FEEDBACK, "episodes": 3_000, "updates": 30_000, "noise": 0.03}
 
 LESSONS: Mapping[str, Fields] = {
     "pushing": _BY_FEEDBACK,
-    "picking": {**_BY_FEEDBACK, "noise": 0.02, "episodes": 4_000},
-    "pick_and_place": _PLACED,
-    "stacking2": {**_PLACED, "episodes": 350},
+    "picking": _LIFTED,
+    "pick_and_place": {**_LIFTED, "noise": 0.02},
+    "stacking2": {"protocols": ("P1", "P5"), "episodes": 350, "rounds": 0},
 }
 """What differs from the usual lesson of imitation, by task."""
 

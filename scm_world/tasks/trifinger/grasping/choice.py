@@ -65,10 +65,11 @@ class Choice:
     Args:
         sight: Of the world.
         holds: Whether the block with the highest goal is held there, even if it could stand.
+        swings: Whether two fingers may hold a block in the air, and rather do so than three.
     """
 
-    def __init__(self, sight: Sight, *, holds: bool = False) -> None:
-        self._sight = sight
+    def __init__(self, sight: Sight, *, holds: bool = False, swings: bool = False) -> None:
+        self._sight, self._swings = sight, swings
         self._bodies = sight.solid()
         self._goals = {goal: sight.body(goal) for _, goal in sight.pairs}
         height = {goal: float(body.place[2]) for goal, body in self._goals.items()}
@@ -90,10 +91,10 @@ class Choice:
             end = end.at(end.place + lifted(self._kept == goal), end.yaw)
             ways = [(start.at(end.place, start.yaw + turn), turn) for turn in turns(start, end)]
             move = self._best(tool, start, ways, release=not hangs)
-            swings = hangs and end.bottom > ON_FLOOR  # held by two fingers in the air
-            if move is not None and (move.grip.firm or not swings):
+            firm = hangs and end.bottom > ON_FLOOR and not self._swings
+            if move is not None and (move.grip.firm or not firm):
                 return Job(tool, move, len(self._todo))
-            detour = self._detour(tool, ways, release=not hangs, firm=swings) or move
+            detour = self._detour(tool, ways, release=not hangs, firm=firm) or move
             if detour is not None:
                 return Job(tool, detour, len(self._todo) + (detour is not move))
             found = self._make_way(tool, end)
@@ -125,7 +126,8 @@ class Choice:
 
     def _best(self, tool: str, start: Cuboid, ways: Iterable[Way], *, release: bool) -> Move | None:
         planner = Planner(self._sight.hand, self._sight.joints, self._others(tool))
-        return planner.best(start, ways, wanted=self._sight.wanted(tool), release=release)
+        wanted, swings = self._sight.wanted(tool), self._swings
+        return planner.best(start, ways, wanted=wanted, release=release, swings=swings)
 
     def _make_way(self, tool: str, end: Cuboid) -> Job | None:
         """Move a block that stands where another one should go, or where its fingers would be."""

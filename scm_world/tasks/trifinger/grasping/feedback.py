@@ -165,7 +165,7 @@ class Following:
                 move = self._move = None
                 self._idle = 0
         if move is None and self._idle <= 0 and self._back <= 0:
-            job = Choice(self._sight, holds=True).job()
+            job = Choice(self._sight, holds=True, swings=True).job()
             self._idle, self._still, self._waiting, self._opens = AGAIN, 0, 0, False
             if job is not None:
                 self._tool, self._move = job.tool, job.move

@@ -180,7 +180,13 @@ class Planner:
         self._aside = hand.tips(np.array(hardware.ASIDE)).reshape(3, 3)
 
     def best(
-        self, start: Cuboid, ends: Iterable[Way], *, wanted: float, release: bool
+        self,
+        start: Cuboid,
+        ends: Iterable[Way],
+        *,
+        wanted: float,
+        release: bool,
+        swings: bool = False,
     ) -> Move | None:
         """Find the best way to bring a block to one of some places.
 
@@ -189,6 +195,8 @@ class Planner:
             ends: Where it may go, and by how much it turns on the way [rad].
             wanted: With which force it should be pressed [N].
             release: Whether it is let go there.
+            swings: Whether two fingers rather than three carry it through the air: each of the two
+                on one side of three presses half as much, and slips sooner.
 
         Returns:
             The best way, or None if the fingers can go none.
@@ -222,7 +230,10 @@ class Planner:
                 rows, held = rows[held > 0.0], held[held > 0.0]
             share = held / wanted
             enough = np.minimum(share, 1.0) + PLENTY * np.minimum(share, 3.0)
-            worths[rows, way] = ease[rows] - TURNING * abs(turn) + enough
+            loose = 2.0 * FIRMNESS * (swings and height > start.place[2] + CLEARANCE)
+            worths[rows, way] = (
+                ease[rows] - loose * table.used[rows].all(axis=1) - TURNING * abs(turn) + enough
+            )
             strengths[rows, way] = held
         if not np.isfinite(worths).any():
             return None
