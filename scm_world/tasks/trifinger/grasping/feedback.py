@@ -15,7 +15,7 @@ from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, smallest, turn_about_z, unit
 from scm_world.tasks.trifinger.grasping.choice import Choice
 from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand
-from scm_world.tasks.trifinger.grasping.ways import CLEARANCE, EDGE, OPENINGS, Grip, Move, Planner
+from scm_world.tasks.trifinger.grasping.ways import EDGE, OPENINGS, Grip, Move, Planner
 
 FREE = np.zeros((3, 3))
 TRAVEL, CLOSE = 0.022, 0.006  # [m] per control step, of fingertips far from a block, and beside it
@@ -32,6 +32,7 @@ FUNNEL = 2.5  # how much higher fingertips are for what they are too far aside
 UNEVEN = 0.012  # [m] by which the fingers of two faces may be aside of one another
 PRESS, LIGHT = 2.0, 1.5  # [N] with which a block is pressed, if fingers can, that wants less
 FIRMLY = 1.5  # with which a heavier one is pressed, as a multiple of what it wants
+LANDING, TILTED, SOFT = 0.012, 0.1, 0.6  # [m], [rad], share: a block that swings is laid flat
 LAG, TWIST = 0.015, 0.2  # [m], [rad] that a held block may be behind its command
 BACK = 0.0005  # [m] by which slipping fingertips are brought back
 PUSHED = 0.06  # [rad] that a command changes in a step while fingers press
@@ -236,6 +237,8 @@ class Following:
         used, shares = np.array(grip.used), np.abs(grip.inward).max(axis=1)
         wanted = sight.wanted(tool)
         press = min(PRESS if wanted < LIGHT else FIRMLY * wanted, move.strength)
+        if not grip.firm and move.over and max(body.bottom, move.end.bottom) < LANDING:
+            press *= 1.0 - SOFT * min(math.hypot(*body.lean) / TILTED, 1.0)
         forces = press * grip.inward @ turn_about_z(body.yaw).T
         forces[:, 2] += sight.weight(tool) * shares / shares.sum()
         more = hand.more(joints, forces)
@@ -265,8 +268,8 @@ class Following:
         burden = self._sight.burden(str(self._tool)) / max(press, 1e-9)
         pace = CARRY * max(min(max((0.7 - burden) / 0.5, 0.0), 1.0) ** 2, 0.3)
         below = min(move.height - float(body.place[2]), 0.014 - body.bottom)
-        if move.height > max(move.end.place[2], move.start.place[2] + CLEARANCE):
-            below = move.height - float(body.place[2])  # something is in the way
+        if move.over:
+            below = move.height - float(body.place[2])
         lifted = min(max((0.014 - below) / 0.006, 0.05), 1.0) if far > 0.015 else 1.0
         higher = min(max(max(far / 0.01, abs(turn) / 0.15) - 0.5, 0.0), 1.0)
         height = move.end.place[2] + higher * max(move.height - move.end.place[2], 0.0)

@@ -162,6 +162,11 @@ class Move:
     worth: float
     release: bool
 
+    @property
+    def over(self) -> bool:
+        """Whether something is in the way, over which the block is carried."""
+        return self.height > max(self.end.place[2], self.start.place[2] + CLEARANCE)
+
 
 @final
 class Planner:
