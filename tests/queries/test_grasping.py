@@ -15,7 +15,8 @@ from scm_world.queries import World
 from scm_world.tasks import Picking
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping import Feedback, Grasp, Pace
-from scm_world.tasks.trifinger.grasping.bodies import Cuboid, body_of, smallest, turns
+from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, body_of, smallest, turns
+from scm_world.tasks.trifinger.grasping.choice import Choice
 from scm_world.tasks.trifinger.grasping.feedback import TOUCHING, held
 from scm_world.tasks.trifinger.grasping.hand import Hand, carrying, pressing
 from scm_world.tasks.trifinger.grasping.ways import gripped
@@ -94,6 +95,26 @@ def test_it_tries_again(made: Any, least: float) -> None:
     for _ in range(190):
         world.step(policy(world))
     assert world["fractional_success"] > least
+
+
+def test_two_fingers_carry_through_the_air_by_feedback() -> None:
+    """On the floor three fingers are better, and a plan in time always takes three."""
+    for task, swings, fingers in (
+        ("picking", True, 2),
+        ("picking", False, 3),
+        ("pushing", True, 3),
+    ):
+        sight = Sight(world := world_of(task, "mujoco"))
+        sight.look(world)
+        job = Choice(sight, holds=True, swings=swings).job()
+        assert job is not None
+        assert sum(job.move.grip.used) == fingers
+        assert not job.move.over
+    sight = Sight(world := world_of("pick_and_place", "mujoco"))
+    sight.look(world)
+    job = Choice(sight, holds=True, swings=True).job()
+    assert job is not None
+    assert job.move.over
 
 
 # --- one instance, many episodes ------------------------------------------------------------------
