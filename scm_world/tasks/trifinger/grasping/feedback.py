@@ -25,14 +25,17 @@ FREE_GAIN, GAIN, HOLD = 0.35, 0.15, 0.4  # shares of an error that are corrected
 AHEAD = 0.02  # [m] that a command may be from where a fingertip is
 TOUCHING, SLIPPED = 0.004, 0.02  # [m] across and along a face, of fingertips that hold a block
 BESIDE, ASIDE = 0.012, 0.015  # [m] likewise, beyond the opening, of those that come to it
-STRAIGHT, OBLIQUE = 0.008, 0.02  # [m] along a face, where they close and where they stay open
+STRAIGHT, OBLIQUE = (
+    0.008,
+    0.02,
+)  # [m] along a face: the farther they have to go, the less they close
 INTO = 0.012  # [m] behind a face that fingers close towards: so they are not slow before they touch
 NEAR, FAR = 0.008, 0.025  # [m] from above a grip: fingertips come down; they go up first
 FUNNEL = 2.5  # how much higher fingertips are for what they are too far aside
 UNEVEN = 0.012  # [m] by which the fingers of two faces may be aside of one another
 PRESS, LIGHT = 2.0, 1.5  # [N] with which a block is pressed, if fingers can, that wants less
 FIRMLY = 1.5  # with which a heavier one is pressed, as a multiple of what it wants
-LANDING, TILTED, SOFT = 0.012, 0.1, 0.6  # [m], [rad], share: a block that swings is laid flat
+LANDING, TILTED, SOFT = 0.012, 0.1, 0.6  # [m], sine, share: a block that swings is laid flat
 LAG, TWIST = 0.015, 0.2  # [m], [rad] that a held block may be behind its command
 BACK = 0.0005  # [m] by which slipping fingertips are brought back
 PUSHED = 0.06  # [rad] that a command changes in a step while fingers press
@@ -237,7 +240,7 @@ class Following:
         used, shares = np.array(grip.used), np.abs(grip.inward).max(axis=1)
         wanted = sight.wanted(tool)
         press = min(PRESS if wanted < LIGHT else FIRMLY * wanted, move.strength)
-        if not grip.firm and move.over and max(body.bottom, move.end.bottom) < LANDING:
+        if not grip.firm and move.over and self._lands(move, body):
             press *= 1.0 - SOFT * min(math.hypot(*body.lean) / TILTED, 1.0)
         forces = press * grip.inward @ turn_about_z(body.yaw).T
         forces[:, 2] += sight.weight(tool) * shares / shares.sum()
@@ -260,6 +263,12 @@ class Following:
         aim[~used] = self._place(move, body, 0.0)[~used]
         found = hand.bounded(hand.solve(aim.ravel(), joints)[0] + more)
         return np.clip(found, before - PUSHED, before + PUSHED)
+
+    @staticmethod
+    def _lands(move: Move, body: Cuboid) -> bool:
+        """Tell whether a block is about to touch the floor at its goal there."""
+        far = math.dist(body.place[:2], move.end.place[:2])
+        return far < 2.0 * LANDING and max(body.bottom, move.end.bottom) < LANDING
 
     def _speed(self, move: Move, body: Cuboid, press: float) -> tuple[Floats, float]:
         """Choose how a block moves in this control step, shape (3,) [m], and turns [rad]."""

@@ -164,8 +164,8 @@ class Move:
 
     @property
     def over(self) -> bool:
-        """Whether something is in the way, over which the block is carried."""
-        return self.height > max(self.end.place[2], self.start.place[2] + CLEARANCE)
+        """Whether the block goes higher than its goal, over something that is in the way."""
+        return self.height > max(float(self.end.place[2]), float(self.start.place[2]) + CLEARANCE)
 
 
 @final
@@ -200,7 +200,7 @@ class Planner:
             ends: Where it may go, and by how much it turns on the way [rad].
             wanted: With which force it should be pressed [N].
             release: Whether it is let go there.
-            swings: Whether two fingers rather than three carry it through the air: each of the two
+            swings: Whether two fingers rather than three lift it from the floor: each of the two
                 on one side of three presses half as much, and slips sooner.
 
         Returns:
