@@ -141,6 +141,8 @@ def clone(
         rounds: Further rounds, in which the network acts, too.
         backend: Physics backend, or several with commas, which take turns; by default that of the
             task.
+        workers: How many files of 25 demonstrations are recorded at the same time; 0 for as many
+            as there are cores.
         out: Folder for all files; by default under scm-world-results.
     """
     from scm_world.policies.cards import COMMON, FORM, OPTIONS, PolicyAbout
@@ -188,7 +190,8 @@ def clone(
         for one in (learned.options, usual.options)
     )
     same = all(mine.option(name) == its.option(name) for name in (*FORM, *COMMON))
-    if same and usual.network.activation == learned.network.activation:
+    nets = usual.network, learned.network
+    if same and len({(one.activation, one.hidden) for one in nets}) == 1:
         more = "" if observations is None else f" --observations {observations}"
         console.say(f"go on:    scm-world train {task}{more} --start {found.best}")
 

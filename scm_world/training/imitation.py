@@ -90,8 +90,8 @@ class Lesson(Frozen):
         share: Of the control steps in which the network acts in those rounds, on average.
         stretch: Control steps that it acts at a stretch, on average.
         keep: Fractional success of an episode, in the end, that is learned from.
-        settled: Control steps in a row that are as good as ``keep``, after which an episode ends;
-            None for the whole length of each.
+        settled: Control steps in a row that are as good as ``keep``, after which an episode of the
+            teacher ends; None for the whole length of each. Recordings are taken as they are.
         symmetric: Whether each control step is also shown as the task's symmetries have it: the
             robot with three fingers looks the same after a third of a turn.
         observations: Of the network: ``"plain"``, or ``"privileged"``: with every causal parameter.
@@ -236,8 +236,12 @@ def _load(path: Path) -> Demonstrations:
     try:
         file = read_arrays(path)
         found = Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
-        if len(found.observations) != len(found.actions):
-            raise ValueError("observations and actions are not equally many")
+        shapes = [array.shape for array in vars(found).values()]
+        seen, actions, scores, kept = shapes
+        if len(seen) != 2 or len(actions) != 2 or seen[0] != actions[0] or scores != kept:
+            raise ValueError(f"its arrays have the shapes {shapes}")
+        if not (np.isfinite(found.observations).all() and np.isfinite(found.actions).all()):
+            raise ValueError("a number is not finite")
     except DAMAGED as error:
         advice = "remove it: the same call makes it again"
         raise UnreadableFile(str(path), f"it is damaged ({error})", advice) from None
@@ -680,17 +684,20 @@ def _collected(
         (range(begin, min(begin + SHARD, stop)), backends[begin // SHARD % len(backends)])
         for begin in begins
     ]
-    missing = [place for place, path in enumerate(paths) if not path.exists()]
-    done = first + sum(len(jobs[i][0]) for i in range(len(jobs)) if i not in missing)
+    found = {place: _load(path) for place, path in enumerate(paths) if path.exists()}
+    missing = [place for place in range(len(jobs)) if place not in found]
+    done = first + sum(len(jobs[place][0]) for place in found)
     show = partial(partial, _shown, lesson=lesson, round_=round_, **how)
+    total, tell = lesson.episodes + lesson.rounds * lesson.more, progress or (lambda *_: None)
+    tell(done, total)
     for number, shown in executor.run(show, [jobs[place] for place in missing]):
-        stream = io.BytesIO()
+        stream, place = io.BytesIO(), missing[number]
         np.savez(stream, allow_pickle=False, **vars(shown))
-        write_durably(paths[missing[number]], stream.getvalue())
-        done += len(jobs[missing[number]][0])
-        if progress is not None:
-            progress(done, lesson.episodes + lesson.rounds * lesson.more)
-    return [_load(path) for path in paths]
+        write_durably(paths[place], stream.getvalue())
+        found[place] = shown
+        done += len(jobs[place][0])
+        tell(done, total)
+    return [found[place] for place in range(len(jobs))]
 
 
 def _shown(job: tuple[range, str], *, lesson: Lesson, **how: Any) -> Demonstrations:

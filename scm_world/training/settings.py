@@ -371,6 +371,9 @@ _FROM_A_CLONE: Fields = {
 }
 """PPO does not find out by itself how to grasp: this is for a policy that can. It is a guess."""
 
+_WIDE = {"activation": "relu", "hidden": (384, 384)}
+_FROM_A_WIDE_CLONE: Fields = {**_FROM_A_CLONE, "network": {**_WIDE, "log_std": -3.0}}
+
 TUNED: Mapping[str, Mapping[str | None, Fields]] = {
     "reaching": {
         None: {
@@ -409,11 +412,11 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
     },
     "picking": {
         None: {"env": _reacting(**_PICKING), "curriculum": 1},
-        "ppo": _FROM_A_CLONE,
+        "ppo": _FROM_A_WIDE_CLONE,
     },
     "pick_and_place": {
-        None: {"env": {"task_options": _PLACING}, "curriculum": 1},
-        "ppo": _FROM_A_CLONE,
+        None: {"env": _reacting(**_PLACING), "curriculum": 1},
+        "ppo": _FROM_A_WIDE_CLONE,
     },
     "stacking2": {None: {"curriculum": 1}, "ppo": _FROM_A_CLONE},
 }
@@ -429,7 +432,7 @@ _BY_FEEDBACK: Fields = {
     "keep": 0.5,
     "settled": 60,
     "symmetric": True,
-    "network": {"activation": "relu", "hidden": (384, 384)},
+    "network": _WIDE,
     "updates": 40_000,
     "batch": 1_024,
     "trials": {"protocols": ("P4", "P5", "P7", "P10"), "episodes": 20},

@@ -26,6 +26,7 @@ from scm_world.training.imitation import (
     lesson,
     whitening,
 )
+from scm_world.training.recipe import recipe
 
 SHORT = {"max_episode_length": 12}
 QUICK: dict[str, Any] = {
@@ -172,6 +173,34 @@ def test_backends_take_turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
             np.testing.assert_array_equal(file["observations"], alone.observations)
     again = clone(None, how, out=tmp_path / "2", backend="mujoco,bullet", workers=2)
     assert again.policy.read_bytes() == found.policy.read_bytes()
+
+
+def test_a_damaged_file_is_named_before_more_is_recorded(tmp_path: Path) -> None:
+    """It is not found out after hours; progress counts what is there."""
+    pytest.importorskip("torch")
+    how, done = lesson("picking", **{**QUICK, "episodes": 26, "rounds": 0}), list[int]()
+    clone(None, how, out=tmp_path, progress=lambda n, _: done.append(n))
+    clone(None, how, out=tmp_path, progress=lambda n, _: done.append(n))
+    assert done == [0, 25, 26, 26]
+    first, second = sorted((tmp_path / "demonstrations").iterdir())
+    second.unlink()
+    (tmp_path / "rounds" / "00.safetensors").unlink()
+    with np.load(first) as file:
+        arrays = dict(file)
+    np.savez(first, **{**arrays, "scores": arrays["scores"][:3]})
+    with pytest.raises(UnreadableFile, match=r"000000.*shapes.*remove it"):
+        clone(None, how, out=tmp_path)
+    assert not second.exists()
+
+
+@pytest.mark.parametrize("task", ["picking", "pick_and_place", "stacking2"])
+def test_a_training_can_go_on_from_a_clone(task: str) -> None:
+    """The recipe of PPO has the network and the actions of the lesson."""
+    learned, usual = lesson(task), recipe(task)
+    assert usual.network.hidden == learned.network.hidden
+    assert usual.network.activation == learned.network.activation
+    for name in ("observe", "keypoints", "action_mode", "delta_scale", "delta_origin"):
+        assert usual.env.get(name) == learned.env.get(name)
 
 
 def test_what_ends_badly_is_left_out() -> None:

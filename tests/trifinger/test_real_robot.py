@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from scm_world.discovery.data import Dataset, from_frame, load, save
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import forward
@@ -107,16 +107,28 @@ def test_a_table_survives_its_file(tmp_path: Path) -> None:
     assert load(tmp_path / "real") == found
 
 
+def without(data: dict[str, Any], name: str) -> dict[str, Any]:
+    """Leave something out."""
+    return {other: value for other, value in data.items() if other != name}
+
+
 def test_other_layouts_are_refused() -> None:
-    """Filtered observations, missing parts and rows that do not fit are named."""
+    """What is missing, filtered, scaled, of another shape or not finite is named."""
     data = given()
-    with pytest.raises(UnknownOption, match=r"\(12, 90\).*\(n, 97\)"):
-        from_trifinger_rl({**data, "observations": data["observations"][:, :90]})
-    with pytest.raises(ModelError, match="lack actions"):
-        from_trifinger_rl({name: data[name] for name in data if name != "actions"})
-    with pytest.raises(ModelError, match="rows differ"):
-        from_trifinger_rl({**data, "actions": data["actions"][:5]})
     rows = nested(data["observations"])
     del rows[3]["camera_observation"]["delay"]
-    with pytest.raises(ModelError, match="lacks 'delay'"):
-        from_trifinger_rl({**data, "observations": rows})
+    for other, message in (
+        ({"observations": data["observations"][:, :90]}, r"\(12, 90\).*\(n, 97\)"),
+        ({"observations": data["observations"][:0]}, r"\(0, 97\).*\(n, 97\)"),
+        ({"observations": 0.1 * data["observations"]}, "scale_obs=False"),
+        ({"observations": rows}, "delay cannot be '0 numbers in observation 3'"),
+        ({"actions": data["actions"][:5]}, r"actions.*\(5, 9\).*\(12, 9\)"),
+        ({"rewards": np.full(12, np.nan)}, "rewards.*not finite"),
+        ({"rewards": ["much"] * 12}, "rewards.*no array of numbers"),
+        ({"timeouts": True}, r"timeouts.*\(12,\)"),
+    ):
+        with pytest.raises(UnknownOption, match=message):
+            from_trifinger_rl({**data, **other})
+    for name in ("actions", "timeouts"):
+        with pytest.raises(UnreadableFile, match=f"lack {name}"):
+            from_trifinger_rl(without(data, name))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.tasks.trifinger.platform import facing_there, turned
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ COLUMNS: Mapping[str, str] = {
 }
 """Of the table, and what each is there; vectors are ``NAME[0]``, ``NAME[1]``, …"""
 
+_LAST = "robot_observation.velocity"
 _PLACE = "camera_observation.object_position"
 _FACING = "camera_observation.object_orientation"
 
@@ -59,11 +60,8 @@ def _layout(goal: str) -> dict[str, slice]:
     }
 
 
-_FLAT = {
-    layout["robot_observation.velocity"].stop: layout
-    for layout in map(_layout, ("object_position", "object_keypoints"))
-}
-"""By the width of a flat observation: 97 of pushing, 139 of lifting."""
+_LAYOUTS = {goal: _layout(goal) for goal in ("object_position", "object_keypoints")}
+"""Of flat observations: 97 numbers of pushing, 139 of lifting."""
 
 
 def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
@@ -82,15 +80,16 @@ def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
     Args:
         data: What ``env.get_dataset()`` gave: ``observations``, shape (n, 97) or (n, 139), or a
             list of dictionaries (``flatten_obs=False``); ``actions``, shape (n, 9) [N m];
-            ``rewards``, shape (n,); and ``timeouts`` or ``terminals``, true at the last step of
-            each episode. An episode that is cut off at the end is kept.
+            ``rewards``, shape (n,); and ``timeouts`` or ``terminals``, shape (n,), true at the
+            last step of each episode. Rows have to follow one another, as they do without
+            ``indices``. An episode that is cut off is kept; its steps count from its first row.
 
     Returns:
         Rows with ``episode``, ``step``, the columns ``COLUMNS`` and ``intervention_targets``.
 
     Raises:
-        UnknownOption: Flat observations have another width: they are filtered, or of other data.
-        ModelError: Something is missing, or numbers of rows differ.
+        UnreadableFile: Something is missing.
+        UnknownOption: Something has another shape, is filtered or scaled, or is not finite.
 
     Source:
         Gürtler et al., *Benchmarking Offline Reinforcement Learning on Real-Robot Hardware*, ICLR
@@ -98,7 +97,9 @@ def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
 
     Example:
         >>> ends = np.array([False, True, False])
-        >>> given = {"observations": np.zeros((3, 97)), "actions": np.zeros((3, 9))}
+        >>> rows = np.zeros((3, 97))
+        >>> rows[:, 41] = 1.0  # of the quaternion of the cube
+        >>> given = {"observations": rows, "actions": np.zeros((3, 9))}
         >>> found = from_trifinger_rl({**given, "rewards": np.zeros(3), "timeouts": ends})
         >>> found["episode"].tolist(), found["step"].tolist(), "action[8]" in found
         ([0, 0, 1], [0, 1, 0], True)
@@ -106,19 +107,17 @@ def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
     import pandas as pd
 
     missing = sorted({"observations", "actions", "rewards"} - set(data))
+    if not {"timeouts", "terminals"} & set(data):
+        missing.append("timeouts")
     if missing:
         advice = "give what get_dataset() of trifinger_rl_datasets gives"
-        raise ModelError([f"the data lack {', '.join(missing)}: {advice}"])
+        raise UnreadableFile("the data", f"they lack {', '.join(missing)}", advice)
     parts = _parts(data["observations"])
-    parts |= {name: np.asarray(data[name], float) for name in ("actions", "rewards")}
-    lengths = {"observations": len(parts["desired_goal"])}
-    lengths |= {name: len(parts[name]) for name in ("actions", "rewards")}
-    n = lengths["rewards"]
-    if {*lengths.values()} != {n} or parts["actions"].shape[1:] != (9,):
-        raise ModelError([f"rows differ: {lengths}, and actions have {parts['actions'].shape[1:]}"])
+    n = len(parts["desired_goal"])
+    parts |= {"actions": _array(data, "actions", (n, 9)), "rewards": _array(data, "rewards", (n,))}
     ends = np.zeros(n, dtype=bool)
-    for name in ("timeouts", "terminals"):
-        ends |= np.asarray(data.get(name, ends), dtype=bool)
+    for name in {"timeouts", "terminals"} & set(data):
+        ends |= _array(data, name, (n,)) != 0.0
     episode = np.cumsum(ends) - ends
     first = np.flatnonzero(np.diff(episode, prepend=-1))
     step = np.arange(n) - np.repeat(first, np.diff(first, append=n))
@@ -130,27 +129,41 @@ def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
     return pd.DataFrame(columns).assign(intervention_targets=None)
 
 
+def _array(data: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Floats:
+    """Return numbers of a shape.
+
+    Raises:
+        UnknownOption: They have another one, are no numbers, or not finite.
+    """
+    allowed = (f"finite numbers of shape {shape}, as there are {shape[0]} observations",)
+    try:
+        found = np.asarray(data[name], dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UnknownOption(name, f"what is no array of numbers ({error})", allowed) from None
+    if found.shape != shape or not np.isfinite(found).all():
+        given = f"of shape {found.shape}" if found.shape != shape else "not finite"
+        raise UnknownOption(name, given, allowed)
+    return found
+
+
 def _parts(observations: Any) -> dict[str, Floats]:
     """Take observations apart, each of shape (n, k), in this package's frame."""
-    goal = "object_position"
-    if isinstance(observations, np.ndarray):
-        width = observations.shape[-1] if observations.ndim == 2 else None
-        if width not in _FLAT:
-            allowed = [f"shape (n, {known})" for known in _FLAT]
-            advice = "all observations, neither filtered nor scaled"
-            raise UnknownOption("observations", observations.shape, (*allowed, advice))
-        found = {name: observations[:, where].astype(float) for name, where in _FLAT[width].items()}
-        goal = next(name for name in found if name.startswith("desired")).partition(".")[2]
+    nested = isinstance(observations, Sequence) and bool(observations)
+    if nested and all(isinstance(row, Mapping) for row in observations):
+        goal = next(iter(observations[0].get("desired_goal", ())), "")
+        flat = _flattened(observations, _LAYOUTS.get(goal, _LAYOUTS["object_position"]))
     else:
-        try:
-            goal = next(iter(observations[0]["desired_goal"]))
-            found = {
-                name: np.array([np.ravel(_within(row, name)) for row in observations], float)
-                for name in _layout(goal)
-            }
-        except (KeyError, IndexError, TypeError, StopIteration) as error:
-            problem = f"an observation lacks {error}: give whole ones, as flatten_obs=False does"
-            raise ModelError([problem]) from None
+        flat = np.asarray(observations)
+    layouts = {layout[_LAST].stop: goal for goal, layout in _LAYOUTS.items()}
+    if flat.ndim != 2 or flat.shape[1] not in layouts or flat.dtype.kind != "f" or not len(flat):
+        allowed = (*(f"shape (n, {width})" for width in layouts), "a list of whole dictionaries")
+        raise UnknownOption("observations", f"{flat.dtype} of shape {flat.shape}", allowed)
+    data, goal = {"observations": flat}, layouts[flat.shape[1]]
+    flat = _array(data, "observations", flat.shape)
+    found = {name: flat[:, where] for name, where in _LAYOUTS[goal].items()}
+    if not np.allclose(np.linalg.norm(found[_FACING], axis=1), 1.0, atol=0.05):
+        allowed = ("observations in SI units: make the environment with scale_obs=False",)
+        raise UnknownOption("orientation of the cube", "no unit quaternion", allowed)
     place = found[f"desired_goal.{goal}"]
     found["desired_goal"] = place.reshape(len(place), -1, 3).mean(axis=1)
     for name in ("robot_observation.fingertip_position", _PLACE, "desired_goal"):
@@ -160,7 +173,20 @@ def _parts(observations: Any) -> dict[str, Floats]:
     return found
 
 
-def _within(row: Mapping[str, Any], name: str) -> Any:
-    for part in name.split("."):
-        row = row[part]
-    return row
+def _flattened(rows: Sequence[Mapping[str, Any]], layout: Mapping[str, slice]) -> Floats:
+    """Write dictionaries as flat observations.
+
+    Raises:
+        UnknownOption: A part is missing, or has another length.
+    """
+    flat = np.empty((len(rows), layout[_LAST].stop))
+    for name, where in layout.items():
+        first, _, second = name.partition(".")
+        for number, row in enumerate(rows):
+            part = row.get(first, {})
+            part = np.ravel(part.get(second, ()) if second else part)
+            if part.shape != (size := where.stop - where.start,):
+                given = f"{len(part)} numbers in observation {number}"
+                raise UnknownOption(name, given, (f"{size}, as flatten_obs=False gives",))
+            flat[number, where] = part
+    return flat
