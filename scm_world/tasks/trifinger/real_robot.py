@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from scm_world._arguments import load
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.tasks.trifinger.platform import facing_there, turned
@@ -88,6 +89,7 @@ def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
         Rows with ``episode``, ``step``, the columns ``COLUMNS`` and ``intervention_targets``.
 
     Raises:
+        MissingExtra: pandas is not installed.
         UnreadableFile: Something is missing.
         UnknownOption: Something has another shape, is filtered or scaled, or is not finite.
 
@@ -104,8 +106,7 @@ def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
         >>> found["episode"].tolist(), found["step"].tolist(), "action[8]" in found
         ([0, 0, 1], [0, 1, 0], True)
     """
-    import pandas as pd
-
+    pandas: Any = load("pandas", "pandas", "data")
     missing = sorted({"observations", "actions", "rewards"} - set(data))
     if not {"timeouts", "terminals"} & set(data):
         missing.append("timeouts")
@@ -126,7 +127,8 @@ def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
         value = parts[source].reshape(n, -1)
         size = value.shape[1]
         columns |= {f"{name}[{i}]" if size > 1 else name: value[:, i] for i in range(size)}
-    return pd.DataFrame(columns).assign(intervention_targets=None)
+    found: pd.DataFrame = pandas.DataFrame(columns).assign(intervention_targets=None)
+    return found
 
 
 def _array(data: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Floats:
