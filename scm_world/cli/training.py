@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -190,10 +191,12 @@ def clone(
         for one in (learned.options, usual.options)
     )
     same = all(mine.option(name) == its.option(name) for name in (*FORM, *COMMON))
-    nets = usual.network, learned.network
-    if same and len({(one.activation, one.hidden) for one in nets}) == 1:
+    if same and usual.network.activation == learned.network.activation:
         more = "" if observations is None else f" --observations {observations}"
-        console.say(f"go on:    scm-world train {task}{more} --start {found.best}")
+        hidden = json.dumps(learned.network.hidden, separators=(",", ":"))
+        if learned.network.hidden != usual.network.hidden:
+            more += f" --set network.hidden={hidden}"
+        console.say(f"go on:    scm-world train {task} --start {found.best}{more}")
 
 
 def _tell(found: Any, task: str) -> None:

@@ -304,8 +304,8 @@ def demonstrated(
     env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
     runner = EpisodeRunner(env)
     try:
-        told = [name for name in (FRACTION, SUCCESS) if name in env.world.model]
-        if not told:
+        metrics = [name for name in (FRACTION, SUCCESS) if name in env.world.model]
+        if not metrics:
             allowed = (
                 f"a task with {FRACTION!r} or {SUCCESS!r}: only what ended well is learned from"
             )
@@ -316,10 +316,10 @@ def demonstrated(
             protocol = taught[number % len(taught)]
             random = np.random.default_rng([seed, round_, number])
             turn, observation = runner.begin(protocol, seed=SEED + seed, episode=number)
-            pairs, info = _episode(lesson, env, turn, observation, random, learner, told[0])
+            pairs, info = _episode(lesson, env, turn, observation, random, learner, metrics[0])
             seen.append(np.array([one for one, _ in pairs], np.float32))
             done.append(np.array([one for _, one in pairs], np.float32))
-            scores.append(float(info[told[0]]))
+            scores.append(float(info[metrics[0]]))
     finally:
         runner.close()
     kept = np.array(scores) >= lesson.keep
@@ -339,7 +339,7 @@ def _episode(
     observation: Any,
     random: np.random.Generator,
     learner: MlpPolicy | None,
-    told: str,
+    metric: str,
 ) -> tuple[list[tuple[Any, Any]], dict[str, Any]]:
     """Run an episode; return what was observed and what the teacher would have done, and infos."""
     teacher, size = NAMED[lesson.teacher](), env.world.compiled.n_actions
@@ -363,7 +363,7 @@ def _episode(
         action = learner(observation) if learner is not None and learns else right
         given: Any = np.clip(action + scale * next(noises), -1.0, 1.0)
         observation, _, terminated, truncated, info = env.step(given)
-        row = row + 1 if float(info[told]) >= lesson.keep else 0
+        row = row + 1 if float(info[metric]) >= lesson.keep else 0
         over = terminated or truncated or row == lesson.settled
         if not over and turn.step(env):
             observation = env.observe()
@@ -413,11 +413,11 @@ def given_demonstrations(
 
 
 def _recorded(recording: Recording, keep: float) -> Demonstrations:
-    told = [name for name in (FRACTION, SUCCESS) if all(name in e.infos for e in recording)]
-    if not told:
+    metrics = [name for name in (FRACTION, SUCCESS) if all(name in e.infos for e in recording)]
+    if not metrics:
         problem = f"the recording does not say how episodes ended: record {FRACTION!r}, too"
         raise ModelError([problem])
-    scores = np.array([float(episode.infos[told[0]][-1]) for episode in recording])
+    scores = np.array([float(episode.infos[metrics[0]][-1]) for episode in recording])
     kept = scores >= keep
     good = tuple(episode for episode, is_good in zip(recording, kept, strict=True) if is_good)
     none = np.empty((0, 1), np.float32), np.empty((0, 1), np.float32)

@@ -60,6 +60,7 @@ def test_it_says_what_comes_next(tmp_path: Path) -> None:
         assert done.exit_code == 0, done.output
         assert f"scm-world evaluate {tmp_path}/run/policy.safetensors picking" in done.output
         assert "scm-world train picking --start" in done.output
+        assert "--set network.hidden=[4]" in done.output
     about = json.loads((tmp_path / "run" / "clone.json").read_text())
     made = about["lesson"]
     assert (made["episodes"], made["network"]["hidden"], made["keep"]) == (1, [4], 0.0)

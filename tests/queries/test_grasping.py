@@ -98,7 +98,7 @@ def test_it_tries_again(made: Any, least: float) -> None:
 
 
 def test_two_fingers_carry_through_the_air_by_feedback() -> None:
-    """On the floor three fingers are better, and a plan in time always takes three."""
+    """On the floor, and where blocks may not swing, three fingers are chosen."""
     for task, swings, fingers in (
         ("picking", True, 2),
         ("picking", False, 3),

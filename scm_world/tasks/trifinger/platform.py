@@ -171,7 +171,7 @@ class TriFingerPlatform(InMemory):
         from trifinger_simulation.tasks.move_cube import Pose
 
         first: PhysicalState = self._first
-        pose = Pose(turned(first.positions[0], 1), facing_there(first.orientations[0], 1))
+        pose = Pose(turned(first.positions[0], 1), turned_orientations(first.orientations[0], 1))
         usual = np.array(Platform.spaces.robot_position.default, dtype=np.float64)
         self._platform = Platform(initial_object_pose=pose)
         robot = self._platform.simfinger
@@ -226,7 +226,7 @@ class TriFingerPlatform(InMemory):
         state.joint_velocities[:] = slopes @ np.array(robot.velocity)
         state.joint_torques[:] = np.linalg.lstsq(slopes.T, np.array(robot.torque), rcond=None)[0]
         pose, time = seen.filtered_object_pose, 1e-3 * seen.cameras[0].timestamp
-        place, facing = turned(pose.position, -1), facing_there(pose.orientation, -1)
+        place, facing = turned(pose.position, -1), turned_orientations(pose.orientation, -1)
         if self._seen is not None and time > self._seen[0]:
             elapsed, undone = time - self._seen[0], self._seen[2] * (-1.0, -1.0, -1.0, 1.0)
             state.linear_velocities[0] = (place - self._seen[1]) / elapsed
@@ -267,7 +267,7 @@ def turned(points: Any, sign: int) -> Floats:
     return turned
 
 
-def facing_there(orientations: Any, sign: int) -> Floats:
+def turned_orientations(orientations: Any, sign: int) -> Floats:
     """Turn orientations about z likewise, with w >= 0."""
     turn = np.array([0.0, 0.0, sign * math.sin(TURN / 2), math.cos(TURN / 2)])
     found = quaternion_product(turn, np.asarray(orientations, dtype=np.float64))

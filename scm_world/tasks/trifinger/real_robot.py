@@ -10,21 +10,10 @@ import numpy as np
 from scm_world._arguments import load
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption, UnreadableFile
-from scm_world.tasks.trifinger.platform import facing_there, turned
+from scm_world.tasks.trifinger.platform import turned, turned_orientations
 
 if TYPE_CHECKING:
     import pandas as pd
-
-_CAMERA = {"confidence": 1, "delay": 1, "object_keypoints": 24} | {
-    "object_orientation": 4,
-    "object_position": 3,
-}
-_ROBOT = {"fingertip_force": 3, "fingertip_position": 9, "fingertip_velocity": 9} | {
-    "position": 9,
-    "robot_id": 1,
-    "torque": 9,
-    "velocity": 9,
-}
 
 COLUMNS: Mapping[str, str] = {
     "joint_positions": "robot_observation.position",
@@ -41,7 +30,7 @@ COLUMNS: Mapping[str, str] = {
     "action": "actions",
     "reward": "rewards",
 }
-"""Of the table, and what each is there; vectors are ``NAME[0]``, ``NAME[1]``, …"""
+"""Columns of the table, and their sources; vectors are ``NAME[0]``, ``NAME[1]``, …"""
 
 _LAST = "robot_observation.velocity"
 _PLACE = "camera_observation.object_position"
@@ -49,16 +38,29 @@ _FACING = "camera_observation.object_orientation"
 
 
 def _layout(goal: str) -> dict[str, slice]:
-    """Say where things stand in a flat observation: as Gymnasium flattens, by names in order."""
+    """Return the slices of a flat observation: as Gymnasium flattens, by names in order."""
     length = {"object_position": 3, "object_keypoints": 24}[goal]
-    sizes = {f"achieved_goal.{goal}": length, "action": 9}
-    sizes |= {f"camera_observation.{name}": size for name, size in _CAMERA.items()}
-    sizes |= {f"desired_goal.{goal}": length}
-    sizes |= {f"robot_observation.{name}": size for name, size in _ROBOT.items()}
-    ends = np.cumsum([*sizes.values()]).tolist()
-    return {
-        name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)
+    sizes = {
+        f"achieved_goal.{goal}": length,
+        "action": 9,
+        "camera_observation.confidence": 1,
+        "camera_observation.delay": 1,
+        "camera_observation.object_keypoints": 24,
+        _FACING: 4,
+        _PLACE: 3,
+        f"desired_goal.{goal}": length,
+        "robot_observation.fingertip_force": 3,
+        "robot_observation.fingertip_position": 9,
+        "robot_observation.fingertip_velocity": 9,
+        "robot_observation.position": 9,
+        "robot_observation.robot_id": 1,
+        "robot_observation.torque": 9,
+        _LAST: 9,
     }
+    found, end = dict[str, slice](), 0
+    for name, size in sizes.items():
+        found[name], end = slice(end, end + size), end + size
+    return found
 
 
 _LAYOUTS = {goal: _layout(goal) for goal in ("object_position", "object_keypoints")}
@@ -149,7 +151,7 @@ def _array(data: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Floats
 
 
 def _parts(observations: Any) -> dict[str, Floats]:
-    """Take observations apart, each of shape (n, k), in this package's frame."""
+    """Return the parts of observations, each of shape (n, k), in this package's frame."""
     nested = isinstance(observations, Sequence) and bool(observations)
     if nested and all(isinstance(row, Mapping) for row in observations):
         goal = next(iter(observations[0].get("desired_goal", ())), "")
@@ -160,8 +162,8 @@ def _parts(observations: Any) -> dict[str, Floats]:
     if flat.ndim != 2 or flat.shape[1] not in layouts or flat.dtype.kind != "f" or not len(flat):
         allowed = (*(f"shape (n, {width})" for width in layouts), "a list of whole dictionaries")
         raise UnknownOption("observations", f"{flat.dtype} of shape {flat.shape}", allowed)
-    data, goal = {"observations": flat}, layouts[flat.shape[1]]
-    flat = _array(data, "observations", flat.shape)
+    goal = layouts[flat.shape[1]]
+    flat = _array({"observations": flat}, "observations", flat.shape)
     found = {name: flat[:, where] for name, where in _LAYOUTS[goal].items()}
     if not np.allclose(np.linalg.norm(found[_FACING], axis=1), 1.0, atol=0.05):
         allowed = ("observations in SI units: make the environment with scale_obs=False",)
@@ -171,12 +173,12 @@ def _parts(observations: Any) -> dict[str, Floats]:
     for name in ("robot_observation.fingertip_position", _PLACE, "desired_goal"):
         points = found[name]
         found[name] = turned(points.reshape(len(points), -1, 3), -1).reshape(points.shape)
-    found[_FACING] = facing_there(found[_FACING], -1)
+    found[_FACING] = turned_orientations(found[_FACING], -1)
     return found
 
 
 def _flattened(rows: Sequence[Mapping[str, Any]], layout: Mapping[str, slice]) -> Floats:
-    """Write dictionaries as flat observations.
+    """Return dictionaries as flat observations.
 
     Raises:
         UnknownOption: A part is missing, or has another length.

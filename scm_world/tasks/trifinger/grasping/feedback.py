@@ -25,11 +25,8 @@ FREE_GAIN, GAIN, HOLD = 0.35, 0.15, 0.4  # shares of an error that are corrected
 AHEAD = 0.02  # [m] that a command may be from where a fingertip is
 TOUCHING, SLIPPED = 0.004, 0.02  # [m] across and along a face, of fingertips that hold a block
 BESIDE, ASIDE = 0.012, 0.015  # [m] likewise, beyond the opening, of those that come to it
-STRAIGHT, OBLIQUE = (
-    0.008,
-    0.02,
-)  # [m] along a face: the farther they have to go, the less they close
-INTO = 0.012  # [m] behind a face that fingers close towards: so they are not slow before they touch
+STRAIGHT, OBLIQUE = 0.008, 0.02  # [m] along a face, of fingers that close fully, or not at all
+INTO = 0.012  # [m] behind a face, of the place that fingers close towards: they touch at full speed
 NEAR, FAR = 0.008, 0.025  # [m] from above a grip: fingertips come down; they go up first
 FUNNEL = 2.5  # how much higher fingertips are for what they are too far aside
 UNEVEN = 0.012  # [m] by which the fingers of two faces may be aside of one another
@@ -266,7 +263,7 @@ class Following:
 
     @staticmethod
     def _lands(move: Move, body: Cuboid) -> bool:
-        """Tell whether a block is about to touch the floor at its goal there."""
+        """Return whether a block is near the floor and near its goal, which is on the floor."""
         far = math.dist(body.place[:2], move.end.place[:2])
         return far < 2.0 * LANDING and max(body.bottom, move.end.bottom) < LANDING
 
