@@ -150,6 +150,7 @@ class Sight:
         hand: The robot.
         joints: Its joint positions, shape (9,) [rad].
         pairs: Blocks, each with its goal.
+        walls: What stands in the way and is not moved.
         left: How many control steps the episode still has.
 
     Raises:
@@ -159,6 +160,7 @@ class Sight:
     hand: Hand
     joints: Floats
     pairs: tuple[tuple[str, str], ...]
+    walls: tuple[str, ...]
 
     def __init__(self, world: Any) -> None:
         self._version = -1
@@ -173,7 +175,8 @@ class Sight:
             return  # all else moves only when someone intervenes
         self._version, task = world.version, world.compiled.task
         self.hand = Hand(self._values, world.control_period)
-        self._solid = (*world.composition.blocks, *world.composition.obstacles)
+        self.walls = world.composition.obstacles
+        self._solid = (*world.composition.blocks, *self.walls)
         self.pairs = tuple(
             (tool, goal)
             for goal, tool in task.targets().items()
@@ -202,8 +205,12 @@ class Sight:
 
     def burden(self, tool: str) -> float:
         """Compute with which force a block must be pressed from both sides to be carried [N]."""
+        return abs(self.weight(tool)) / (2.0 * self.friction(tool))
+
+    def friction(self, tool: str) -> float:
+        """Return the friction of a block and a fingertip."""
         friction = float(self._values["finger_friction"]) * float(self._values[f"{tool}.friction"])
-        return abs(self.weight(tool)) / (2.0 * max(friction, LEAST_FRICTION))
+        return max(friction, LEAST_FRICTION)
 
     def wanted(self, tool: str) -> float:
         """Choose with which force a block should be pressed [N]."""

@@ -15,12 +15,23 @@ from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, smallest, turn_about_z, unit
 from scm_world.tasks.trifinger.grasping.choice import Choice
 from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand
-from scm_world.tasks.trifinger.grasping.ways import EDGE, OPENINGS, Grip, Move, Planner
+from scm_world.tasks.trifinger.grasping.ways import (
+    CLEARANCE,
+    EDGE,
+    OPENINGS,
+    SAMPLES,
+    Grip,
+    Move,
+    Planner,
+)
 
 FREE = np.zeros((3, 3))
 TRAVEL, CLOSE = 0.022, 0.006  # [m] per control step, of fingertips far from a block, and beside it
 CARRY, TURN = 0.0045, 0.03  # [m], [rad] per control step, of a block
 RISE = 0.0012  # [m] per control step, upwards or downwards
+SINK, SLOWEST, FASTEST = 0.0015, 0.0006, 0.002  # [m] likewise, of a block that goes over a wall
+STIFF = 400.0  # [N/m] with which fingers pull at it when their command moves up
+SOON = 0.03  # [m] of its way, for which it is high enough before it goes on
 FREE_GAIN, GAIN, HOLD = 0.35, 0.15, 0.4  # shares of an error that are corrected in a control step
 AHEAD = 0.02  # [m] that a command may be from where a fingertip is
 TOUCHING, SLIPPED = 0.004, 0.02  # [m] across and along a face, of fingertips that hold a block
@@ -273,16 +284,39 @@ class Following:
         far = math.hypot(error[0], error[1])
         burden = self._sight.burden(str(self._tool)) / max(press, 1e-9)
         pace = CARRY * max(min(max((0.7 - burden) / 0.5, 0.0), 1.0) ** 2, 0.3)
-        below = min(move.height - float(body.place[2]), 0.014 - body.bottom)
-        if move.over:
-            below = move.height - float(body.place[2])
+        height, most, least = move.height, RISE, RISE
+        below = min(height - float(body.place[2]), 0.014 - body.bottom)
+        if move.over and self._sight.walls:
+            soon = self._passing(body, error, min(SOON, far))
+            height = max(self._passing(body, error, far), float(body.half[2]) + CLEARANCE)
+            below = soon - float(body.place[2]) if soon > 0.0 else 0.014 - body.bottom
+            spare = self._sight.friction(str(self._tool)) * press * max(1.0 - burden, 0.0)
+            most, least = min(max(spare / STIFF, SLOWEST), FASTEST), SINK
+        elif move.over:
+            below = height - float(body.place[2])
         lifted = min(max((0.014 - below) / 0.006, 0.05), 1.0) if far > 0.015 else 1.0
         higher = min(max(max(far / 0.01, abs(turn) / 0.15) - 0.5, 0.0), 1.0)
-        height = move.end.place[2] + higher * max(move.height - move.end.place[2], 0.0)
+        aim = move.end.place[2] + higher * max(height - move.end.place[2], 0.0)
         flat = error[:2] * min(GAIN, pace * lifted / max(far, 1e-9))
-        rise = min(max(GAIN * (height - body.place[2]), -RISE), RISE)
+        rise = min(max(GAIN * (aim - body.place[2]), -least), most)
         turning = min(max(GAIN * turn, -TURN), TURN) * lifted * pace / CARRY
         return np.array([*flat, rise]), turning
+
+    def _passing(self, body: Cuboid, way: Floats, reach: float) -> float:
+        """Find how high a block must be to pass over walls on the next part of its way [m].
+
+        Args:
+            body: The block.
+            way: To its end, shape (3,) [m].
+            reach: How much of it is looked at, as seen from above [m].
+        """
+        height, ahead = 0.0, way[:2] / max(math.hypot(way[0], way[1]), 1e-9)
+        for far in np.linspace(0.0, reach, SAMPLES):
+            on = body.at(body.place + np.array([*far * ahead, 0.0]), body.yaw)
+            for wall in map(self._sight.body, self._sight.walls):
+                if on.depth_in(wall, margin=CLEARANCE, flat=True) > 0.0:
+                    height = max(height, wall.top + float(body.half[2]) + CLEARANCE)
+        return height
 
 
 def held(body: Cuboid, own: Floats) -> Grip | None:
