@@ -120,6 +120,26 @@ def test_two_fingers_carry_through_the_air_by_feedback() -> None:
 # --- one instance, many episodes ------------------------------------------------------------------
 
 
+def test_by_feedback_a_block_passes_a_wall_without_touching_it() -> None:
+    """It is above the wall while it is near it, and comes down beyond before it is at its goal."""
+    world, policy = world_of("pick_and_place", "mujoco"), Feedback()
+    world.do({"goal_block.polar": [0.1, math.pi / 2]})
+    wall = world["obstacle.size"]
+    low = 0.5 * float(world["tool_block.size"][2])
+    far, heights = [], []
+    for _ in range(world.max_episode_length):
+        world.step(policy(world))
+        assert not any({"tool_block", "obstacle"} == set(c.bodies) for c in world.backend.contacts())
+        place = world["tool_block.cartesian_position"]
+        far.append(float(np.linalg.norm((place - world["goal_block.cartesian_position"])[:2])))
+        heights.append(float(place[2]) - low)
+    above, away = np.array(heights), np.array(far)
+    assert above.max() > float(wall[2])
+    beyond = (away > 0.02) & (np.arange(len(away)) > above.argmax())
+    assert above[beyond].min() < above.max() - 0.008
+    assert world["fractional_success"] > 0.8
+
+
 @engines
 @pytest.mark.parametrize("made", [Grasp, Feedback])
 def test_it_begins_anew_with_an_episode(engine: str, made: Any) -> None:
