@@ -64,7 +64,7 @@ class Feedback:
     """
 
     def __init__(self) -> None:
-        self._programs: WeakKeyDictionary[Any, Following] = WeakKeyDictionary()
+        self._programs: WeakKeyDictionary[Any, Program] = WeakKeyDictionary()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle without what is going on."""
@@ -81,13 +81,13 @@ class Feedback:
             raise ActionError(problem, world.action_mode)
         program = self._programs.get(world)
         if program is None or not program.goes_on(world):
-            program = self._programs[world] = Following(world)
+            program = self._programs[world] = Program(world)
         command = program.command(world)
         return program.hand.tips(command) if "effector" in world.action_mode else command
 
 
 @final
-class Following:
+class Program:
     """What is done in one episode, step by step.
 
     The only memory is the job: which block is taken, by which grip, and where to. All else is read
