@@ -445,7 +445,7 @@ _LIFTED: Fields = {**_BY_FEEDBACK, "episodes": 3_000, "updates": 30_000, "noise"
 LESSONS: Mapping[str, Fields] = {
     "pushing": _BY_FEEDBACK,
     "picking": _LIFTED,
-    "pick_and_place": {**_LIFTED, "noise": 0.02},
+    "pick_and_place": {**_LIFTED, "noise": 0.02, "symmetric": False},
     "stacking2": {"protocols": ("P1", "P5"), "episodes": 350, "rounds": 0},
 }
 """What differs from the usual lesson of imitation, by task."""

@@ -129,7 +129,9 @@ def test_by_feedback_a_block_passes_a_wall_without_touching_it() -> None:
     far, heights = [], []
     for _ in range(world.max_episode_length):
         world.step(policy(world))
-        assert not any({"tool_block", "obstacle"} == set(c.bodies) for c in world.backend.contacts())
+        assert not any(
+            {"tool_block", "obstacle"} == set(c.bodies) for c in world.backend.contacts()
+        )
         place = world["tool_block.cartesian_position"]
         far.append(float(np.linalg.norm((place - world["goal_block.cartesian_position"])[:2])))
         heights.append(float(place[2]) - low)

@@ -139,6 +139,14 @@ def test_symmetric_scenes_are_shown_besides() -> None:
     assert not np.allclose(more.observations[1::3], plain.observations)
 
 
+@pytest.mark.parametrize("task", ["pushing", "picking", "pick_and_place"])
+def test_usual_lessons_may_show_the_causes(task: str) -> None:
+    """Scenes that are turned have them, too; an episode ends after its first control step here."""
+    how = lesson(task, observations="privileged", settled=1, keep=0.0)
+    found = demonstrated(how, range(1), backend="mujoco", seed=0)
+    assert len(found) == (3 if how.symmetric else 1)
+
+
 def test_an_episode_ends_once_it_is_settled() -> None:
     """It is the beginning of the whole one, and its score is the one there."""
     whole, less = shown(1), shown(1, settled=3)

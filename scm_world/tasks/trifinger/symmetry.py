@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import UnknownOption
+from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import N_FINGERS
 
 JOINTS = ("joint_positions", "joint_velocities", "joint_torques", "action")
-UNTURNED = ("size", "mass", "friction")
+UNTURNED = ("size", "mass", "friction", "color", "type")
+UPRIGHT = ("position_gains", "velocity_gains", "safety_damping", "floor_color", "stage_color")
+"""What keeps its numbers: those of bodies, and vectors that are none of space."""
+
+ARROWS = ("gravity", "light_direction")
+FINGERS = tuple(f"robot_finger_{name}_" for name in hardware.FINGERS)
 _BEFORE = np.array([1, 2, 0])
 """Which finger stands, before the scene is turned by a third, where each one stands afterwards."""
 
@@ -26,16 +32,15 @@ def swapped(joints: Floats, thirds: int) -> Floats:
     return fingers.ravel()
 
 
-def turned(
-    values: Mapping[str, Value], names: Iterable[str], thirds: int, bodies: Collection[str]
-) -> dict[str, Any]:
+def turned(values: Mapping[str, Value], names: Iterable[str], thirds: int) -> dict[str, Any]:
     """Give the values of a scene that is turned about the vertical by thirds of a turn.
 
+    What belongs to a finger goes to the one that stands there afterwards; cameras are turned, too.
+
     Args:
-        values: Of these variables.
+        values: Of these variables, and of the same of other fingers.
         names: Of the variables that are wanted.
         thirds: How many.
-        bodies: Names of blocks and goals.
 
     Raises:
         UnknownOption: It is not known how a variable turns.
@@ -47,12 +52,16 @@ def turned(
 
     def one(name: str) -> Any:
         body, _, part = name.rpartition(".")
+        finger = next((i for i, own in enumerate(FINGERS) if body.startswith(own)), None)
+        if finger is not None:
+            before = FINGERS[int(swapped(np.arange(3.0), thirds)[finger])]
+            return np.asarray(values[name.replace(FINGERS[finger], before)], dtype=float)
         value = np.asarray(values[name], dtype=float)
         if name in JOINTS:
             return swapped(value, thirds)
         if name == "end_effector_positions":
             return swapped((value.reshape(N_FINGERS, 3) @ axes.T).ravel(), thirds)
-        if part in ("cartesian_position", "linear_velocity"):
+        if name in ARROWS or part in ("cartesian_position", "linear_velocity", "position"):
             return axes @ value
         if part == "orientation":
             x, y, z, w = value.tolist()
@@ -60,9 +69,13 @@ def turned(
                 [rest * x - half * y, rest * y + half * x, rest * z + half * w, rest * w - half * z]
             )
             return turn if turn[3] >= 0.0 else -turn
-        if part in UNTURNED and body in bodies:
+        if part in ("polar", "cylindrical_position"):
+            around = value + np.eye(len(value))[1] * angle
+            around[1] = math.remainder(around[1], 2.0 * math.pi)
+            return around
+        if part in UNTURNED or name in UPRIGHT or value.ndim == 0:
             return value
-        allowed = (*JOINTS, "end_effector_positions", "poses and sizes of blocks and goals")
+        allowed = (*JOINTS, "end_effector_positions", "poses, and parameters that are known")
         raise UnknownOption("observed variable of a symmetric lesson", name, allowed)
 
     return {name: one(name) for name in names}
