@@ -14,9 +14,11 @@ from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import N_FINGERS
 
 JOINTS = ("joint_positions", "joint_velocities", "joint_torques", "action")
-UNTURNED = ("size", "mass", "friction", "color", "type")
-UPRIGHT = ("position_gains", "velocity_gains", "safety_damping", "floor_color", "stage_color")
-"""What keeps its numbers: those of bodies, and vectors that are none of space."""
+UNTURNED = (
+    *("size", "mass", "friction", "color", "type"),
+    *("position_gains", "velocity_gains", "safety_damping", "floor_color", "stage_color"),
+)
+"""What keeps its numbers: parts of bodies, and vectors that do not point anywhere."""
 
 ARROWS = ("gravity", "light_direction")
 FINGERS = tuple(f"robot_finger_{name}_" for name in hardware.FINGERS)
@@ -73,7 +75,7 @@ def turned(values: Mapping[str, Value], names: Iterable[str], thirds: int) -> di
             around = value + np.eye(len(value))[1] * angle
             around[1] = math.remainder(around[1], 2.0 * math.pi)
             return around
-        if part in UNTURNED or name in UPRIGHT or value.ndim == 0:
+        if part in UNTURNED or value.ndim == 0:
             return value
         allowed = (*JOINTS, "end_effector_positions", "poses, and parameters that are known")
         raise UnknownOption("observed variable of a symmetric lesson", name, allowed)
