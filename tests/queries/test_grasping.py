@@ -117,9 +117,6 @@ def test_two_fingers_carry_through_the_air_by_feedback() -> None:
     assert job.move.over
 
 
-# --- one instance, many episodes ------------------------------------------------------------------
-
-
 def test_by_feedback_a_block_passes_a_wall_without_touching_it() -> None:
     """It is above the wall while it is near it, and comes down beyond before it is at its goal."""
     world, policy = world_of("pick_and_place", "mujoco"), Feedback()
@@ -140,6 +137,9 @@ def test_by_feedback_a_block_passes_a_wall_without_touching_it() -> None:
     beyond = (away > 0.02) & (np.arange(len(away)) > above.argmax())
     assert above[beyond].min() < above.max() - 0.008
     assert world["fractional_success"] > 0.8
+
+
+# --- one instance, many episodes ------------------------------------------------------------------
 
 
 @engines

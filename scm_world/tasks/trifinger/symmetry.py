@@ -20,7 +20,9 @@ UNTURNED = (
 )
 """What keeps its numbers: parts of bodies, and vectors that do not point anywhere."""
 
-ARROWS = ("gravity", "light_direction")
+VECTORS = ("gravity", "light_direction")
+"""What turns like a position, apart from parts of bodies."""
+
 FINGERS = tuple(f"robot_finger_{name}_" for name in hardware.FINGERS)
 _BEFORE = np.array([1, 2, 0])
 """Which finger stands, before the scene is turned by a third, where each one stands afterwards."""
@@ -63,7 +65,7 @@ def turned(values: Mapping[str, Value], names: Iterable[str], thirds: int) -> di
             return swapped(value, thirds)
         if name == "end_effector_positions":
             return swapped((value.reshape(N_FINGERS, 3) @ axes.T).ravel(), thirds)
-        if name in ARROWS or part in ("cartesian_position", "linear_velocity", "position"):
+        if name in VECTORS or part in ("cartesian_position", "linear_velocity", "position"):
             return axes @ value
         if part == "orientation":
             x, y, z, w = value.tolist()

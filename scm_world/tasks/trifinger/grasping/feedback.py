@@ -30,7 +30,7 @@ TRAVEL, CLOSE = 0.022, 0.006  # [m] per control step, of fingertips far from a b
 CARRY, TURN = 0.0045, 0.03  # [m], [rad] per control step, of a block
 RISE = 0.0012  # [m] per control step, upwards or downwards
 SINK, SLOWEST, FASTEST = 0.0015, 0.0006, 0.002  # [m] likewise, of a block that goes over a wall
-STIFF = 400.0  # [N/m] with which fingers pull at it when their command moves up
+STIFF = 400.0  # [N/m] of a fingertip: 10 N m/rad, the usual gain, at a lever of 0.16 m
 SOON = 0.03  # [m] of its way, for which it is high enough before it goes on
 FREE_GAIN, GAIN, HOLD = 0.35, 0.15, 0.4  # shares of an error that are corrected in a control step
 AHEAD = 0.02  # [m] that a command may be from where a fingertip is
@@ -285,15 +285,15 @@ class Program:
         burden = self._sight.burden(str(self._tool)) / max(press, 1e-9)
         pace = CARRY * max(min(max((0.7 - burden) / 0.5, 0.0), 1.0) ** 2, 0.3)
         height, most, least = move.height, RISE, RISE
-        below = min(height - float(body.place[2]), 0.014 - body.bottom)
+        below = height - float(body.place[2])
         if move.over and self._sight.walls:
             soon = self._passing(body, error, min(SOON, far))
             height = max(self._passing(body, error, far), float(body.half[2]) + CLEARANCE)
             below = soon - float(body.place[2]) if soon > 0.0 else 0.014 - body.bottom
             spare = self._sight.friction(str(self._tool)) * press * max(1.0 - burden, 0.0)
             most, least = min(max(spare / STIFF, SLOWEST), FASTEST), SINK
-        elif move.over:
-            below = height - float(body.place[2])
+        elif not move.over:
+            below = min(below, 0.014 - body.bottom)
         lifted = min(max((0.014 - below) / 0.006, 0.05), 1.0) if far > 0.015 else 1.0
         higher = min(max(max(far / 0.01, abs(turn) / 0.15) - 0.5, 0.0), 1.0)
         aim = move.end.place[2] + higher * max(height - move.end.place[2], 0.0)
