@@ -190,7 +190,9 @@ def clone(
         PolicyAbout(task=task, env={name: one[name] for name in OPTIONS if name in one})
         for one in (learned.options, usual.options)
     )
-    same = all(mine.option(name) == its.option(name) for name in (*FORM, *COMMON))
+    same = not learned.memory and all(
+        mine.option(name) == its.option(name) for name in (*FORM, *COMMON)
+    )
     if same and usual.network.activation == learned.network.activation:
         more = "" if observations is None else f" --observations {observations}"
         hidden = json.dumps(learned.network.hidden, separators=(",", ":"))

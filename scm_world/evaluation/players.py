@@ -244,7 +244,7 @@ def _network(policy: MlpPolicy | OnnxPolicy, name: str, env: ScmWorldEnv) -> Act
     if policy.made_for is not None:
         policy.made_for.check(env, name)
     policy.check(env.observe(), env.world.compiled.n_actions)
-    return policy
+    return _model(policy, env) if policy.made_for is not None and policy.made_for.memory else policy
 
 
 def _of_world(make: Any, name: str, env: ScmWorldEnv) -> Actor:

@@ -87,6 +87,8 @@ class PolicyAbout(Frozen):
         output: Keeps actions in [-1, 1].
         inputs: Parts of a dictionary observation in the order in which they are joined; None: the
             observation is one array.
+        memory: How many numbers the network gives after its action; it gets their signs back after
+            the next observation, and zeros in an episode's first control step.
         card: How it was trained and how well it does, as JSON.
     """
 
@@ -97,6 +99,7 @@ class PolicyAbout(Frozen):
     activation: Literal["tanh", "relu"] = "tanh"
     output: Literal["clip", "tanh"] = "clip"
     inputs: tuple[str, ...] | None = None
+    memory: int = Field(default=0, ge=0)
     card: dict[str, JsonValue] = Field(default_factory=dict)
 
     @field_validator("env", "card")

@@ -86,11 +86,16 @@ class MlpPolicy:
     def __post_init__(self) -> None:
         kind = tasks().get(self.about.task)
         wanted = len(kind.rest) or None if kind is not None else None
-        problems = [*_misfits("layers", self.layers, None, wanted)]
+        memory = self.about.memory
+        problems = [*_misfits("layers", self.layers, None, wanted and wanted + memory)]
+        if memory and not problems and min(self.n_observed, self.n_actions) < 1:
+            problems = [f"layers: too narrow for a memory of {memory} numbers"]
+        if memory and (self.value or self.log_std is not None):
+            problems.append("a policy with a memory has neither log_std nor value.layers")
         if self.value and not problems:
             problems = [*_misfits("value.layers", self.value, self.n_observed, 1)]
         if self.log_std is not None and not problems:
-            shape = self.layers[-1].bias.shape
+            shape = (self.n_actions,)
             if not _is_good(self.log_std, shape):
                 problems = [f"log_std: expected shape {shape} and finite numbers"]
         if problems:
@@ -104,12 +109,12 @@ class MlpPolicy:
     @property
     def n_observed(self) -> int:
         """Number of components of an observation."""
-        return int(self.layers[0].weight.shape[0])
+        return int(self.layers[0].weight.shape[0]) - self.about.memory
 
     @property
     def n_actions(self) -> int:
         """Number of components of an action."""
-        return int(self.layers[-1].weight.shape[1])
+        return int(self.layers[-1].weight.shape[1]) - self.about.memory
 
     def __call__(
         self, observation: Any, *, generator: np.random.Generator | None = None
@@ -125,7 +130,8 @@ class MlpPolicy:
             for bit, the action that it gets alone.
 
         Raises:
-            ActionError: The observation has another number of components, or other parts.
+            ActionError: The observation has another number of components, or other parts; or the
+                policy has a memory.
             UnknownOption: There is a generator, but the standard deviations are not known.
         """
         found = self.mean(observation)
@@ -133,11 +139,17 @@ class MlpPolicy:
             if self.log_std is None:
                 raise UnknownOption("generator", generator, ("None: there is no log_std",))
             found = found + np.exp(self.log_std) * generator.standard_normal(found.shape)
+        return self._bounded(found)
+
+    def _bounded(self, found: Floats) -> Weights:
         found = np.tanh(found) if self.about.output == "tanh" else np.clip(found, -1.0, 1.0)
         return found.astype(np.float32)
 
     def mean(self, observation: Any) -> Floats:
         """Compute the mean before it is bounded, shape (..., n_actions); errors as above."""
+        if self.about.memory:
+            advice = "call policy.predict(observation, state=…, episode_start=…)"
+            raise ActionError(f"the policy has a memory; {advice}", None)
         return self._computed(self.layers, self.joined(observation))
 
     def values(self, observation: Any) -> Floats:
@@ -152,7 +164,7 @@ class MlpPolicy:
         return self._computed(self.value, self.joined(observation))
 
     def _computed(self, layers: tuple[Layer, ...], seen: NDArray[Any]) -> Floats:
-        x = np.ascontiguousarray(seen.reshape(-1, self.n_observed), dtype=np.float64)
+        x = np.ascontiguousarray(seen.reshape(-1, len(layers[0].weight)), dtype=np.float64)
         doubles = self._doubles if layers is self.layers else _in_doubles(layers)
         hidden = 1 if self.about.activation == "tanh" else 2
         for number, (weight, bias) in enumerate(doubles, start=1):
@@ -199,25 +211,37 @@ class MlpPolicy:
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = True,
-    ) -> tuple[Weights, None]:
+    ) -> tuple[Weights, Weights | None]:
         """Choose the action, with the signature of Stable-Baselines3.
 
         Args:
             observation: As above.
-            state: Not used: the policy has no memory.
-            episode_start: Not used either.
+            state: The memory that the last call returned, shape (..., memory); None: it is empty.
+            episode_start: Whether it is emptied first, a truth value or shape (...).
             deterministic: Must be true; draws need a generator: ``policy(…, generator=…)``.
 
         Returns:
-            The action, shape (..., n_actions), and no state.
+            The action, shape (..., n_actions), and the memory, of the values -1 and 1; None if the
+            policy has none.
 
         Raises:
-            ActionError: As above.
+            ActionError: As above, or the memory has another shape.
             UnknownOption: ``deterministic`` is false.
         """
         if not deterministic:
             raise UnknownOption("deterministic", deterministic, ("True",))
-        return self(observation), None
+        if not self.about.memory:
+            return self(observation), None
+        seen = self.joined(observation)
+        shape = (*seen.shape[:-1], self.about.memory)
+        kept = np.zeros(shape) if state is None else np.array(state, np.float64)
+        if kept.shape != shape:
+            raise ActionError(f"the memory has shape {shape}, got {kept.shape}", None)
+        if episode_start is not None:
+            kept[np.asarray(episode_start, bool).reshape(shape[:-1])] = 0.0
+        found = self._computed(self.layers, np.concatenate([seen, kept], axis=-1))
+        action, said = np.split(found, [self.n_actions], axis=-1)
+        return self._bounded(action), np.where(said > 0.0, 1.0, -1.0).astype(np.float32)
 
     def tensors(self) -> dict[str, Weights]:
         """Return the tensors of a file, by name."""

@@ -123,7 +123,7 @@ def begin_with(model: Any, recipe: Recipe, start: Path | str) -> None:
     given, mine = load_policy(start), exported(model, recipe, {})
     theirs, ours = given.tensors(), mine.tensors()
     pairs: dict[str, Any] = {n: (given.about.option(n), mine.about.option(n)) for n in FORM}
-    for name in ("activation", "output", "inputs"):
+    for name in ("activation", "output", "inputs", "memory"):
         pairs[name] = getattr(given.about, name), getattr(mine.about, name)
     for name in sorted({*theirs, *ours}):
         if name in theirs and name in ours:
@@ -234,11 +234,14 @@ def to_onnx(policy: MlpPolicy | Path | str, path: Path | str) -> Path:
 
     Raises:
         MissingExtra: The package onnx is not installed.
+        UnknownOption: The policy has a memory.
         UnreadableFile: The file is no policy.
         UnwritableFolder: There is no room, or no permission.
     """
     onnx: Any = load("onnx", "onnx")
     given = policy if isinstance(policy, MlpPolicy) else load_policy(policy)
+    if given.about.memory:
+        raise UnknownOption("memory of an ONNX network", given.about.memory, ("0: none",))
     made = _model(onnx, given)
     made.metadata_props.add(key=KEY, value=given.about.text())
     onnx.checker.check_model(made)

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, final
+from typing import Annotated, Any, Self, final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from scm_world._arguments import load, one_of, whole_number
 from scm_world._types import Floats
@@ -61,6 +61,9 @@ SEED = 5_000_003
 UNIT = 0.1
 """Of actions, while they are learned: errors of that size count fully, larger ones linearly."""
 
+CHANGES = 15.0
+"""How much more the loss counts where what is remembered changes, which is seldom."""
+
 ONLY: Mapping[str, tuple[Any, ...]] = {
     "normalize_actions": (True,),
     "observation_mode": ("structured", "full", "custom"),
@@ -94,6 +97,8 @@ class Lesson(Frozen):
             teacher ends; None for the whole length of each. Recordings are taken as they are.
         symmetric: Whether each control step is also shown as the task's symmetries have it: the
             robot with three fingers looks the same after a third of a turn.
+        memory: Whether the network learns what the teacher remembers, too: what it says about that
+            it gets back in the next control step; see ``scm_world.policies.PolicyAbout``.
         observations: Of the network: ``"plain"``, or ``"privileged"``: with every causal parameter.
         network: What learns.
         updates: Steps of the optimizer, each time.
@@ -120,6 +125,7 @@ class Lesson(Frozen):
     keep: Share = 0.9
     settled: Count | None = None
     symmetric: bool = False
+    memory: bool = False
     observations: Observations = "plain"
     network: Network = Field(default_factory=lambda: Network(activation="relu"))
     updates: Count = 20_000
@@ -144,6 +150,15 @@ class Lesson(Frozen):
                     f"{name} of a lesson", value, [json.dumps(one) for one in allowed]
                 )
         return env
+
+    @model_validator(mode="after")
+    def _remembers(self) -> Self:
+        if self.memory and self.symmetric:
+            raise UnknownOption("symmetric with memory", True, ("False",))
+        if self.memory and not hasattr(NAMED[self.teacher](), "memory"):
+            allowed = (f"False: {self.teacher!r} does not say what it remembers",)
+            raise UnknownOption("memory of a lesson", True, allowed)
+        return self
 
     @property
     def options(self) -> dict[str, Any]:
@@ -214,17 +229,26 @@ class Demonstrations:
     Attributes:
         observations: Shape (n, k).
         actions: What the teacher would have done, shape (n, n_actions), in [-1, 1].
+        before: What the teacher remembered before each control step, -1 or 1, or 0 in the first one
+            of an episode, shape (n, m); m is 0 without a memory.
+        after: What it remembered afterwards, of the same shape.
         scores: Fractional success at the end of each episode, shape (episodes,).
         kept: Whether it is among the pairs, shape (episodes,).
     """
 
     observations: NDArray[np.float32]
     actions: NDArray[np.float32]
+    before: NDArray[np.float32]
+    after: NDArray[np.float32]
     scores: Floats
     kept: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.observations)
+
+
+PAIRS = ("observations", "actions", "before", "after")
+"""Arrays of ``Demonstrations`` with a row for each control step."""
 
 
 def _load(path: Path) -> Demonstrations:
@@ -237,10 +261,11 @@ def _load(path: Path) -> Demonstrations:
         file = read_arrays(path)
         found = Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
         shapes = [array.shape for array in vars(found).values()]
-        seen, actions, scores, kept = shapes
-        if len(seen) != 2 or len(actions) != 2 or seen[0] != actions[0] or scores != kept:
+        *pairs, scores, kept = shapes
+        same = len({shape[0] for shape in pairs}) == 1 and pairs[2] == pairs[3]
+        if any(len(shape) != 2 for shape in pairs) or not same or scores != kept:
             raise ValueError(f"its arrays have the shapes {shapes}")
-        if not (np.isfinite(found.observations).all() and np.isfinite(found.actions).all()):
+        if not all(np.isfinite(getattr(found, name)).all() for name in PAIRS):
             raise ValueError("a number is not finite")
     except DAMAGED as error:
         advice = "remove it: the same call makes it again"
@@ -267,12 +292,9 @@ def joined(parts: Iterable[Demonstrations]) -> Demonstrations:
     lengths = {part.observations.shape[1] for part in filled}
     if len(lengths) != 1:
         raise ModelError([f"observations have several lengths: {sorted(lengths)}"])
-    return Demonstrations(
-        np.concatenate([part.observations for part in filled]),
-        np.concatenate([part.actions for part in filled]),
-        scores,
-        np.concatenate([part.kept for part in listed]),
-    )
+    kept = np.concatenate([part.kept for part in listed])
+    rows = {name: np.concatenate([getattr(part, name) for part in filled]) for name in PAIRS}
+    return Demonstrations(**rows, scores=scores, kept=kept)
 
 
 def demonstrated(
@@ -311,25 +333,22 @@ def demonstrated(
             )
             raise UnknownOption("task of a lesson", lesson.task, (allowed,))
         taught = chosen(lesson.protocols, protocols_of(lesson.task))
-        seen, done, scores = [], [], []
+        shown, scores = list[list[NDArray[np.float32]]](), list[float]()
         for number in numbers:
             protocol = taught[number % len(taught)]
             random = np.random.default_rng([seed, round_, number])
             turn, observation = runner.begin(protocol, seed=SEED + seed, episode=number)
             pairs, info = _episode(lesson, env, turn, observation, random, learner, metrics[0])
-            seen.append(np.array([one for one, _ in pairs], np.float32))
-            done.append(np.array([one for _, one in pairs], np.float32))
+            shown.append([np.array(one, np.float32) for one in zip(*pairs, strict=True)])
             scores.append(float(info[metrics[0]]))
     finally:
         runner.close()
     kept = np.array(scores) >= lesson.keep
-    empty = slice(0, 0)
-    return Demonstrations(
-        np.concatenate([seen[0][empty], *(one for one, k in zip(seen, kept, strict=True) if k)]),
-        np.concatenate([done[0][empty], *(one for one, k in zip(done, kept, strict=True) if k)]),
-        np.array(scores),
-        kept,
-    )
+    good = [one for one, is_good in zip(shown, kept, strict=True) if is_good]
+    none = [array[:0] for array in shown[0]]
+    rows = [np.concatenate(parts) for parts in zip(none, *good, strict=True)]
+    named = dict(zip(PAIRS, rows, strict=True))
+    return Demonstrations(**named, scores=np.array(scores), kept=kept)
 
 
 def _episode(
@@ -340,15 +359,18 @@ def _episode(
     random: np.random.Generator,
     learner: MlpPolicy | None,
     metric: str,
-) -> tuple[list[tuple[Any, Any]], dict[str, Any]]:
-    """Run an episode; return what was observed and what the teacher would have done, and infos."""
-    teacher, size = NAMED[lesson.teacher](), env.world.compiled.n_actions
+) -> tuple[list[tuple[Any, ...]], dict[str, Any]]:
+    """Run an episode; return the rows of ``PAIRS``, and the infos of its end."""
+    teacher: Any = NAMED[lesson.teacher]()
+    size = env.world.compiled.n_actions
     scale, share = lesson.noise * random.uniform(), lesson.share * random.uniform(0.0, 2.0)
     noises, learns, over, info = action_noise(random, size), False, False, dict[str, Any]()
-    pairs, row = [], 0
+    pairs, row, said = list[tuple[Any, ...]](), 0, np.empty(0)
     while not over:
         right = np.clip(env.toward(teacher(env.world)), -1.0, 1.0)
-        pairs.append((np.array(observation, np.float32), right.astype(np.float32)))
+        now = teacher.memory(env.world) if lesson.memory else said
+        before, said = said if pairs else np.zeros_like(now), now
+        pairs.append((observation, right, before, said))
         if lesson.symmetric:
             names = env.observed or ()
             scenes = list(env.world.task.symmetries(env.world.evaluate(names), names))
@@ -356,11 +378,12 @@ def _episode(
                 allowed = (f"False: {lesson.task} has no symmetries",)
                 raise UnknownOption("symmetric of a lesson", True, allowed)
             for scene, order in scenes:
-                turned = right[list(order)].astype(np.float32)
-                pairs.append((env.observe_values(scene), turned))
+                pairs.append((env.observe_values(scene), right[list(order)], before, said))
         if learner is not None and random.uniform() < 1.0 / lesson.stretch:
             learns = random.uniform() < share
-        action = learner(observation) if learner is not None and learns else right
+        action: Any = right
+        if learner is not None and learns:
+            action, _ = learner.predict(observation, before if lesson.memory else None)
         given: Any = np.clip(action + scale * next(noises), -1.0, 1.0)
         observation, _, terminated, truncated, info = env.step(given)
         row = row + 1 if float(info[metric]) >= lesson.keep else 0
@@ -402,6 +425,7 @@ def given_demonstrations(
     if any(options != kept[0] for options in kept):
         raise ModelError(["the recordings were made in environments with different options"])
     fields = {**lesson.model_dump(mode="json"), "env": json.loads(json.dumps(kept[0])), "rounds": 0}
+    fields |= {"symmetric": False, "memory": False}
     try:
         learned = Lesson.model_validate(fields)
     except ValidationError as error:
@@ -421,8 +445,9 @@ def _recorded(recording: Recording, keep: float) -> Demonstrations:
     kept = scores >= keep
     good = tuple(episode for episode, is_good in zip(recording, kept, strict=True) if is_good)
     none = np.empty((0, 1), np.float32), np.empty((0, 1), np.float32)
-    pairs = Recording(recording.environment, good).pairs() if good else none
-    return Demonstrations(*pairs, scores, kept)
+    seen, done = Recording(recording.environment, good).pairs() if good else none
+    nothing = np.empty((len(seen), 0), np.float32)
+    return Demonstrations(seen, done, nothing, nothing, scores, kept)
 
 
 # --- fitting --------------------------------------------------------------------------------------
@@ -432,6 +457,8 @@ def fitted(
     shown: Demonstrations, lesson: Lesson, *, seed: int
 ) -> tuple[dict[str, NDArray[np.float32]], float]:
     """Fit a network to demonstrations, by Adam on Huber's loss.
+
+    With a memory the network also learns what the teacher remembers afterwards, from that before.
 
     Observations are whitened: turned into their principal components, each with a standard
     deviation of one. So how far a fingertip is from a block counts as much as where both are. The
@@ -451,25 +478,33 @@ def fitted(
     """
     torch: Any = load("torch", "torch", "train")
     turn, shift = whitening(shown.observations)
-    seen = torch.from_numpy((shown.observations @ turn.T + shift).astype(np.float32))
+    white, n_actions = len(turn), shown.actions.shape[1]
+    whitened = (shown.observations @ turn.T + shift).astype(np.float32)
+    seen = torch.from_numpy(np.concatenate([whitened, shown.before], axis=1))
     done = torch.from_numpy(shown.actions / np.float32(UNIT))
-    after = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[lesson.network.activation]
-    losses = []
+    after, before = torch.from_numpy(shown.after), torch.from_numpy(shown.before)
+    weight = torch.where(after == before, 1.0, CHANGES)
+    unit = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[lesson.network.activation]
+    losses, huber = [], torch.nn.functional.smooth_l1_loss
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         layers: list[Any] = []
         width = seen.shape[1]
         for hidden in lesson.network.hidden:
-            layers += [torch.nn.Linear(width, hidden), after()]
+            layers += [torch.nn.Linear(width, hidden), unit()]
             width = hidden
-        network = torch.nn.Sequential(*layers, torch.nn.Linear(width, done.shape[1]))
+        network = torch.nn.Sequential(*layers, torch.nn.Linear(width, n_actions + after.shape[1]))
         optimizer = torch.optim.Adam(network.parameters(), lr=lesson.rate)
         falling = torch.optim.lr_scheduler.CosineAnnealingLR(
             optimizer, lesson.updates, eta_min=0.01 * lesson.rate
         )
         for _ in range(lesson.updates):
             rows = torch.randint(0, len(seen), (lesson.batch,))
-            loss = torch.nn.functional.smooth_l1_loss(network(seen[rows]), done[rows])
+            found = network(seen[rows])
+            loss = huber(found[:, :n_actions], done[rows])
+            if after.shape[1]:
+                said = huber(found[:, n_actions:], after[rows], reduction="none")
+                loss = loss + (weight[rows] * said).mean()
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
@@ -479,8 +514,13 @@ def fitted(
     if not np.isfinite(last):
         raise ModelError(["the loss is no finite number any more: take a smaller rate"])
     arrays = [tensor.detach().numpy().astype(np.float64) for tensor in network.parameters()]
-    arrays[:2] = [arrays[0] @ turn, arrays[0] @ shift + arrays[1]]
-    arrays[-2:] = [UNIT * array for array in arrays[-2:]]
+    first = arrays[0][:, :white]
+    arrays[:2] = [
+        np.concatenate([first @ turn, arrays[0][:, white:]], axis=1),
+        first @ shift + arrays[1],
+    ]
+    for array in arrays[-2:]:
+        array[:n_actions] *= UNIT
     names = [f"layers.{i // 2}.{('weight', 'bias')[i % 2]}" for i in range(len(arrays))]
     return {n: array.astype(np.float32) for n, array in zip(names, arrays, strict=True)}, last
 
@@ -623,6 +663,7 @@ def clone(
                 }
                 form: dict[str, Any] = {"task": lesson.task, "env": lesson.options, "card": card}
                 form["activation"] = lesson.network.activation
+                form["memory"] = pairs.after.shape[1]
                 policy = MlpPolicy.of(tensors, form)
                 save_policy(path, policy)  # nothing that fails later costs what was learned
                 save_policy(folder / "policy.safetensors", policy)

@@ -343,17 +343,22 @@ _PICKING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_ce
 _PLACING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_goal": 0.0}}
 
 
-def _reacting(**task_options: Any) -> Fields:
+def _reacting(*numbers: str, **task_options: Any) -> Fields:
     """Return what a grasp by feedback reacts to, and actions relative to its command.
 
     Neither velocities nor torques are observed, in which engines differ most. With relative
     commands a network corrects errors until they are gone, whatever the fingers weigh.
 
     Args:
+        numbers: Ends of the names of blocks and goals; one of each, without, if there are none.
         task_options: Arguments of the task, if any.
     """
     robot = ("joint_positions", "end_effector_positions", "action")
-    bodies = (f"{body}.cartesian_position" for body in ("tool_block", "goal_block"))
+    bodies = (
+        f"{body}{number}.cartesian_position"
+        for body in ("tool_block", "goal_block")
+        for number in numbers or ("",)
+    )
     return {
         **({"task_options": task_options} if task_options else {}),
         "delta_origin": "command",
@@ -417,8 +422,8 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
         "ppo": _FROM_A_CLONE,
     },
     "stacking2": {
-        None: {"curriculum": 1},
-        "ppo": {**_FROM_A_CLONE, "network": {"activation": "relu", "log_std": -3.0}},
+        None: {"env": _reacting("_1", "_2"), "curriculum": 1},
+        "ppo": _FROM_A_CLONE,
     },
 }
 """What differs from that, by task and algorithm."""
@@ -446,7 +451,16 @@ LESSONS: Mapping[str, Fields] = {
     "pushing": _BY_FEEDBACK,
     "picking": _LIFTED,
     "pick_and_place": {**_LIFTED, "noise": 0.02, "symmetric": False},
-    "stacking2": {"protocols": ("P1", "P5"), "episodes": 350, "rounds": 0},
+    "stacking2": {
+        **_LIFTED,
+        "env": {**ENV, **_reacting("_1", "_2")},
+        "protocols": ("P5",),
+        "noise": 0.02,
+        "keep": 0.7,
+        "symmetric": False,
+        "memory": True,
+        "trials": {"protocols": ("P0", "P5"), "episodes": 20},
+    },
 }
 """What differs from the usual lesson of imitation, by task."""
 

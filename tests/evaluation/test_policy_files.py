@@ -14,6 +14,7 @@ import safetensors.numpy
 from policy_samples import RELATIVE, policy, tensors, trained
 
 import scm_world
+from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
     ActionError,
     ModelError,
@@ -59,6 +60,59 @@ def test_an_observation_among_others_gets_the_action_that_it_gets_alone() -> Non
     for place in np.ndindex(SEEN.shape[:2]):
         np.testing.assert_array_equal(found(SEEN[place]), together[place])
     np.testing.assert_array_equal(found.predict(SEEN[0])[0], together[0])
+
+
+def test_a_memory_is_given_back_by_its_signs(tmp_path: Path) -> None:
+    """The network has it behind the observation and the action; it is empty in a first step."""
+    made = MlpPolicy.of(tensors(56 + 2, 16, 9 + 2), {"task": "pushing", "memory": 2})
+    assert (made.n_observed, made.n_actions) == (56, 9)
+    random = np.random.default_rng(0)
+    seen, kept = random.normal(size=(3, 56)), random.choice([-1.0, 1.0], (3, 2))
+    plain = MlpPolicy.of(tensors(56 + 2, 16, 9 + 2))
+    wanted = plain.mean(np.concatenate([seen, kept], axis=1))
+    action, state = made.predict(seen, kept)
+    np.testing.assert_array_equal(action, np.clip(wanted[:, :9], -1.0, 1.0).astype(np.float32))
+    np.testing.assert_array_equal(state, np.where(wanted[:, 9:] > 0.0, 1.0, -1.0))
+    first = [True, False, True]
+    emptied, _ = made.predict(seen, kept, first)
+    np.testing.assert_array_equal(emptied[1], action[1])
+    np.testing.assert_array_equal(emptied[[0, 2]], made.predict(seen[[0, 2]])[0])
+    again = load_policy(save_policy(tmp_path / "p.safetensors", made))
+    assert again.about.memory == 2
+    assert again.sha256 == made.sha256
+
+
+def test_a_memory_that_would_be_lost_is_refused() -> None:
+    """A call alone has none, and the networks of PPO have none."""
+    made = MlpPolicy.of(tensors(56 + 2, 16, 9 + 2), {"task": "pushing", "memory": 2})
+    with pytest.raises(ActionError, match=r"memory.*predict"):
+        made(np.zeros(56))
+    with pytest.raises(ActionError, match=r"shape \(2,\), got \(3,\)"):
+        made.predict(np.zeros(56), np.zeros(3))
+    with pytest.raises(ModelError, match="neither log_std"):
+        MlpPolicy.of({**made.tensors(), "log_std": np.zeros(9, np.float32)}, made.about)
+    with pytest.raises(ModelError, match="too narrow"):
+        MlpPolicy.of(tensors(3, 2), {"task": "any", "memory": 2})
+
+
+def test_a_memory_lasts_for_an_episode_of_an_evaluation() -> None:
+    """It is empty again in the next one."""
+    made = MlpPolicy.of(
+        tensors(56 + 2, 16, 9 + 2), {"task": "pushing", "env": RELATIVE, "memory": 2}
+    )
+    env = ScmWorldEnv("pushing", max_episode_length=4, **RELATIVE)
+    player, kept = as_player(made), []
+    for _ in range(2):
+        observation, _ = env.reset(seed=0)
+        player.begin(env)
+        state = None
+        for _ in range(4):
+            action, state = made.predict(observation, state)
+            np.testing.assert_array_equal(player.act(observation), action)
+            observation, *_ = env.step(action)
+            kept.append(action)
+    np.testing.assert_array_equal(kept[:4], kept[4:])
+    env.close()
 
 
 def test_parts_of_an_observation_are_joined_in_their_order() -> None:

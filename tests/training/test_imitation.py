@@ -147,6 +147,47 @@ def test_usual_lessons_may_show_the_causes(task: str) -> None:
     assert len(found) == (3 if how.symmetric else 1)
 
 
+def test_what_a_teacher_remembers_is_shown() -> None:
+    """It is what it remembered one control step ago; at first it is nothing."""
+    found = demonstrated(
+        lesson("stacking2", settled=None, keep=0.0, env=SHORT), range(2), backend="mujoco", seed=0
+    )
+    assert found.after.shape == found.before.shape == (24, 7)  # two blocks, three fingers, two more
+    np.testing.assert_array_equal(found.before[[0, 12]], 0.0)
+    np.testing.assert_array_equal(found.before[1:12], found.after[:11])
+    assert {*np.unique(found.after)} == {-1.0, 1.0}
+    assert (found.after[:, :2].sum(axis=1) == 0.0).all()  # one block of two is taken
+    assert (found.after[:, 2:5].sum(axis=1) >= 1.0).all()  # by two fingers at least
+
+
+def test_a_network_learns_to_remember() -> None:
+    """An action that follows from what was seen in the first control step only."""
+    pytest.importorskip("torch")
+    random = np.random.default_rng(0)
+    seen = random.normal(size=(400, 10, 3)).astype(np.float32)
+    sign = np.where(seen[:, :1, :1] > 0.0, 1.0, -1.0).astype(np.float32)
+    after = np.broadcast_to(sign, (400, 10, 1)).copy()
+    before = after.copy()
+    before[:, 0] = 0.0
+    rows = (array.reshape(4000, -1) for array in (seen, 0.5 * after, before, after))
+    shown_ = Demonstrations(*rows, np.ones(400), np.ones(400, bool))
+    how = lesson("picking", updates=600, batch=256, network={"hidden": [32]})
+    network, _ = fitted(shown_, how, seed=0)
+    policy = MlpPolicy.of(network, {"task": "any", "activation": "relu", "memory": 1})
+    fresh, state = random.normal(size=(10, 100, 3)), None
+    for now in fresh:
+        action, state = policy.predict(now, state)
+    assert (np.sign(action[:, 0]) == np.sign(fresh[0, :, 0])).mean() > 0.75
+
+
+def test_only_a_teacher_that_says_what_it_remembers_teaches_it() -> None:
+    """Nor are scenes turned then."""
+    with pytest.raises(UnknownOption, match=r"memory of a lesson.*'grasp' does not say"):
+        lesson("picking", teacher="grasp", symmetric=False, memory=True)
+    with pytest.raises(UnknownOption, match="symmetric with memory"):
+        lesson("picking", memory=True)
+
+
 def test_an_episode_ends_once_it_is_settled() -> None:
     """It is the beginning of the whole one, and its score is the one there."""
     whole, less = shown(1), shown(1, settled=3)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scm_world.errors import MissingExtra, UnreadableFile
+from scm_world.errors import MissingExtra, UnknownOption, UnreadableFile
 from scm_world.policies import MlpPolicy, save_policy
 from scm_world.training.export import to_onnx
 
@@ -63,6 +63,8 @@ def test_networks_act_as_policies(form: dict[str, Any], tmp_path: Path) -> None:
 def test_what_cannot_be_written_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No policy, or no library."""
     pytest.importorskip("onnx")
+    with pytest.raises(UnknownOption, match="memory of an ONNX network"):
+        to_onnx(MlpPolicy.of(policy().tensors(), {"memory": 1, "task": "any"}), tmp_path / "p.onnx")
     with pytest.raises(UnreadableFile, match="nothing"):
         to_onnx(tmp_path / "nothing.safetensors", tmp_path / "policy.onnx")
     monkeypatch.setitem(sys.modules, "onnx", None)

@@ -14,7 +14,7 @@ from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, turns
 from scm_world.tasks.trifinger.grasping.ways import Move, Planner, Way
 
 ENOUGH = 0.93
-"""Share of a goal that a block fills where it is left alone."""
+"""Share of a goal that a block usually fills where it is left alone."""
 
 FAIR = 0.8
 LATE = 70
@@ -66,16 +66,25 @@ class Choice:
         sight: Of the world.
         holds: Whether the block with the highest goal is held there, even if it could stand.
         swings: Whether two fingers may hold a block in the air, and rather do so than three.
+        enough: Share of a goal that a block fills where it is left alone.
     """
 
-    def __init__(self, sight: Sight, *, holds: bool = False, swings: bool = False) -> None:
+    def __init__(
+        self,
+        sight: Sight,
+        *,
+        holds: bool = False,
+        swings: bool = False,
+        enough: float = ENOUGH,
+    ) -> None:
         self._sight, self._swings = sight, swings
         self._bodies = sight.solid()
         self._goals = {goal: sight.body(goal) for _, goal in sight.pairs}
         height = {goal: float(body.place[2]) for goal, body in self._goals.items()}
         pairs = sorted(sight.pairs, key=lambda pair: height[pair[1]])
         self._kept = pairs[-1][1] if holds and pairs else None
-        enough = ENOUGH if sight.left > LATE else FAIR  # in the end, better not touch it again
+        if sight.left <= LATE:
+            enough = min(enough, FAIR)  # in the end, better not touch it again
         self._todo = [
             (tool, goal)
             for tool, goal in pairs

@@ -47,7 +47,8 @@ LANDING, TILTED, SOFT = 0.012, 0.1, 0.6  # [m], sine, share: a block that swings
 LAG, TWIST = 0.015, 0.2  # [m], [rad] that a held block may be behind its command
 BACK = 0.0005  # [m] by which slipping fingertips are brought back
 PUSHED = 0.06  # [rad] that a command changes in a step while fingers press
-ARRIVED = np.array([0.003, 0.04])  # [m, rad] of a block that is let go of
+ARRIVED = np.array([0.005, 0.06])  # [m, rad] of a block that is let go of, at once
+ENOUGH = 0.85  # share of a goal that such a block fills then, where it is left alone
 AGAIN, STUCK, RETREAT = 25, 100, 14
 """Control steps until another plan, until fingers count as stuck, and that they then go back."""
 
@@ -85,6 +86,15 @@ class Feedback:
         command = program.command(world)
         return program.hand.tips(command) if "effector" in world.action_mode else command
 
+    def memory(self, world: Any) -> Floats:
+        """Say what it remembers after the action of the present step, by -1 for no and 1 for yes.
+
+        Returns:
+            Shape (n + 5,) where there are n blocks with goals: which of them it takes, which
+            fingers take part, whether they let go, and whether they go back since they were stuck.
+        """
+        return self._programs[world].memory()
+
 
 @final
 class Program:
@@ -104,7 +114,7 @@ class Program:
         self._sight = Sight(world)
         self._tool: str | None = None
         self._move: Move | None = None
-        self._idle = self._still = self._waiting = self._back = 0
+        self._idle = self._waiting = self._back = 0
         self._opens = False
         self._unit, self._next = unit(world), world.index
 
@@ -116,6 +126,12 @@ class Program:
     def goes_on(self, world: Any) -> bool:
         """Tell whether the present is the step after the last one."""
         return bool(world.index == self._next and self._unit == unit(world))
+
+    def memory(self) -> Floats:
+        """Say what is remembered; see ``Feedback.memory``."""
+        used = self._move.grip.used if self._move is not None else (False,) * 3
+        taken = [self._move is not None and tool == self._tool for tool, _ in self._sight.pairs]
+        return np.where([*taken, *used, self._opens, self._back > 0], 1.0, -1.0)
 
     def command(self, world: Any) -> Floats:
         """Give the joint positions to command now, shape (9,) [rad]."""
@@ -168,17 +184,16 @@ class Program:
         if move is not None:
             body = self._body()
             error = math.dist(move.end.place, body.place), abs(self._turn(move, body))
-            self._still = self._still + 1 if bool((np.array(error) < ARRIVED).all()) else 0
             stuck = self._waiting > STUCK
             if stuck:
                 self._back = RETREAT
-            self._opens |= move.release and self._still > 3
+            self._opens |= move.release and bool((np.array(error) < ARRIVED).all())
             if stuck or (self._opens and self._open(move, body)) or math.hypot(*body.lean) > 0.6:
                 move = self._move = None
                 self._idle = 0
         if move is None and self._idle <= 0 and self._back <= 0:
-            job = Choice(self._sight, holds=True, swings=True).job()
-            self._idle, self._still, self._waiting, self._opens = AGAIN, 0, 0, False
+            job = Choice(self._sight, holds=True, swings=True, enough=ENOUGH).job()
+            self._idle, self._waiting, self._opens = AGAIN, 0, False
             if job is not None:
                 self._tool, self._move = job.tool, job.move
         return self._move
