@@ -16,7 +16,7 @@ from scm_world.policies.scripted import Policy, as_policy
 from scm_world.queries.equations import Equations, System
 from scm_world.queries.plans import GroupedSchedules, Key, Layer, Schedule
 from scm_world.world import Audit, Simulation
-from scm_world.world.batch import Batch, Table
+from scm_world.world.batch import Batch, StateTable
 
 EVERY = 10
 """Control steps from one snapshot to the next."""
@@ -267,7 +267,7 @@ class RunningTogether:
         self._shifts = [0] * len(units)  # of the clock: an intervention can set it
         n_actions = self._rows[0].world.compiled.n_actions
         self._commands = np.zeros((self._steps, len(batch), n_actions))
-        self._columns: dict[int, tuple[Table, _Columns]] = {}
+        self._columns: dict[int, tuple[StateTable, _Columns]] = {}
         self._numbers: list[list[Floats]] = [[] for _ in units]  # of rows, not in the trace yet
         self._read_by: list[_Columns | None] = [None] * len(units)
 
@@ -366,7 +366,7 @@ class _Columns:
     names: dict[str, tuple[slice, tuple[int, ...]]]
 
     @classmethod
-    def of(cls, table: Table, names: Sequence[str]) -> _Columns:
+    def of(cls, table: StateTable, names: Sequence[str]) -> _Columns:
         """Find them."""
         model, width = table.compiled.model, table.state_size
         parts, places = [np.arange(width)], {}

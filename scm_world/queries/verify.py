@@ -17,7 +17,7 @@ from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import Probe
 from scm_world.queries.experiments.probes import probes as probe_states
-from scm_world.queries.experiments.together import Together
+from scm_world.queries.experiments.together import JointExperiments
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.laws import check_laws
 from scm_world.queries.progress import Progress
@@ -195,7 +195,7 @@ class _Experiments:
     def __init__(self, world: Simulation, seed: int, causes: set[str] | None = None) -> None:
         self._paired = Paired(world, seed, causes=causes)
         self.effects, self.targets = self._paired.effects, self._paired.targets
-        self._together = Together(world, seed, self.effects)
+        self._together = JointExperiments(world, seed, self.effects)
 
     def run(self, number: int, probe: Probe) -> None:
         """Do all experiments of one probe state."""

@@ -21,7 +21,7 @@ KEPT = 4
 
 
 @final
-class Table:
+class StateTable:
     """The present of worlds of one structure: a row for each world, columns for variables.
 
     Args:
@@ -96,7 +96,7 @@ class Batch:
         self._engine = backends[0].batch(backends, count)
         self._names = tuple(names)
         n = len(self._worlds)
-        self._tables: dict[CompiledTask, Table] = {}
+        self._tables: dict[CompiledTask, StateTable] = {}
         self._kinds: list[tuple[Any, ...]] = [()] * n  # table, mode and substeps of each world
         self._groups: list[tuple[Any, Integers]] | None = None  # all worlds, by these
         self._stepped = np.zeros(n, dtype=np.bool_)  # the world does not know yet
@@ -129,14 +129,14 @@ class Batch:
         for row in rows[~self._ready[rows]].tolist():
             self._take(row)
 
-    def table(self, index: int) -> Table:
+    def table(self, index: int) -> StateTable:
         """Give the table in whose row of this number the present of a world is."""
         kind = self._kinds[index]
         return kind[0] if kind else self._table(self._worlds[index].compiled)
 
-    def tables(self, rows: Integers) -> list[tuple[Table, Integers]]:
+    def tables(self, rows: Integers) -> list[tuple[StateTable, Integers]]:
         """Give the tables of some worlds, each with the rows of those that are in it."""
-        found: dict[Table, list[Integers]] = {}
+        found: dict[StateTable, list[Integers]] = {}
         for (table, *_), members in self._grouped(rows):
             found.setdefault(table, []).append(members)
         return [(table, np.sort(np.concatenate(parts))) for table, parts in found.items()]
@@ -177,7 +177,7 @@ class Batch:
             self._fresh[members] = True
 
     def _step(
-        self, table: Table, mode: Any, substeps: int, rows: Integers, commands: Floats
+        self, table: StateTable, mode: Any, substeps: int, rows: Integers, commands: Floats
     ) -> None:
         matrix, mechanisms = table.matrix, table.compiled.mechanisms
         if not self._translating:
@@ -233,14 +233,14 @@ class Batch:
             else:
                 rows.discard(row)
 
-    def _table(self, compiled: CompiledTask) -> Table:
+    def _table(self, compiled: CompiledTask) -> StateTable:
         found = self._tables.get(compiled)
         if found is None:
             used = {id(kind[0]) for kind in self._kinds if kind}
             unused = [key for key, table in self._tables.items() if id(table) not in used]
             for key in unused[: max(0, len(self._tables) + 1 - KEPT)]:
                 del self._tables[key]
-            found = Table(compiled, self._names, len(self._worlds))
+            found = StateTable(compiled, self._names, len(self._worlds))
             self._tables[compiled] = found
         return found
 

@@ -20,7 +20,7 @@ from scm_world.env.vector import KEYPOINTS, Vector
 from scm_world.errors import EngineFailure, ScmWorldError
 from scm_world.tasks.rewards import FRACTION, SUCCESS, one_number
 from scm_world.variables.reserved import CONTROL_INDEX, SENSOR_NOISE
-from scm_world.world.batch import Batch, Table
+from scm_world.world.batch import Batch, StateTable
 from scm_world.world.mechanisms import FunctionFailure, places
 
 
@@ -47,7 +47,7 @@ class NativeExecutor(LoopExecutor):
         self._reads = None if self._delta is None else self._delta.reads
         names = (*lead._needed, *(() if self._reads is None else (self._reads,)))
         self._batch = Batch([env.world for env in self.envs], threads=threads, names=names)
-        self._readers: WeakKeyDictionary[Table, ObservationReader] = WeakKeyDictionary()
+        self._readers: WeakKeyDictionary[StateTable, ObservationReader] = WeakKeyDictionary()
         self._commands = np.empty((num_envs, lead.world.compiled.n_actions))
         # Where joints were put since the last command: relative actions are relative to them.
         self._are_set = np.zeros(num_envs, dtype=np.bool_)
@@ -200,7 +200,7 @@ class ObservationReader:
         clock: Column of the number of control steps.
     """
 
-    def __init__(self, env: ScmWorldEnv, table: Table) -> None:
+    def __init__(self, env: ScmWorldEnv, table: StateTable) -> None:
         seen: Any = env._observer
         goals = env._goals
         together = isinstance(seen, DictObserver)
@@ -224,7 +224,7 @@ class ObservationReader:
         self._success, self._fraction = where.get(SUCCESS), where.get(FRACTION)
         self.clock, self._scale, self._limit = where[CONTROL_INDEX], env._scale, env.limit
 
-    def write(self, table: Table, rows: Integers, buffers: Buffers) -> int | None:
+    def write(self, table: StateTable, rows: Integers, buffers: Buffers) -> int | None:
         """Write some rows of the buffers.
 
         Returns:

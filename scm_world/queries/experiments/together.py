@@ -57,7 +57,7 @@ Differing = dict[str, tuple[int, float]]
 
 
 @final
-class Together:
+class JointExperiments:
     """Experiments with one world in which many variables are changed together.
 
     Args:
