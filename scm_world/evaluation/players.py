@@ -352,6 +352,8 @@ def in_world(policy: Any, world: Simulation) -> Policy:
     Raises:
         UnknownOption: There is no such policy, or it was trained with other options.
         SnapshotMismatch: When it acts: that world has another task or other options.
+        ActionError: When it acts: it has a memory, and this is not the control step after the last
+            one, as in a branch of an episode.
 
     Example:
         >>> from scm_world.queries import World
@@ -371,13 +373,19 @@ def in_world(policy: Any, world: Simulation) -> Policy:
         conventions=world.conventions.name,
         **options,
     )
-    episode: list[tuple[int, int]] = []
+    remembers = player.made_for is not None and player.made_for.memory > 0
+    last = (-1, -1, -1)
 
     def act(now: Simulation) -> Floats:
+        nonlocal last
         env.world.restore(now.snapshot())
-        if now.index == 0 or [(now.noise.seed, now.episode)] != episode:
-            episode[:] = [(now.noise.seed, now.episode)]
+        present = now.noise.seed, now.episode, now.index
+        if now.index > 0 and remembers and present != (*last[:2], last[2] + 1):
+            problem = "a policy with a memory acts from the first control step on, in one world"
+            raise ActionError(f"{problem}; make one for each branch, and begin at step 0", None)
+        if now.index == 0 or present[:2] != last[:2]:
             player.begin(env)
+        last = present
         return env.command(player.act(env.observe()))
 
     return act

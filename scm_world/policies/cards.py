@@ -166,8 +166,9 @@ class PolicyAbout(Frozen):
         return type(self)(**{**self.model_dump(), "card": {**self.card, **entries}})
 
     def text(self) -> str:
-        """Return it as JSON."""
-        return json.dumps(self.model_dump(mode="json"), allow_nan=False)
+        """Return it as JSON; what earlier versions do not know only if there is some."""
+        left_out = set() if self.memory else {"memory"}
+        return json.dumps(self.model_dump(mode="json", exclude=left_out), allow_nan=False)
 
     @classmethod
     def of(cls, given: Mapping[str, Any] | str | PolicyAbout) -> Self:

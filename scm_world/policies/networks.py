@@ -1,8 +1,9 @@
 """Multilayer perceptrons in safetensors files and in archives of Stable-Baselines 2.
 
 A safetensors file has the tensors ``layers.<i>.weight`` (outputs, inputs) and ``layers.<i>.bias``,
-from the observation to the action; it may have ``log_std``, and ``value.layers.<i>…`` of a second
-network for the value of the state. Its metadata has a ``PolicyAbout`` under ``"scm_world"``.
+from the observation to the action, each followed by the memory if there is one; it may have
+``log_std``, and ``value.layers.<i>…`` of a second network for the value of the state. Its metadata
+has a ``PolicyAbout`` under ``"scm_world"``.
 
 An archive of Stable-Baselines 2 is a zip file. Its member ``parameters`` is a numpy archive of
 plain arrays; its member ``data`` holds pickled Python objects and is never opened. Reading a file
@@ -69,7 +70,8 @@ class MlpPolicy:
     """A normal distribution over actions whose mean is a multilayer perceptron.
 
     Attributes:
-        layers: From the observation to the action; all but the last are hidden.
+        layers: From the observation to the action, each followed by the memory if there is one; all
+            but the last are hidden.
         log_std: Logarithm of the standard deviations of the actions, shape (n,), if known.
         value: The layers of the network for the value of the state, if known.
         made_for: What it was trained for, if known.
@@ -217,7 +219,7 @@ class MlpPolicy:
         Args:
             observation: As above.
             state: The memory that the last call returned, shape (..., memory); None: it is empty.
-            episode_start: Whether it is emptied first, a truth value or shape (...).
+            episode_start: Whether it is emptied first, a truth value or shape (...); not if None.
             deterministic: Must be true; draws need a generator: ``policy(…, generator=…)``.
 
         Returns:
@@ -234,11 +236,16 @@ class MlpPolicy:
             return self(observation), None
         seen = self.joined(observation)
         shape = (*seen.shape[:-1], self.about.memory)
-        kept = np.zeros(shape) if state is None else np.array(state, np.float64)
-        if kept.shape != shape:
-            raise ActionError(f"the memory has shape {shape}, got {kept.shape}", None)
-        if episode_start is not None:
-            kept[np.asarray(episode_start, bool).reshape(shape[:-1])] = 0.0
+        try:
+            kept = np.zeros(shape) if state is None else np.array(state, np.float64)
+            first = np.asarray(False if episode_start is None else episode_start, bool)
+            first = first.reshape(shape[:-1] if first.size > 1 else ())
+        except (TypeError, ValueError) as error:
+            raise ActionError(f"no memory of shape {shape}: {error}", None) from None
+        if kept.shape != shape or not np.isin(kept, (-1.0, 0.0, 1.0)).all():
+            wanted = f"the memory has shape {shape} and the values -1, 0 and 1"
+            raise ActionError(f"{wanted}, got {np.array(state)}", None)
+        kept[np.broadcast_to(first, shape[:-1])] = 0.0
         found = self._computed(self.layers, np.concatenate([seen, kept], axis=-1))
         action, said = np.split(found, [self.n_actions], axis=-1)
         return self._bounded(action), np.where(said > 0.0, 1.0, -1.0).astype(np.float32)

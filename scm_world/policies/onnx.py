@@ -65,6 +65,8 @@ class OnnxPolicy:
         except ModelError as error:
             reason = f"its metadata {KEY!r}: {'; '.join(error.problems)}"
             raise UnreadableFile(str(path), reason, _ADVICE) from None
+        if self.made_for is not None and self.made_for.memory:
+            raise UnreadableFile(str(path), "its metadata says that it has a memory", _ADVICE)
 
     def __reduce__(self) -> Any:
         """Pickle what was read: the file may change meanwhile."""

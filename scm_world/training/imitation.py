@@ -98,7 +98,8 @@ class Lesson(Frozen):
         symmetric: Whether each control step is also shown as the task's symmetries have it: the
             robot with three fingers looks the same after a third of a turn.
         memory: Whether the network learns what the teacher remembers, too: what it says about that
-            it gets back in the next control step; see ``scm_world.policies.PolicyAbout``.
+            it gets back in the next control step; see ``scm_world.policies.PolicyAbout``. Not from
+            recordings. In rounds it is given what the teacher remembers.
         observations: Of the network: ``"plain"``, or ``"privileged"``: with every causal parameter.
         network: What learns.
         updates: Steps of the optimizer, each time.
@@ -154,7 +155,7 @@ class Lesson(Frozen):
     @model_validator(mode="after")
     def _remembers(self) -> Self:
         if self.memory and self.symmetric:
-            raise UnknownOption("symmetric with memory", True, ("False",))
+            raise UnknownOption("symmetric", True, ("False", "True with memory=False"))
         if self.memory and not hasattr(NAMED[self.teacher](), "memory"):
             allowed = (f"False: {self.teacher!r} does not say what it remembers",)
             raise UnknownOption("memory of a lesson", True, allowed)
@@ -289,9 +290,9 @@ def joined(parts: Iterable[Demonstrations]) -> Demonstrations:
             "smaller keep"
         )
         raise ModelError([problem])
-    lengths = {part.observations.shape[1] for part in filled}
+    lengths = {(part.observations.shape[1], part.after.shape[1]) for part in filled}
     if len(lengths) != 1:
-        raise ModelError([f"observations have several lengths: {sorted(lengths)}"])
+        raise ModelError([f"observations and memories have several lengths: {sorted(lengths)}"])
     kept = np.concatenate([part.kept for part in listed])
     rows = {name: np.concatenate([getattr(part, name) for part in filled]) for name in PAIRS}
     return Demonstrations(**rows, scores=scores, kept=kept)

@@ -22,9 +22,10 @@ from scm_world.errors import (
     UnreadableFile,
     UnwritableFolder,
 )
-from scm_world.evaluation.players import as_player, player_from
+from scm_world.evaluation.players import as_player, in_world, player_from
 from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, networks, save_policy
 from scm_world.policies.cards import KEY, OPTIONS, USUAL
+from scm_world.queries import World
 
 SEEN = np.random.default_rng(1).uniform(-1, 1, (5, 4, 56)).astype(np.float32)
 
@@ -74,6 +75,7 @@ def test_a_memory_is_given_back_by_its_signs(tmp_path: Path) -> None:
     np.testing.assert_array_equal(action, np.clip(wanted[:, :9], -1.0, 1.0).astype(np.float32))
     np.testing.assert_array_equal(state, np.where(wanted[:, 9:] > 0.0, 1.0, -1.0))
     first = [True, False, True]
+    np.testing.assert_array_equal(made.predict(seen, kept, True)[0], made.predict(seen)[0])
     emptied, _ = made.predict(seen, kept, first)
     np.testing.assert_array_equal(emptied[1], action[1])
     np.testing.assert_array_equal(emptied[[0, 2]], made.predict(seen[[0, 2]])[0])
@@ -87,8 +89,12 @@ def test_a_memory_that_would_be_lost_is_refused() -> None:
     made = MlpPolicy.of(tensors(56 + 2, 16, 9 + 2), {"task": "pushing", "memory": 2})
     with pytest.raises(ActionError, match=r"memory.*predict"):
         made(np.zeros(56))
-    with pytest.raises(ActionError, match=r"shape \(2,\), got \(3,\)"):
+    with pytest.raises(ActionError, match=r"memory has shape \(2,\)"):
         made.predict(np.zeros(56), np.zeros(3))
+    with pytest.raises(ActionError, match="values -1, 0 and 1"):
+        made.predict(np.zeros(56), np.full(2, np.nan))
+    with pytest.raises(ActionError, match="no memory of shape"):
+        made.predict(np.zeros((3, 56)), episode_start=[True, False])
     with pytest.raises(ModelError, match="neither log_std"):
         MlpPolicy.of({**made.tensors(), "log_std": np.zeros(9, np.float32)}, made.about)
     with pytest.raises(ModelError, match="too narrow"):
@@ -113,6 +119,18 @@ def test_a_memory_lasts_for_an_episode_of_an_evaluation() -> None:
             kept.append(action)
     np.testing.assert_array_equal(kept[:4], kept[4:])
     env.close()
+
+
+def test_a_memory_is_not_taken_into_a_branch_of_an_episode() -> None:
+    """It would be that of the end of the other branch."""
+    about = {"task": "pushing", "env": RELATIVE, "memory": 2}
+    made = MlpPolicy.of(tensors(56 + 2, 16, 9 + 2), about)
+    world = World("pushing", backend="fake")
+    acts = in_world(made, world)
+    once, again = (world.rollout(acts, steps=4) for _ in range(2))
+    np.testing.assert_array_equal(once.actions, again.actions)
+    with pytest.raises(ActionError, match=r"memory.*from the first control step"):
+        once.counterfactual({"tool_block.mass": 0.03}, at=2, actions=acts)
 
 
 def test_parts_of_an_observation_are_joined_in_their_order() -> None:

@@ -89,6 +89,8 @@ class Feedback:
     def memory(self, world: Any) -> Floats:
         """Say what it remembers after the action of the present step, by -1 for no and 1 for yes.
 
+        Where a finger touches, and where the block is taken to, is not among it.
+
         Returns:
             Shape (n + 5,) where there are n blocks with goals: which of them it takes, which
             fingers take part, whether they let go, and whether they go back since they were stuck.
