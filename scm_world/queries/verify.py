@@ -17,7 +17,7 @@ from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import Probe
 from scm_world.queries.experiments.probes import probes as probe_states
-from scm_world.queries.experiments.together import JointExperiments
+from scm_world.queries.experiments.joint import JointExperiments
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.laws import check_laws
 from scm_world.queries.progress import Progress

@@ -84,7 +84,8 @@ class Lesson(Frozen):
         task: Name of the task.
         teacher: Name of a policy that reads the world's state.
         env: Options of the environment, those that a policy file keeps.
-        protocols: Names of protocols that vary the demonstrations, in turns.
+        protocols: Names of protocols that vary the demonstrations, in turns; a name that stands
+            there twice has twice as many.
         episodes: Number of those in which the teacher acts alone.
         rounds: How often the network acts now and then afterwards, and is trained again.
         more: Episodes of each of these rounds.
@@ -214,8 +215,8 @@ def lesson(task: str, **changes: Any) -> Lesson:
         found = Lesson.model_validate(fields)
     except ValidationError as error:
         raise refused("a lesson", error) from None
-    for names in (found.protocols, found.trials.protocols or ("P0",)):
-        chosen(names, known)
+    chosen(dict.fromkeys(found.protocols), known)  # one that is there twice is shown twice
+    chosen(found.trials.protocols or ("P0",), known)
     return found
 
 
@@ -333,7 +334,8 @@ def demonstrated(
                 f"a task with {FRACTION!r} or {SUCCESS!r}: only what ended well is learned from"
             )
             raise UnknownOption("task of a lesson", lesson.task, (allowed,))
-        taught = chosen(lesson.protocols, protocols_of(lesson.task))
+        known = protocols_of(lesson.task)
+        taught = [one for name in lesson.protocols for one in chosen(name, known)]
         shown, scores = list[list[NDArray[np.float32]]](), list[float]()
         for number in numbers:
             protocol = taught[number % len(taught)]

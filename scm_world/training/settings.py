@@ -343,7 +343,7 @@ _PICKING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_ce
 _PLACING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_goal": 0.0}}
 
 
-def _reacting(*numbers: str, **task_options: Any) -> Fields:
+def _reacting(*numbers: str, also: tuple[str, ...] = (), **task_options: Any) -> Fields:
     """Return what a grasp by feedback reacts to, and actions relative to its command.
 
     Neither velocities nor torques are observed, in which engines differ most. With relative
@@ -351,6 +351,7 @@ def _reacting(*numbers: str, **task_options: Any) -> Fields:
 
     Args:
         numbers: Ends of the names of blocks and goals; one of each, without, if there are none.
+        also: What else is observed.
         task_options: Arguments of the task, if any.
     """
     robot = ("joint_positions", "end_effector_positions", "action")
@@ -363,11 +364,12 @@ def _reacting(*numbers: str, **task_options: Any) -> Fields:
         **({"task_options": task_options} if task_options else {}),
         "delta_origin": "command",
         "observation_mode": "custom",
-        "observe": [*robot, *bodies],
+        "observe": [*robot, *bodies, *also],
         "keypoints": "view",
     }
 
 
+_WALL = ("obstacle.size",)  # how high a block has to go
 _WIDE = {"activation": "relu", "hidden": (384, 384)}
 _FROM_A_CLONE: Fields = {
     "network": {**_WIDE, "log_std": -3.0},
@@ -418,7 +420,7 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
         "ppo": _FROM_A_CLONE,
     },
     "pick_and_place": {
-        None: {"env": _reacting(**_PLACING), "curriculum": 1},
+        None: {"env": _reacting(also=_WALL, **_PLACING), "curriculum": 1},
         "ppo": _FROM_A_CLONE,
     },
     "stacking2": {
@@ -450,7 +452,15 @@ _LIFTED: Fields = {**_BY_FEEDBACK, "episodes": 3_000, "updates": 30_000, "noise"
 LESSONS: Mapping[str, Fields] = {
     "pushing": _BY_FEEDBACK,
     "picking": _LIFTED,
-    "pick_and_place": {**_LIFTED, "noise": 0.02, "symmetric": False},
+    "pick_and_place": {
+        **_LIFTED,
+        "env": {**ENV, **_reacting(also=_WALL)},
+        "protocols": ("P7", "P10", "P10", "P10"),
+        "episodes": 7_000,
+        "updates": 45_000,
+        "noise": 0.02,
+        "symmetric": False,
+    },
     "stacking2": {
         **_LIFTED,
         "env": {**ENV, **_reacting("_1", "_2")},

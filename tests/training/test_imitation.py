@@ -108,6 +108,23 @@ def test_privileged_observations_have_the_causes_besides() -> None:
         lesson("picking", observations="everything")
 
 
+def test_a_protocol_that_stands_twice_is_shown_twice() -> None:
+    """In turns; evaluations have each protocol once."""
+    both, one = shown(3, protocols=["P0", "P5", "P5"]), shown(3, protocols=["P0"])
+    two = shown(3, protocols=["P5"])
+    parts = [np.split(found.observations, 3) for found in (both, one, two)]
+    np.testing.assert_array_equal(parts[0], [parts[1][0], *parts[2][1:]])
+    assert not np.array_equal(parts[1][1], parts[2][1])
+    with pytest.raises(UnknownOption, match="once"):
+        lesson("picking", trials={"protocols": ["P5", "P5"]})
+
+
+def test_pick_and_place_sees_how_high_the_wall_is() -> None:
+    """The teacher lifts a block as high as that; so does the recipe that goes on from its clone."""
+    for env in (lesson("pick_and_place").options, recipe("pick_and_place").env):
+        assert "obstacle.size" in env["observe"]
+
+
 def test_a_quiet_teacher_is_itself() -> None:
     """Without noise, what is shown leads from each observation to the next one."""
     first = shown(1, noise=0.0, protocols=["P0"])

@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import ActionError
-from scm_world.geometry import overlap_volume
+from scm_world.geometry import from_rotation_vector, overlap_volume
 from scm_world.geometry.penetration import box_box_kernel
 from scm_world.tasks.trifinger.grasping.hand import Hand
 from scm_world.tasks.trifinger.views import upright
@@ -88,6 +88,15 @@ class Cuboid:
             place = np.array([*place[:2], other.place[2]])
         first = half, place, turn_about_z(self.yaw)
         return float(box_box_kernel(*first, other.half, other.place, turn_about_z(other.yaw)))
+
+    def fills(self, goal: Cuboid) -> float:
+        """Compute which share of a goal it fills."""
+        poses = (
+            part
+            for body in (self, goal)
+            for part in (2.0 * body.half, body.place, from_rotation_vector([0.0, 0.0, body.yaw]))
+        )
+        return float(overlap_volume(*poses)) / float(np.prod(2.0 * goal.half))
 
 
 def body_of(name: str, values: Mapping[str, Value]) -> Cuboid:

@@ -35,6 +35,9 @@ RINGS = (0.0, 0.05, 0.09, 0.12)  # [m] radii of these places
 PARTS = (1.0, 0.5, 0.0)
 """Shares of a turn that may be made before a block is put down on the way."""
 
+LESS = (0.75, 0.5, 0.25, 0.0)
+"""Shares of a turn that may be made instead, where the block is held in the end."""
+
 STOPS = [
     np.array([radius * math.cos(angle), radius * math.sin(angle)])
     for radius in RINGS
@@ -100,6 +103,8 @@ class Choice:
             end = end.at(end.place + lifted(self._kept == goal), end.yaw)
             ways = [(start.at(end.place, start.yaw + turn), turn) for turn in turns(start, end)]
             move = self._best(tool, start, ways, release=not hangs)
+            if move is None and self._kept == goal:
+                move = self._turned_less(tool, start, end, [turn for _, turn in ways])
             firm = hangs and end.bottom > ON_FLOOR and not self._swings
             if move is not None and (move.grip.firm or not firm):
                 return Job(tool, move, len(self._todo))
@@ -137,6 +142,24 @@ class Choice:
         planner = Planner(self._sight.hand, self._sight.joints, self._others(tool))
         wanted, swings = self._sight.wanted(tool), self._swings
         return planner.best(start, ways, wanted=wanted, release=release, swings=swings)
+
+    def _turned_less(
+        self, tool: str, start: Cuboid, end: Cuboid, turned: Iterable[float]
+    ) -> Move | None:
+        """Find a way on which a block is turned too little to fill its goal, but fills it fairly.
+
+        No grip can make the whole turn then. Putting the block down on the way takes so long that
+        an episode mostly ends before it is at its goal.
+        """
+        for share in LESS:
+            ways = [
+                (start.at(end.place, start.yaw + share * turn), share * turn) for turn in turned
+            ]
+            fair = [way for way in ways if way[0].fills(end) > FAIR]
+            move = self._best(tool, start, fair, release=False)
+            if move is not None:
+                return move
+        return None
 
     def _make_way(self, tool: str, end: Cuboid) -> Job | None:
         """Move a block that stands where another one should go, or where its fingers would be."""
