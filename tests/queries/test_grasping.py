@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from scm_world.env import ScmWorldEnv
 from scm_world.errors import ActionError, UnknownOption
+from scm_world.evaluation.episodes import EpisodeRunner
+from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.geometry import from_rotation_vector
 from scm_world.policies.scripted import as_policy
 from scm_world.queries import World
@@ -137,6 +140,24 @@ def test_by_feedback_a_block_passes_a_wall_without_touching_it() -> None:
     beyond = (away > 0.02) & (np.arange(len(away)) > above.argmax())
     assert above[beyond].min() < above.max() - 0.008
     assert world["fractional_success"] > 0.8
+
+
+def test_by_feedback_a_block_is_turned_less_where_no_grip_can_make_the_whole_turn() -> None:
+    """It goes to its goal, which it fills fairly, instead of being put down on the way."""
+    env = ScmWorldEnv("pick_and_place")
+    runner = EpisodeRunner(env)
+    (everything,) = chosen("P10", protocols_of("pick_and_place"))
+    fills = []
+    for episode in range(9):
+        runner.begin(everything, seed=0, episode=episode)
+        sight = Sight(env.world)
+        goal, job = sight.body("goal_block"), Choice(sight, holds=True, swings=True).job()
+        if job is not None:  # fingers have no room between a wall and a block close to it
+            np.testing.assert_allclose(job.move.end.place[:2], goal.place[:2])
+            fills.append(job.move.end.fills(goal))
+    runner.close()
+    assert len(fills) > 6
+    assert 0.8 < min(fills) < 0.95 < max(fills)
 
 
 # --- one instance, many episodes ------------------------------------------------------------------
