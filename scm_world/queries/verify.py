@@ -13,11 +13,11 @@ from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.agreement import SEEDS, Agreement, Sign, compare_signs
 from scm_world.queries.experiments.effects import EdgeKey, Effects, Series
+from scm_world.queries.experiments.joint import JointExperiments
 from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import Probe
 from scm_world.queries.experiments.probes import probes as probe_states
-from scm_world.queries.experiments.joint import JointExperiments
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.laws import check_laws
 from scm_world.queries.progress import Progress

@@ -157,7 +157,8 @@ class Candidates:
             raise Unknown
         values = {parent: self._value(parent) for parent in parents}
         own = variable.name if act.stream is None else f"{act.stream}/{variable.name}"
-        keys = [word_of(f"{own}#{attempt}") for attempt in self.attempts.tolist()]
+        numbers = self.attempts.tolist()
+        keys = [word_of(f"{own}#{number}" if number else own) for number in numbers]
         uniforms = np.empty((len(keys), source.n_uniforms(variable.shape)))
         where = np.array([self._key.noise.key, self._key.episode, self._key.step], dtype=np.uint64)
         philox(where, np.array(keys, dtype=np.uint64), uniforms)
@@ -184,7 +185,7 @@ def promising(
     made: Mapping[Plan | None, InterventionPlan],
     structure: Callable[[NoiseKey], Plan | None] | None,
     key: NoiseKey,
-    count: int,
+    draws: range,
 ) -> Iterator[tuple[int, Plan | None]]:
     """Yield the further draws that may be feasible, and the last one.
 
@@ -197,7 +198,7 @@ def promising(
         structure: Gives the structure of a draw, or None where that is refused; None where all
             draws have the same.
         key: Where to draw.
-        count: How many draws there are, the first one number 0.
+        draws: Their numbers.
 
     Yields:
         The number of a draw, and its structure.
@@ -209,8 +210,8 @@ def promising(
     # What is asked of a body is refused where the body is not there.
     asked = {name.partition(".")[0] for name in (*plan.asked, *plan.removals)}
     alike_everywhere = asked.isdisjoint(plan.compiled.entity_names)
-    for begin in range(1, count - 1, CHUNK):
-        attempts = list(range(begin, min(begin + CHUNK, count - 1)))
+    for begin in range(0, len(draws) - 1, CHUNK):
+        attempts = list(draws[:-1][begin : begin + CHUNK])
         if structure is None:
             places: dict[int, Plan | None] = dict.fromkeys(attempts, here)
         else:
@@ -224,8 +225,8 @@ def promising(
                 thinned[where] = frozenset(_thinned(made[where], before, key, alike))
             if where not in thinned or attempt in thinned[where]:
                 yield attempt, where
-    if count > 1:
-        yield count - 1, None
+    if draws:
+        yield draws[-1], None
 
 
 def _thinned(

@@ -14,7 +14,7 @@ from scm_world.errors import Infeasible, InterventionError
 from scm_world.graph import NoiseKey
 from scm_world.models import Difference, State, Structure
 from scm_world.models.scene import Overlap
-from scm_world.variables import Draw, Hard
+from scm_world.variables import SOFT, Draw, Hard, Mechanism
 from scm_world.variables.checks import coerce
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.candidates import promising
@@ -119,6 +119,9 @@ class CarriedOut:
         space: Every target has to lie in, if any.
         plan: Of the draw that was taken.
         kept: The draws that move no body.
+        crowded: Whether the first draw need not be planned before it is looked at: it was not
+            feasible, so that it seldom is, and it can only be refused for overlaps. All draws are
+            from spaces of the task, and nobody changed a mechanism.
     """
 
     base: StepBase
@@ -126,6 +129,7 @@ class CarriedOut:
     space: AnyRegion | None
     plan: InterventionPlan
     kept: frozenset[str]
+    crowded: bool
 
     def is_again(self, base: StepBase, request: Mapping[str, Any], space: AnyRegion | None) -> bool:
         """Tell whether a request is the same, but for where it is drawn."""
@@ -158,7 +162,14 @@ def carried_out(
     if not again or not any(isinstance(act, Draw) for act in request.values()):
         return None
     kept = _immaterial(structures, plan.compiled, request)
-    return CarriedOut(base, request, space, plan, kept)
+    acts = (*request.values(), *base.model.interventions.values())
+    usual = not any(
+        isinstance(act, (*SOFT, Mechanism))
+        or (isinstance(act, Draw) and not isinstance(act.source, str))
+        for act in acts
+    )
+    crowded = usual and plan.solver is not None and plan.solver.attempt > 0
+    return CarriedOut(base, request, space, plan, kept, crowded)
 
 
 def feasible_plan(
@@ -197,6 +208,10 @@ def feasible_plan(
     attempts: Iterator[tuple[int, Plan | None]] = iter(((0, None),))
     tried = ""
     start = None if earlier is None else earlier.plan
+    if earlier is not None and earlier.crowded:  # look at the first draw before planning it, too
+        key, tried = replace(key, kept=earlier.kept), NONE
+        known: dict[Plan | None, InterventionPlan] = {earlier.plan.compiled.plan: earlier.plan}
+        attempts = promising(base, known, None, key, range(ATTEMPTS))
     while (drawn := next(attempts, None)) is not None:
         attempt, where = drawn
         key, last = replace(key, attempt=attempt), made.get(where, start)
@@ -221,7 +236,7 @@ def feasible_plan(
             structure = None
             if draws_bodies(structures, request):
                 structure = partial(_structure, structures, base, request)
-            attempts = promising(base, made, structure, key, ATTEMPTS)
+            attempts = promising(base, made, structure, key, range(1, ATTEMPTS))
     raise refusal(structures, base, present, plan, request, problems, key, tried)
 
 

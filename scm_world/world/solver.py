@@ -89,6 +89,11 @@ class Solver:
     def _is_state(self, target: str) -> bool:
         return self._task.model.declared(target).role == "state"
 
+    @property
+    def attempt(self) -> int:
+        """How many draws were rejected before."""
+        return self._key.attempt
+
     def again(self, key: NoiseKey) -> Solver:
         """Return a solver of the same request at another draw."""
         return Solver(self.base, self.asked, self.pending, key, self)

@@ -149,6 +149,33 @@ def test_what_was_asked_in_other_episodes_changes_nothing() -> None:
     assert 0 < refused < 6
 
 
+def test_the_first_draw_of_a_crowded_request_is_not_planned_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is looked at with the others, where nothing but an overlap can rule it out."""
+    planned: list[int] = []
+
+    def noted(*args: Any) -> InterventionPlan:
+        planned.append(args[4].attempt)
+        return plan_intervention(*args)
+
+    monkeypatch.setattr(feasibility, "plan_intervention", noted)
+    usual = {"joint_positions": Draw("A"), "block.size": Draw("A"), "stage_friction": 0.5}
+    own = {**usual, "block.size": CROWDED["block.size"]}  # may have no possible value
+    found: list[int] = []
+    for request, plans in ((usual, 1), (own, 2), ({**usual, "gravity": CROWDED["gravity"]}, 2)):
+        world = World("pushing", backend="fake")
+        for episode in range(4):
+            planned.clear()
+            world.reset(seed=3, episode=episode, do=request)
+            if plans == 1 and episode:
+                assert len(planned) == 1
+            else:
+                assert planned[0] == 0
+                found.append(len(planned))
+    assert max(found) > 1
+
+
 TURNED = {"tool_block.euler_orientation": [0.3, 0.2, 0.0]}
 SCREENED: list[tuple[str, dict[str, Any], bool]] = [
     ("pushing", CROWDED, True),

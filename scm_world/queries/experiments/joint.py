@@ -1,4 +1,4 @@
-"""Experiments in which everything that should not matter is changed at once.
+"""Experiments in which everything that should not matter is changed together.
 
 A declared graph says of each variable that, given its parents and its own noise, nothing else acts
 on it. So all else may be changed together, by much, and it has to stay as it is. That one question
