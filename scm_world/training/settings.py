@@ -339,7 +339,16 @@ _CARRYING: Fields = {
         "reward.speed": 5e-4,
     },
 }
-_PICKING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_center": 0.0}}
+_PICKING: Fields = {
+    "terms": _CARRYING["terms"],
+    "weights": {
+        **_CARRYING["weights"],
+        "reward.block_to_center": 0.0,
+        "reward.tips_to_block": 20.0,
+        "reward.grasp": 0.5,
+        "reward.block_to_height": 200.0,
+    },
+}
 _PLACING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_goal": 0.0}}
 
 
@@ -369,6 +378,19 @@ def _reacting(*numbers: str, also: tuple[str, ...] = (), **task_options: Any) ->
     }
 
 
+_MOVING: Fields = {
+    "delta_scale": 0.04,
+    "delta_origin": "command",
+    "observation_mode": "custom",
+    "observe": _SEEN,
+}
+_BY_REWARD: Fields = {
+    "settings": {"n_steps": 32, "batch_size": 512},
+    "rate": {"initial": 5e-4, "schedule": "adaptive", "target_kl": 0.02, "lowest": 5e-5},
+    "network": {"log_std_end": -2.3, "scaled": True},
+}
+"""What brings a block somewhere from random weights."""
+
 _WALL = ("obstacle.size",)  # how high a block has to go
 _WIDE = {"activation": "relu", "hidden": (384, 384)}
 _FROM_A_CLONE: Fields = {
@@ -377,7 +399,7 @@ _FROM_A_CLONE: Fields = {
     "critic_warmup": 200_000,
     "steps": 1_000_000,
 }
-"""PPO does not find out by itself how to grasp: this is for a policy that can. It is a guess."""
+"""For a policy that knows how to grasp: over a wall PPO did not find out by itself. It is a guess."""
 
 TUNED: Mapping[str, Mapping[str | None, Fields]] = {
     "reaching": {
@@ -398,26 +420,15 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
     },
     "pushing": {
         None: {
-            "env": {
-                "task_options": _PUSHING,
-                "delta_scale": 0.04,
-                "delta_origin": "command",
-                "observation_mode": "custom",
-                "observe": _SEEN,
-            },
+            "env": {"task_options": _PUSHING, **_MOVING},
             "episode_length": 125,
             "curriculum": resample("goal_block.cylindrical_position", "A"),
         },
-        "ppo": {
-            "steps": 3_000_000,
-            "settings": {"n_steps": 32, "batch_size": 512},
-            "rate": {"initial": 5e-4, "schedule": "adaptive", "target_kl": 0.02, "lowest": 5e-5},
-            "network": {"log_std_end": -2.3, "scaled": True},
-        },
+        "ppo": {"steps": 3_000_000, **_BY_REWARD},
     },
     "picking": {
-        None: {"env": _reacting(**_PICKING), "curriculum": 1},
-        "ppo": _FROM_A_CLONE,
+        None: {"env": {"task_options": _PICKING, **_MOVING}, "episode_length": 125, "curriculum": 1},
+        "ppo": {"steps": 5_000_000, **_BY_REWARD},
     },
     "pick_and_place": {
         None: {"env": _reacting(also=_WALL, **_PLACING), "curriculum": 1},

@@ -56,10 +56,10 @@ def test_it_says_what_comes_next(tmp_path: Path) -> None:
     """A small clone names its file and the commands that take it; again, it is there already."""
     pytest.importorskip("torch")
     for _ in range(2):
-        done = call("picking", *QUICK, "--out", str(tmp_path / "run"))
+        done = call("pick_and_place", *QUICK, "--out", str(tmp_path / "run"))
         assert done.exit_code == 0, done.output
-        assert f"scm-world evaluate {tmp_path}/run/policy.safetensors picking" in done.output
-        assert "scm-world train picking --start" in done.output
+        assert f"scm-world evaluate {tmp_path}/run/policy.safetensors pick_and_place" in done.output
+        assert "scm-world train pick_and_place --start" in done.output
         assert "--set network.hidden=[4]" in done.output
     about = json.loads((tmp_path / "run" / "clone.json").read_text())
     made = about["lesson"]
@@ -72,11 +72,11 @@ def test_a_recording_of_gymnasium_is_learned_from(
 ) -> None:
     """A recording names all options of its environment; a failed trial costs no policy."""
     pytest.importorskip("torch")
-    options = {**recipe("picking").env, "task_options": None, "max_episode_length": 5}
-    env = gymnasium.make("scm_world/Picking-v0", **options)
+    options = {**recipe("pick_and_place").env, "task_options": None, "max_episode_length": 5}
+    env = gymnasium.make("scm_world/PickAndPlace-v0", **options)
     record("still", env, 1, out=tmp_path / "shown.parquet")
     env.close()
-    given = ("picking", "--from", str(tmp_path / "shown.parquet"), "--out", str(tmp_path / "run"))
+    given = ("pick_and_place", "--from", str(tmp_path / "shown.parquet"), "--out", str(tmp_path / "run"))
     small = ("--set", "trials.episodes=1", "--set", 'trials.protocols=["P0"]')
     arguments = (*given, *QUICK[4:8], "--set", "network.hidden=[4]", *small)
 
@@ -92,7 +92,7 @@ def test_a_recording_of_gymnasium_is_learned_from(
     monkeypatch.setattr(imitation, "fitted", broken)  # what was learned is not learned again
     done = call(*arguments)
     assert done.exit_code == 0, done.output
-    assert "scm-world train picking --start" in done.output
+    assert "scm-world train pick_and_place --start" in done.output
     second = load_policy(tmp_path / "run" / "best.safetensors")
     assert second.about.card["trials"] == {"P0": 0.0}
     assert (second.layers[0].weight == first.layers[0].weight).all()
