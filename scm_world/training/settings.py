@@ -399,7 +399,7 @@ _FROM_A_CLONE: Fields = {
     "critic_warmup": 200_000,
     "steps": 1_000_000,
 }
-"""For a policy that knows how to grasp: over a wall PPO did not find out by itself. It is a guess."""
+"""For a policy that can grasp: PPO was not tried without on these. It is a guess."""
 
 TUNED: Mapping[str, Mapping[str | None, Fields]] = {
     "reaching": {
@@ -427,7 +427,11 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
         "ppo": {"steps": 3_000_000, **_BY_REWARD},
     },
     "picking": {
-        None: {"env": {"task_options": _PICKING, **_MOVING}, "episode_length": 125, "curriculum": 1},
+        None: {
+            "env": {"task_options": _PICKING, **_MOVING},
+            "episode_length": 125,
+            "curriculum": 1,
+        },
         "ppo": {"steps": 5_000_000, **_BY_REWARD},
     },
     "pick_and_place": {

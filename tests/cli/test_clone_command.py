@@ -76,7 +76,13 @@ def test_a_recording_of_gymnasium_is_learned_from(
     env = gymnasium.make("scm_world/PickAndPlace-v0", **options)
     record("still", env, 1, out=tmp_path / "shown.parquet")
     env.close()
-    given = ("pick_and_place", "--from", str(tmp_path / "shown.parquet"), "--out", str(tmp_path / "run"))
+    given = (
+        "pick_and_place",
+        "--from",
+        str(tmp_path / "shown.parquet"),
+        "--out",
+        str(tmp_path / "run"),
+    )
     small = ("--set", "trials.episodes=1", "--set", 'trials.protocols=["P0"]')
     arguments = (*given, *QUICK[4:8], "--set", "network.hidden=[4]", *small)
 
