@@ -335,7 +335,7 @@ def demonstrated(
             )
             raise UnknownOption("task of a lesson", lesson.task, (allowed,))
         known = protocols_of(lesson.task)
-        taught = [one for name in lesson.protocols for one in chosen(name, known)]
+        taught = [one for name in lesson.protocols for one in chosen([name], known)]
         shown, scores = list[list[NDArray[np.float32]]](), list[float]()
         for number in numbers:
             protocol = taught[number % len(taught)]

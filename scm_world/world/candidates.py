@@ -157,8 +157,9 @@ class Candidates:
             raise Unknown
         values = {parent: self._value(parent) for parent in parents}
         own = variable.name if act.stream is None else f"{act.stream}/{variable.name}"
+        kept = variable.name in self._key.kept
         numbers = self.attempts.tolist()
-        keys = [word_of(f"{own}#{number}" if number else own) for number in numbers]
+        keys = [word_of(f"{own}#{n}" if n and not kept else own) for n in numbers]
         uniforms = np.empty((len(keys), source.n_uniforms(variable.shape)))
         where = np.array([self._key.noise.key, self._key.episode, self._key.step], dtype=np.uint64)
         philox(where, np.array(keys, dtype=np.uint64), uniforms)

@@ -121,7 +121,7 @@ class CarriedOut:
         kept: The draws that move no body.
         crowded: Whether the first draw need not be planned before it is looked at: it was not
             feasible, so that it seldom is, and it can only be refused for overlaps. All draws are
-            from spaces of the task, and nobody changed a mechanism.
+            from the spaces of a task of this package, and nobody changed a mechanism.
     """
 
     base: StepBase
@@ -163,7 +163,8 @@ def carried_out(
         return None
     kept = _immaterial(structures, plan.compiled, request)
     acts = (*request.values(), *base.model.interventions.values())
-    usual = not any(
+    ours = type(base.compiled.task).__module__.startswith("scm_world.tasks.")
+    usual = (space is None and ours) and not any(
         isinstance(act, (*SOFT, Mechanism))
         or (isinstance(act, Draw) and not isinstance(act.source, str))
         for act in acts

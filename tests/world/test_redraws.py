@@ -149,6 +149,32 @@ def test_what_was_asked_in_other_episodes_changes_nothing() -> None:
     assert 0 < refused < 6
 
 
+@pytest.mark.parametrize(
+    ("task", "space", "request_"),
+    [
+        ("pushing", None, {"joint_positions": Draw("A"), "tool_block.size": Draw("A|B")}),
+        ("pushing", "A", {"joint_positions": Draw("A"), "tool_block.size": Draw("A|B")}),
+        ("pick_and_place", None, {"joint_positions": Draw("A"), "wall_side": Draw("A")}),
+    ],
+)
+def test_a_crowded_request_ends_as_in_a_world_that_never_had_it(
+    task: str, space: Any, request_: dict[str, Any]
+) -> None:
+    """Also where the first draw would be refused for something else than an overlap."""
+    used, found = World(task, backend="fake", variables_space=space), [list[Any](), list[Any]()]
+    for episode in range(12):
+        fresh = World(task, backend="fake", variables_space=space)
+        for ends, world in zip(found, (used, fresh), strict=True):
+            try:
+                world.reset(seed=3, episode=episode, do=request_)
+            except InterventionError as error:
+                ends.append(str(error))
+            else:
+                ends.append({name: value.tobytes() for name, value in world.values().items()})
+    assert found[0] == found[1]
+    assert any(isinstance(end, dict) for end in found[0])
+
+
 def test_the_first_draw_of_a_crowded_request_is_not_planned_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

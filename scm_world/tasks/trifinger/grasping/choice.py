@@ -68,7 +68,8 @@ class Choice:
     Args:
         sight: Of the world.
         holds: Whether the block with the highest goal is held there, even if it could stand.
-        swings: Whether two fingers may hold a block in the air, and rather do so than three.
+        swings: Whether two fingers may hold a block in the air, and rather do so than three; one
+            that is alone is then also turned less than its goal asks for, where that must be.
         enough: Share of a goal that a block fills where it is left alone.
     """
 
@@ -86,6 +87,7 @@ class Choice:
         height = {goal: float(body.place[2]) for goal, body in self._goals.items()}
         pairs = sorted(sight.pairs, key=lambda pair: height[pair[1]])
         self._kept = pairs[-1][1] if holds and pairs else None
+        self._alone = len(pairs) == 1
         if sight.left <= LATE:
             enough = min(enough, FAIR)  # in the end, better not touch it again
         self._todo = [
@@ -103,7 +105,7 @@ class Choice:
             end = end.at(end.place + lifted(self._kept == goal), end.yaw)
             ways = [(start.at(end.place, start.yaw + turn), turn) for turn in turns(start, end)]
             move = self._best(tool, start, ways, release=not hangs)
-            if move is None and self._kept == goal:
+            if move is None and self._swings and self._alone and self._kept == goal:
                 move = self._turned_less(tool, start, end, [turn for _, turn in ways])
             firm = hangs and end.bottom > ON_FLOOR and not self._swings
             if move is not None and (move.grip.firm or not firm):
