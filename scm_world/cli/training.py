@@ -129,8 +129,9 @@ def clone(
     """Train a network by imitation of a scripted policy, or of recordings.
 
     Episodes that end well are learned from. After an interruption the same command resumes.
-    'scm-world evaluate' takes the policy, and 'scm-world train --start' starts from it unless it
-    has a memory ('--set memory=false'). What is not given is what works for the task.
+    'scm-world evaluate' takes the policy. 'scm-world train --start' starts from it where the recipe
+    observes and acts alike and it has no memory: a line 'go on' is printed then. What is not given
+    is what works for the task.
     Example: scm-world clone picking --episodes 200 --out my-picker
 
     Args:
