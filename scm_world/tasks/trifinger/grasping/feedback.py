@@ -45,6 +45,7 @@ PRESS, LIGHT = 2.0, 1.5  # [N] with which a block is pressed, if fingers can, th
 FIRMLY = 1.5  # with which a heavier one is pressed, as a multiple of what it wants
 LANDING, TILTED, SOFT = 0.012, 0.1, 0.6  # [m], sine, share: a block that swings is laid flat
 LAG, TWIST = 0.015, 0.2  # [m], [rad] that a held block may be behind its command
+OFF = 0.001, 0.007  # [m] above the floor: a block begins to follow fingertips, and does so fully
 BACK = 0.0005  # [m] by which slipping fingertips are brought back
 PUSHED = 0.06  # [rad] that a command changes in a step while fingers press
 ARRIVED = np.array([0.005, 0.06])  # [m, rad] of a block that is let go of, at once
@@ -263,23 +264,28 @@ class Program:
         sight, grip = self._sight, move.grip
         hand, joints, tool = sight.hand, sight.joints, str(self._tool)
         used, shares = np.array(grip.used), np.abs(grip.inward).max(axis=1)
-        wanted = sight.wanted(tool)
-        press = min(PRESS if wanted < LIGHT else FIRMLY * wanted, move.strength)
+        wanted, strength, follows = sight.wanted(tool), move.strength, 1.0
+        inward = grip.inward @ turn_about_z(body.yaw).T
+        if sight.walls:  # a long way in the air: elsewhere neither was needed
+            strength = float(hand.strengths(joints[None], inward[None])[0])
+            follows = float(np.interp(body.bottom, OFF, (0.0, 1.0)))
+        press = min(PRESS if wanted < LIGHT else FIRMLY * wanted, strength)
         if not grip.firm and move.over and self._lands(move, body):
             press *= 1.0 - SOFT * min(math.hypot(*body.lean) / TILTED, 1.0)
-        forces = press * grip.inward @ turn_about_z(body.yaw).T
+        forces = press * inward
         forces[:, 2] += sight.weight(tool) * shares / shares.sum()
         more = hand.more(joints, forces)
         own = body.own(tips)
         at = body.world(own + np.clip(grip.touch - own, -BACK, BACK))
         last = hand.tips(before - more).reshape(3, 3)
         lag = np.clip((last - at)[used].mean(axis=0), -LAG, LAG)
+        lag[:2] *= follows
         middle = at[used].mean(axis=0)
         arms = at - middle
         across = np.stack([-arms[:, 1], arms[:, 0]], axis=-1)
         turned = (across * (last - at - lag)[:, :2])[used].sum() / (across**2)[used].sum()
         rate, turning = self._speed(move, body, press)
-        yaw = min(max(float(turned), -TWIST), TWIST)
+        yaw = follows * min(max(float(turned), -TWIST), TWIST)
         firmer = HOLD * (middle + lag + arms @ turn_about_z(yaw).T - last)
         aim = last + firmer + rate + arms @ (turn_about_z(yaw + turning) - turn_about_z(yaw)).T
         lean = 2.0 * GAIN * body.lean
