@@ -266,7 +266,7 @@ class Program:
         used, shares = np.array(grip.used), np.abs(grip.inward).max(axis=1)
         wanted, strength, follows = sight.wanted(tool), move.strength, 1.0
         inward = grip.inward @ turn_about_z(body.yaw).T
-        if sight.walls:  # a long way in the air: elsewhere neither was needed
+        if sight.walls:  # blocks are in the air for long; without walls nothing changes
             strength = float(hand.strengths(joints[None], inward[None])[0])
             follows = float(np.interp(body.bottom, OFF, (0.0, 1.0)))
         press = min(PRESS if wanted < LIGHT else FIRMLY * wanted, strength)
