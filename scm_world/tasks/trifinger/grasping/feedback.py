@@ -45,7 +45,7 @@ PRESS, LIGHT = 2.0, 1.5  # [N] with which a block is pressed, if fingers can, th
 FIRMLY = 1.5  # with which a heavier one is pressed, as a multiple of what it wants
 LANDING, TILTED, SOFT = 0.012, 0.1, 0.6  # [m], sine, share: a block that swings is laid flat
 LAG, TWIST = 0.015, 0.2  # [m], [rad] that a held block may be behind its command
-OFF = 0.001, 0.007  # [m] above the floor: a block begins to follow fingertips, and does so fully
+OFF = 0.001, 0.007  # [m] above the floor, between which a block begins to follow fingertips
 BACK = 0.0005  # [m] by which slipping fingertips are brought back
 PUSHED = 0.06  # [rad] that a command changes in a step while fingers press
 ARRIVED = np.array([0.005, 0.06])  # [m, rad] of a block that is let go of, at once
@@ -266,7 +266,7 @@ class Program:
         used, shares = np.array(grip.used), np.abs(grip.inward).max(axis=1)
         wanted, strength, follows = sight.wanted(tool), move.strength, 1.0
         inward = grip.inward @ turn_about_z(body.yaw).T
-        if sight.walls:  # blocks are in the air for long; without walls nothing changes
+        if sight.walls:  # a block that is carried over a wall must not slip
             strength = float(hand.strengths(joints[None], inward[None])[0])
             follows = float(np.interp(body.bottom, OFF, (0.0, 1.0)))
         press = min(PRESS if wanted < LIGHT else FIRMLY * wanted, strength)
