@@ -265,14 +265,14 @@ class Program:
         hand, joints, tool = sight.hand, sight.joints, str(self._tool)
         used, shares = np.array(grip.used), np.abs(grip.inward).max(axis=1)
         wanted, strength, follows = sight.wanted(tool), move.strength, 1.0
-        inward = grip.inward @ turn_about_z(body.yaw).T
+        turn = turn_about_z(body.yaw).T
         if sight.walls:  # a block that is carried over a wall must not slip
-            strength = float(hand.strengths(joints[None], inward[None])[0])
+            strength = float(hand.strengths(joints[None], (grip.inward @ turn)[None])[0])
             follows = float(np.interp(body.bottom, OFF, (0.0, 1.0)))
         press = min(PRESS if wanted < LIGHT else FIRMLY * wanted, strength)
         if not grip.firm and move.over and self._lands(move, body):
             press *= 1.0 - SOFT * min(math.hypot(*body.lean) / TILTED, 1.0)
-        forces = press * inward
+        forces = press * grip.inward @ turn
         forces[:, 2] += sight.weight(tool) * shares / shares.sum()
         more = hand.more(joints, forces)
         own = body.own(tips)
