@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Callable, Iterator
 from html import unescape
@@ -424,10 +425,12 @@ def test_only_who_is_better_is_bold(small: tuple[Evaluation, str], tmp_path: Pat
 
 
 def test_a_better_mean_alone_is_not_bold() -> None:
-    """An interval that holds 0 says that it may be chance, whichever of the two is first."""
+    """An interval that holds 0, or is unknown, says that it may be chance."""
     sure, unsure = Interval(0.2, 0.1, 0.3, 0.95, 9), Interval(0.2, -0.1, 0.3, 0.95, 9)
     worse = Interval(-0.2, -0.3, -0.1, 0.95, 9)
-    for third, expected in ((sure, {"sac"}), (unsure, set()), ("other episodes", set())):
+    unknown = Interval(0.2, math.nan, math.nan, 0.95, 1)
+    several = ((sure, {"sac"}), (unsure, set()), (unknown, set()), ("other episodes", set()))
+    for third, expected in several:
         pairs: Pairs = {
             ("mujoco", "P0", "ppo", "sac"): worse,
             ("mujoco", "P0", "ppo", "td3"): unsure,

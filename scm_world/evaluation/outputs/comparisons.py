@@ -130,9 +130,9 @@ def best(pairs: Pairs) -> set[tuple[Line, str]]:
     for (engine, protocol, one, other), found in pairs.items():
         first, second = (Line(one, engine), protocol), (Line(other, engine), protocol)
         every |= {first, second}
-        if isinstance(found, str) or found.low <= 0.0:
+        if isinstance(found, str) or not found.low > 0.0:  # nan where an interval is unknown
             beaten.add(first)
-        if isinstance(found, str) or found.high >= 0.0:
+        if isinstance(found, str) or not found.high < 0.0:
             beaten.add(second)
     return every - beaten
 
