@@ -183,7 +183,7 @@ class Commands(ABC):
         """Tell whether it is needed, given the values of everything that physics does not move."""
 
     @abstractmethod
-    def told(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
+    def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
         """Give the command of one control step.
 
         Args:
@@ -193,7 +193,7 @@ class Commands(ABC):
             key: Where in the noise this control step draws.
 
         Returns:
-            Shape (n_commands,). It holds until the next call.
+            Shape (n_commands,). It is valid until the next call.
         """
 
 

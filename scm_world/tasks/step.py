@@ -50,7 +50,7 @@ class ProcessNoise(Commands):
         """Tell that it is always needed."""
         return True
 
-    def told(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
+    def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
         """Give the action and the noise of a control step, shape (n_commands,)."""
         drawn = [
             np.ravel(key.draw(source, name, shape, values, "process noise"))

@@ -472,7 +472,7 @@ LESSONS: Mapping[str, Fields] = {
         "env": {**ENV, **_reacting(also=_WALL)},
         "protocols": ("P7", "P10", "P10", "P10"),
         "episodes": 7_000,
-        "updates": 45_000,
+        "updates": 90_000,
         "noise": 0.02,
         "symmetric": False,
     },

@@ -183,7 +183,7 @@ class Batch:
         if not self._translating:
             self._commands[rows] = commands[rows]
         for row in rows.tolist() if self._translating else ():
-            self._commands[row] = self._worlds[row].told(commands[row], table.clock(row))
+            self._commands[row] = self._worlds[row].command(commands[row], table.clock(row))
         stale = rows[~self._fresh[rows]]
         if len(stale):
             mechanisms.evaluate((), matrix, stale)

@@ -318,8 +318,8 @@ class Simulation(WorldAttributes):
         values.remember()
         values.action[:] = command
         try:
-            told = self.told(command, self._index)
-            self.backend.step(self.composition.mode, told, self._substeps)
+            sent = self.command(command, self._index)
+            self.backend.step(self.composition.mode, sent, self._substeps)
         except EngineFailure as error:
             left = self.compiled.empty_state()
             self.backend.read(left)
@@ -360,13 +360,13 @@ class Simulation(WorldAttributes):
             command[self.compiled.actions[name]] = np.ravel(solved[name])
         return self.compiled.clipped(command)
 
-    def told(self, action: Floats, index: int) -> Floats:
-        """Turn an action into a command, at a control step; it holds until the next call."""
+    def command(self, action: Floats, index: int) -> Floats:
+        """Compute the command of an action in a control step; it is valid until the next call."""
         commands = self.composition.commands
         if commands is None or not self.translates:
             return action
         values = self._values
-        return commands.told(action, values.now, values.state.vector, self.noise_key(index))
+        return commands.command(action, values.now, values.state.vector, self.noise_key(index))
 
     @property
     def pace(self) -> tuple[ControlMode, int]:

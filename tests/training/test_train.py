@@ -17,6 +17,7 @@ import safetensors.numpy
 
 from scm_world.errors import (
     Diverged,
+    InterventionError,
     MissingExtra,
     ScmWorldError,
     UnknownOption,
@@ -261,6 +262,14 @@ def test_divergence_ends_a_training(change: dict[str, float], tmp_path: Path) ->
     with pytest.raises(Diverged, match="lower learning rate"):
         run(RECIPES["ppo"].but(**change, critic_warmup=0), tmp_path / "run")
     assert not [*(tmp_path / "run").glob("*.safetensors")]
+
+
+def test_bodies_that_come_and_go_cannot_all_be_observed(tmp_path: Path) -> None:
+    """Worlds are observed alike; the error of the worlds is shown, and what to do."""
+    everything = {"curriculum": 2, "observations": "privileged", "n_steps": 8, "batch_size": 16}
+    privileged = recipe("reaching", **SMALL, steps=64, **everything)
+    with pytest.raises(InterventionError, match="leave it out of a curriculum"):
+        run(privileged, tmp_path / "run")
 
 
 def test_other_versions_are_told(tmp_path: Path) -> None:

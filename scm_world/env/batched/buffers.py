@@ -79,7 +79,8 @@ class Form:
         raise InterventionError(
             f"{variable} changes which bodies exist, and with them what is observed, from "
             f"{before} to {after}; environments in a batch are all observed alike: set it for all "
-            "of them with start={…} when they are made, or use single environments",
+            "of them with start={…} when they are made, leave it out of a curriculum (besides=…), "
+            "or use single environments",
             variable=variable,
         )
 

@@ -122,7 +122,7 @@ class JointExperiments:
         self._unlike(world.values(), self._later)
         if number == 0:
             self.effects.shared_noise |= shared_noise(
-                world.graph, self._later, self._memory, partial(world.told, probe.action)
+                world.graph, self._later, self._memory, partial(world.command, probe.action)
             )
         self.effects.end_of_probe()
 

@@ -19,7 +19,7 @@ Independent ranks of 64 draws have a correlation with standard deviation 0.13.
 
 
 def shared_noise(
-    model: SCM, values: Values, previous: Values, told: Callable[[int], Floats] | None = None
+    model: SCM, values: Values, previous: Values, command: Callable[[int], Floats] | None = None
 ) -> set[tuple[str, str]]:
     """Name the pairs of variables that are given one and the same noise.
 
@@ -30,7 +30,7 @@ def shared_noise(
         model: Has the mechanisms.
         values: Of the parents.
         previous: Of one control step ago.
-        told: What an engine is told in a control step of this number, which may be random.
+        command: Gives the command of a control step of this number, which may be random.
     """
     keys = [NoiseKey(Noise(0), episode) for episode in range(KEYS)]
     columns: list[Floats] = []
@@ -52,8 +52,8 @@ def shared_noise(
             known = {n: v for n, v in values.items() if n != name}
             solve = model.solve
             take(name, [solve(known, previous=previous, key=k, only=(name,))[name] for k in keys])
-    if told is not None:
-        take("command", [np.array(told(step)) for step in range(KEYS)])
+    if command is not None:
+        take("command", [np.array(command(step)) for step in range(KEYS)])
     if len(columns) < 2:
         return set()
     alike = np.abs(np.corrcoef(np.array(columns))) > ALIKE

@@ -390,9 +390,9 @@ class Paired:
         """Take the physics steps of a control step one by one; tell whether bodies stay apart."""
         world = self._world
         mode, substeps = world.pace
-        told = world.told(world.decided(world.compiled.clipped(action)), world.index)
+        sent = world.command(world.decided(world.compiled.clipped(action)), world.index)
         for _ in range(substeps):
-            world.backend.step(mode, told, 1)
+            world.backend.step(mode, sent, 1)
             if world.backend.contacts():
                 return False
         return True

@@ -180,7 +180,7 @@ class RobotCommands(Commands):
         """Tell whether fingertips are commanded, or the actuators have noise."""
         return self._by_tips or bool(values[ACTUATOR_NOISE] > 0.0)
 
-    def told(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
+    def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
         """Add the noise, then find the joint positions of fingertips, shape (9,)."""
         noise = float(values[ACTUATOR_NOISE])
         if noise > 0.0:

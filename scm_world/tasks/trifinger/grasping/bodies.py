@@ -11,8 +11,9 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import ActionError
-from scm_world.geometry import from_rotation_vector, overlap_volume
+from scm_world.geometry import from_rotation_vector
 from scm_world.geometry.penetration import box_box_kernel
+from scm_world.tasks.trifinger import kernels
 from scm_world.tasks.trifinger.grasping.hand import Hand
 from scm_world.tasks.trifinger.views import upright
 
@@ -96,7 +97,7 @@ class Cuboid:
             for body in (self, goal)
             for part in (2.0 * body.half, body.place, from_rotation_vector([0.0, 0.0, body.yaw]))
         )
-        return float(overlap_volume(*poses)) / float(np.prod(2.0 * goal.half))
+        return float(kernels.filled(*poses))
 
 
 def body_of(name: str, values: Mapping[str, Value]) -> Cuboid:
@@ -206,7 +207,7 @@ class Sight:
     def filled(self, tool: str, goal: str) -> float:
         """Compute which share of a goal its block fills."""
         poses = (self._values[f"{name}.{part}"] for name in (tool, goal) for part in _POSE)
-        return float(overlap_volume(*poses)) / float(np.prod(self._values[f"{goal}.size"]))
+        return float(kernels.filled(*poses))
 
     def weight(self, tool: str) -> float:
         """Compute the weight of a block [N]."""
