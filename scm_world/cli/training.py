@@ -43,8 +43,9 @@ def train(
 
     Args:
         algo: ppo (by default), sac or td3.
-        curriculum: 0: nothing varies, 1: goals, 2: everything, or the JSON file of a curriculum;
-            by default what works for the task.
+        curriculum: What varies: 0 for nothing, 1 for goals, 2 for everything (gravity and gains,
+            too), a protocol such as P10, or the JSON file of a curriculum; by default what works
+            for the task.
         recipe: JSON file of a recipe; by default what works for the task.
         steps: Control steps, of all worlds together; those of the recipe by default.
         out: Folder for all files; by default under scm-world-results.

@@ -286,7 +286,8 @@ def recipe(task: str, algo: str = "ppo", *, curriculum: Any = None, **changes: A
             ``"module:function"`` for a function or class that gives a task. For such tasks nothing
             is said of the environment, and trials are in P0, A and B as far as there are these.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
-        curriculum: See ``curriculum_of``; the usual one of the task if None.
+        curriculum: The name of a protocol of the task, such as ``"P10"``: what varies in it varies
+            in each episode. Else see ``curriculum_of``; the usual one of the task if None.
         changes: Fields of the ``Recipe`` or settings of the algorithm. What is a dictionary
             (``env``, ``settings``, ``rate``, ``network``, ``trials``) changes what it names, and
             ``a.b`` names a part. ``hindsight=True`` stands for its usual settings.
@@ -343,7 +344,16 @@ def _changed(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> Recipe:
 
 
 def _made(fields: Mapping[str, Any]) -> Recipe:
+    """Make a recipe; as a curriculum, the name of a protocol means what varies in it."""
+    found = dict(fields)
+    given = found.get("curriculum")
+    if isinstance(given, str) and not (given.isdecimal() or given.endswith(".json")):
+        known = {one.name: one for one in _protocols(found["task"], found.get("env"))}
+        if given not in known:
+            allowed = ("0", "1", "2", *known, "the path of a JSON file", "a Curriculum")
+            raise UnknownOption("curriculum", given, allowed)
+        found["curriculum"] = known[given].curriculum()
     try:
-        return Recipe.model_validate(dict(fields))
+        return Recipe.model_validate(found)
     except ValidationError as error:
         raise refused("a recipe", error) from None

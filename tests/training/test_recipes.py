@@ -14,6 +14,7 @@ import scm_world  # noqa: F401 # registers the environments
 from scm_world.curricula import Curriculum, goals, physics, together
 from scm_world.env import IDS
 from scm_world.errors import ScmWorldError, UnknownOption, UnreadableFile
+from scm_world.evaluation import protocols_of
 from scm_world.tasks import TASKS
 from scm_world.training.recipe import Recipe, recipe
 from scm_world.training.settings import ALGORITHMS, Hindsight, Sac
@@ -97,6 +98,14 @@ def test_curricula_are_numbers_files_and_values(tmp_path: Path) -> None:
     assert recipe("pushing", curriculum=0).curriculum == Curriculum().as_dict()
 
 
+def test_a_protocol_is_a_curriculum() -> None:
+    """What varies in it varies in training; a recipe that is changed knows its name, too."""
+    for protocol in protocols_of("pick_and_place"):
+        wanted = protocol.curriculum().as_dict()
+        assert recipe("pick_and_place", curriculum=protocol.name).curriculum == wanted
+    assert recipe("pushing").but(curriculum="P10") == recipe("pushing", curriculum="P10")
+
+
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"task": "pulling"}, "pushing"),
     ({"algo": "pp"}, "ppo"),
@@ -104,6 +113,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"curriculum": 3}, "curriculum cannot be 3"),
     ({"curriculum": "none.json"}, "none.json"),
     ({"curriculum": 1.5}, "curriculum cannot be 1.5"),
+    ({"curriculum": "P12"}, "curriculum cannot be 'P12'.*P10, P11"),
     ({"n_stepz": 3}, "n_steps"),
     ({"n_steps": 0}, "settings.n_steps|n_steps"),
     ({"n_steps": "many"}, "many"),
