@@ -445,8 +445,8 @@ class Told:
 
     def __init__(self, world: Any, wrong: Callable[[Any, Any, NoiseKey], Any]) -> None:
         self.world, self.wrong = world, wrong
-        self.honest = world.told
-        world.told = self
+        self.honest = world.command
+        world.command = self
 
     def __call__(self, action: Any, index: int) -> Any:
         """Turn an action into a command."""

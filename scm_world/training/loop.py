@@ -15,7 +15,7 @@ from typing import Any, final
 
 from scm_world._arguments import load, one_of, whole_number
 from scm_world.backends import backends
-from scm_world.errors import DAMAGED, Diverged, ScmWorldError, UnknownOption, UnreadableFile
+from scm_world.errors import DAMAGED, Diverged, UnknownOption, UnreadableFile
 from scm_world.evaluation.setups import EvaluationPlace
 from scm_world.output.durable import is_draft, locked, made, write_whole
 from scm_world.output.reading import read_bytes, read_text
@@ -172,8 +172,8 @@ def _learn(model: Any, watch: Any, left: int, folder: Path, tell: Tell) -> None:
             signal.signal(signal.SIGINT, stop)
         every = 1 if watch.recipe.algo == "ppo" else watch.recipe.worlds  # rounds, or episodes
         model.learn(left, callback=watch, reset_num_timesteps=False, log_interval=every)
-    except ValueError as error:
-        if isinstance(error, ScmWorldError) or watch.is_finite:
+    except ValueError:
+        if not hasattr(watch, "model") or watch.is_finite:  # it has none before the first reset
             raise
         raise Diverged(model.num_timesteps) from None  # torch found it before a round was over
     finally:

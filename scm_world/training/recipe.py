@@ -347,7 +347,8 @@ def _made(fields: Mapping[str, Any]) -> Recipe:
     """Make a recipe; as a curriculum, the name of a protocol means what varies in it."""
     found = dict(fields)
     given = found.get("curriculum")
-    if isinstance(given, str) and not (given.isdecimal() or given.endswith(".json")):
+    is_name = isinstance(given, str) and not (given.isdecimal() or given.endswith(".json"))
+    if is_name and isinstance(found.get("task"), str):
         known = {one.name: one for one in _protocols(found["task"], found.get("env"))}
         if given not in known:
             allowed = ("0", "1", "2", *known, "the path of a JSON file", "a Curriculum")

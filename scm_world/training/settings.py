@@ -395,9 +395,9 @@ _WALL = ("obstacle.size",)  # how high a block has to go
 _WIDE = {"activation": "relu", "hidden": (384, 384)}
 _FROM_A_CLONE: Fields = {
     "network": {**_WIDE, "log_std": -4.5},
-    "rate": {"initial": 2e-6, "schedule": "adaptive", "lowest": 1e-7},
-    "critic_warmup": 200_000,
-    "steps": 1_000_000,
+    "rate": {"initial": 1e-5, "schedule": "adaptive", "target_kl": 0.005, "lowest": 1e-6},
+    "critic_warmup": 150_000,
+    "steps": 500_000,
 }
 """For a policy that can grasp, which more noise or larger updates spoil. It did not improve one."""
 
