@@ -140,6 +140,9 @@ def train(
                 elif getattr(model, "learning_starts", 0) >= recipe.steps:
                     first_step = model.learning_starts
                     say(f"nothing will be learned: learning starts after {first_step:,} steps")
+                elif recipe.critic_warmup and first is None:
+                    said = "this recipe is for a policy that can act (critic_warmup)"
+                    say(f"{said}: give it with --start; now the weights are random")
                 if recipe.steps > model.num_timesteps:
                     _learn(model, watch, recipe.steps - model.num_timesteps, folder, say)
         finally:

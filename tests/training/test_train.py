@@ -401,7 +401,7 @@ def test_ctrl_c_writes_a_checkpoint(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run("ppo", tmp_path / "run", tell=said.append, progress=interrupt)
     assert signal.getsignal(signal.SIGINT) is before
-    assert "Ctrl-C again stops immediately" in said[0]
+    assert "Ctrl-C again stops immediately" in said[1]
     assert agents.checkpoints(tmp_path / "run")[-1].stem == "96"
     run("ppo", tmp_path / "run", tell=said.append)
     assert "goes on after 96 steps" in said
@@ -413,6 +413,16 @@ def test_what_is_never_learned_is_told(tmp_path: Path) -> None:
     made = RECIPES["sac"].but(**{"learning_starts": 5_000, "trials.protocols": []})
     run(made, tmp_path / "run", tell=said.append)
     assert said == ["nothing will be learned: learning starts after 5,000 steps"]
+
+
+def test_a_recipe_for_a_policy_that_can_act_says_so(tmp_path: Path) -> None:
+    """The recipe learns the value first, and no policy is given; with one nothing is said."""
+    said: list[str] = []
+    found = run("ppo", tmp_path / "run", tell=said.append)
+    assert "give it with --start" in said[0]
+    said.clear()
+    run("ppo", tmp_path / "again", tell=said.append, start=found.policy)
+    assert not [line for line in said if "--start" in line]
 
 
 def test_without_the_library_it_says_what_to_install(
