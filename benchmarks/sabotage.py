@@ -435,7 +435,7 @@ def rng(*_: Any) -> float:
     return float(np.random.normal())  # noqa: NPY002 # that is what is wrong
 
 
-class Told:
+class OtherCommands:
     """Commands with other noise than declared.
 
     Args:
@@ -454,9 +454,9 @@ class Told:
         return self.wrong(command, self.world.current()[0], self.world.noise_key(index))
 
 
-def telling(world: Any, wrong: Callable[[Any, Any, NoiseKey], Any]) -> Any:
+def with_commands(world: Any, wrong: Callable[[Any, Any, NoiseKey], Any]) -> Any:
     """Replace what a world tells its engine."""
-    Told(world, wrong)
+    OtherCommands(world, wrong)
     return world
 
 
@@ -987,21 +987,21 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "time",
         "pushing, mujoco",
         (COLOR, "joint_.*"),
-        lambda: telling(task("pushing"), colored),
+        lambda: with_commands(task("pushing"), colored),
     ),
     Sabotage(
         "noise is keyed by another state",
         "time",
         "tanks, step",
         ("dirt", "upper"),
-        lambda: telling(tanks(), keyed_by_state),
+        lambda: with_commands(tanks(), keyed_by_state),
     ),
     Sabotage(
         "two tanks have one noise",
         "time",
         "tanks, step",
         (r"rain|drops|.*\[.*",),
-        lambda: telling(tanks(), one_stream),
+        lambda: with_commands(tanks(), one_stream),
     ),
     Sabotage(
         "two variables are drawn from one stream", "time", "equations", ("a", "b"), shared_equations
@@ -1011,7 +1011,7 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "time",
         "tanks, step",
         ("upper",),
-        lambda: telling(tanks(), unsaved),
+        lambda: with_commands(tanks(), unsaved),
     ),
     Sabotage(
         "one of two colors is bright, not both",

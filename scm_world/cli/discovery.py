@@ -374,10 +374,10 @@ def verify(
             with console.progress("probe states", lines=4, about=f"{tag(name)}: ") as tell:
                 if both and not isinstance(system, SCM):
 
-                    def told(_: str, tell: Any = tell) -> Any:
+                    def progress_of(_: str, tell: Any = tell) -> Any:
                         return tell
 
-                    one = verify_engines(system, progress=told, **settings)
+                    one = verify_engines(system, progress=progress_of, **settings)
                 else:
                     one = verified(system, progress=tell, **settings)
         except KeyboardInterrupt:

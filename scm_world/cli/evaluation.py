@@ -227,15 +227,15 @@ def explain(
             raise typer.BadParameter(message, param_hint=flag) from None
     agent, engine = chosen
     if episode is None:
-        told = False
+        explained = False
         for name in found.protocols if protocol is None else (protocol,):
             causes = found.causes(name, metric, agent=agent, engine=engine)
             score = found.score(name, metric, agent=agent, engine=engine)
             title = f"{name}: {agent} on {engine}, {metric.replace('_', ' ')} {score}"
             if causes.causes or protocol is not None:
                 console.say(title, causes if str(causes) else "nothing is varied in it", "")
-                told = True
-        if not told:
+                explained = True
+        if not explained:
             names = ", ".join(found.protocols)
             console.say(f"nothing to explain: nothing is varied in {names}")
         return

@@ -174,14 +174,14 @@ class CurriculumVectorEnv(VectorWrapper):
         With the actions since then, ``rerun`` takes all members to where they are.
         """
         memories, turns = self._members.get_attr("memory"), self._members.get_attr("turn")
-        told = [None if turn is None else [turn[0], turn[1].as_dict()] for turn in turns]
+        saved = [None if turn is None else [turn[0], turn[1].as_dict()] for turn in turns]
         return {
             **self.state(),
             "present": [*self._present],
             "waiting": [*self._waiting],
             "left": [*self._again],
             "memories": [memory.as_dict() for memory in memories],
-            "turns": told,
+            "turns": saved,
             "stepped": self._stepped.tolist(),
             "success": self._success.tolist(),
         }

@@ -178,7 +178,7 @@ def played(
     planned = sum(shard.stop - shard.first for shard in shards)
     before, begun = sum(map(len, found.values())), time.perf_counter()
 
-    def told(protocol: int | None = None) -> None:
+    def tell_progress(protocol: int | None = None) -> None:
         done = sum(map(len, found.values()))
         if progress is not None:
             progress(done, planned)
@@ -188,7 +188,7 @@ def played(
             left = spent / (done - before) * (planned - done)
             tell(line_of([row for place in mine for row in found[place]], left))
 
-    told()
+    tell_progress()
     missing = [place for place in range(len(shards)) if place not in found]
     with opened(executor) as player:
         if not isinstance(player, Serial):
@@ -209,7 +209,7 @@ def played(
             found[place] = rows
             if folder is not None:
                 write_part(folder, keys[place], rows)
-            told(shards[place].protocol)
+            tell_progress(shards[place].protocol)
     return [row for place in range(len(shards)) for row in found[place]]
 
 

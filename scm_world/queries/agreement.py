@@ -378,9 +378,9 @@ def compare_signs(
             for turn, seed in enumerate(seeds):
                 first, last = turn * probes, (turn + 1) * probes
                 many = len(seeds) * probes
-                told = part(progress, number * many, len(backends) * many)
+                share = part(progress, number * many, len(backends) * many)
                 paired = Paired(world, seed, responses=True)
-                series = Series(paired, many, told, done=first)
+                series = Series(paired, many, share, done=first)
                 series.run(probe_states(world, last, seed, settled=False, first=first))
                 if series.done < last:
                     raise KeyboardInterrupt

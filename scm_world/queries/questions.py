@@ -178,8 +178,8 @@ class Questions(ABC):
         """
         count = whole_number("n", n, least=2)
         treated, control = (
-            self.sample(count, plan, outcomes=(outcome,), first=first, progress=told, **setting)
-            for plan, first, told in (
+            self.sample(count, plan, outcomes=(outcome,), first=first, progress=share, **setting)
+            for plan, first, share in (
                 (do, 0, part(progress, 0, 2 * count)),
                 (versus, 0 if paired else count, part(progress, count, 2 * count)),
             )
@@ -231,8 +231,8 @@ class Questions(ABC):
             raise UnknownOption("mediators of several instants", names, allowed)
         count = whole_number("n", n, least=2)
         outcomes = (outcome, *(Outcome(name) for name in names))
-        told = part(progress, 0, 2 * count)
-        control = self.sample(count, versus, outcomes=outcomes, progress=told, **setting)
+        share = part(progress, 0, 2 * count)
+        control = self.sample(count, versus, outcomes=outcomes, progress=share, **setting)
         kept = [values for _, values in zip(range(len(names) + 1), control.values(), strict=True)]
         treated = samples.sample(
             twins,
@@ -311,8 +311,8 @@ class Questions(ABC):
         """
         count = whole_number("n", n, least=2 * whole_number("bins", bins, least=1))
         treated, control = (
-            self.sample(count, plan, outcomes=(outcome, by), progress=told, **setting)
-            for plan, told in (
+            self.sample(count, plan, outcomes=(outcome, by), progress=share, **setting)
+            for plan, share in (
                 (do, part(progress, 0, 2 * count)),
                 (versus, part(progress, count, 2 * count)),
             )

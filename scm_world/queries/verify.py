@@ -153,7 +153,7 @@ def verify_engines(
     started = time.perf_counter()
     many = whole_number("number of seeds", seeds, least=1)
 
-    def told(name: str) -> Progress | None:
+    def progress_of(name: str) -> Progress | None:
         return None if progress is None else progress(name)
 
     compared = max(1, min(least, probes) // EACH)
@@ -161,14 +161,14 @@ def verify_engines(
     limits["held_out"] = held_out
     reports: list[Verification] = []
     for name in backends:
-        reports.append(verify(task, progress=told(name), **limits, backend=name, **options))
+        reports.append(verify(task, progress=progress_of(name), **limits, backend=name, **options))
         if reports[-1].interrupted:
             break
     signs: tuple[Sign, ...] | None = None
     if not reports[-1].interrupted:
         with contextlib.suppress(KeyboardInterrupt):
             signs = compare_signs(
-                task, backends, compared, range(seed, seed + many), told("signs"), options
+                task, backends, compared, range(seed, seed + many), progress_of("signs"), options
             )
     return Agreement(
         task=reports[0].task,

@@ -103,8 +103,8 @@ class WorldSnapshot:
             except ScmWorldError:
                 raise
             except Exception as error:
-                told = f"the snapshot is damaged: {in_one_line(error)}"
-                raise SnapshotMismatch(told) from error
+                problem = f"the snapshot is damaged: {in_one_line(error)}"
+                raise SnapshotMismatch(problem) from error
         if not isinstance(found, EngineSnapshot):
             raise SnapshotMismatch(f"the snapshot is damaged: {found!r} is no engine's part")
         return found

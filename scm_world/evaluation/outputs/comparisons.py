@@ -77,8 +77,8 @@ def _range(numbers: Collection[int]) -> str:
 
 def protocol_words(evaluation: Evaluation) -> dict[str, str]:
     """Return what varies in each protocol, as far as the evaluation says so."""
-    told = {one["name"]: one for one in evaluation.about.get("protocols", ())}
-    return {name: _varies(told.get(name, {})) for name in evaluation.protocols}
+    declared = {one["name"]: one for one in evaluation.about.get("protocols", ())}
+    return {name: _varies(declared.get(name, {})) for name in evaluation.protocols}
 
 
 def _varies(protocol: Mapping[str, Any]) -> str:
