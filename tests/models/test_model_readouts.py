@@ -19,6 +19,7 @@ from scm_world.backends.mujoco.fields import element_names
 from scm_world.backends.mujoco.reading import compiled, permutation
 from scm_world.errors import ModelError
 from scm_world.models import Model, Readout
+from scm_world.queries import World
 
 POSES = ("position", "orientation", "linear_velocity", "angular_velocity")
 
@@ -162,3 +163,146 @@ def test_readouts_leave_the_compiled_model_alone() -> None:
     before = copy.copy(mj)
     only(model).function(0.1, np.array([1.0, 1.0, 1.0]))
     assert np.array_equal(mj.body_pos, before.body_pos)
+
+
+# --- sensors -----------------------------------------------------------------------------------
+
+SENSED = """
+<worldbody>
+  <camera name="cam" pos="0 -3 1" xyaxes="1 0 0 0 0 1"/>
+  <geom name="floor" type="plane" size="5 5 .1"/>
+  <site name="room" type="box" size=".5 .5 .5" pos="0 0 1"/>
+  <body name="b" pos="0 0 .8">
+    <freejoint/><geom name="gb" type="box" size=".1 .15 .2"/><camera name="eye" pos="0 0 .2"/>
+    <site name="s" pos=".1 .2 .1" euler="10 20 30"/>
+  </body>
+  <body name="arm" pos="1 0 1">
+    <joint name="activation" axis="0 1 0" range="-20 20" limited="true" margin=".2"/>
+    <geom name="ga" type="capsule" size=".03" mass=".5" fromto="0 0 0 0 0 .4"/>
+    <body name="fore" pos="0 0 .5">
+      <joint name="ball" type="ball" range="0 30" limited="true"/>
+      <geom name="gf" size=".06 .1" type="capsule"/><site name="f" pos="0 .1 .2"/>
+    </body>
+  </body>
+  <body name="car" pos="-1 0 1">
+    <joint name="slide" type="slide" axis="1 0 0"/><geom size=".05"/><site name="c"/>
+  </body>
+</worldbody>
+<tendon>
+  <spatial name="t" limited="true" range="0 1.2"><site site="s"/><site site="c"/></spatial>
+</tendon>
+<actuator>
+  <position name="m" joint="activation" kp="20" ctrlrange="-1 1"/>
+  <general name="n" tendon="t" dyntype="filter" dynprm=".1" ctrlrange="-1 1"/>
+</actuator>
+"""
+SENSORS = {
+    "velocimeter": 'site="s"',
+    "gyro": 'site="s"',
+    "magnetometer": 'site="s"',
+    "rangefinder": 'site="s"',
+    "camprojection": 'site="s" camera="cam"',
+    "jointpos": 'joint="activation"',
+    "jointvel": 'joint="activation"',
+    "tendonpos": 'tendon="t"',
+    "tendonvel": 'tendon="t"',
+    "actuatorpos": 'actuator="n"',
+    "actuatorvel": 'actuator="n"',
+    "ballquat": 'joint="ball"',
+    "ballangvel": 'joint="ball"',
+    "jointlimitpos": 'joint="activation"',
+    "jointlimitvel": 'joint="activation"',
+    "tendonlimitpos": 'tendon="t"',
+    "tendonlimitvel": 'tendon="t"',
+    "framepos": 'objtype="site" objname="f"',
+    "framequat": 'objtype="geom" objname="gf"',
+    "framexaxis": 'objtype="body" objname="fore"',
+    "frameyaxis": 'objtype="xbody" objname="fore"',
+    "framezaxis": 'objtype="camera" objname="eye"',
+    "framelinvel": 'objtype="site" objname="f" reftype="body" refname="b"',
+    "frameangvel": 'objtype="body" objname="fore" reftype="site" refname="s"',
+    "subtreecom": 'body="arm"',
+    "subtreelinvel": 'body="b"',
+    "subtreeangmom": 'body="arm"',
+    "insidesite": 'objtype="body" objname="b" site="room"',
+    "distance": 'geom1="gb" geom2="gf" cutoff="9"',
+    "normal": 'geom1="gb" geom2="gf" cutoff="9"',
+    "fromto": 'geom1="gb" geom2="gf" cutoff="9"',
+    "e_potential": "",
+    "e_kinetic": "",
+}
+"""All that are functions of state and parameters."""
+REFUSED = {
+    "touch": 'site="s"',
+    "accelerometer": 'site="s"',
+    "force": 'site="s"',
+    "torque": 'site="s"',
+    "actuatorfrc": 'actuator="m"',
+    "jointactuatorfrc": 'joint="activation"',
+    "tendonactuatorfrc": 'tendon="t"',
+    "jointlimitfrc": 'joint="activation"',
+    "tendonlimitfrc": 'tendon="t"',
+    "framelinacc": 'objtype="site" objname="s"',
+    "frameangacc": 'objtype="site" objname="s"',
+    "contact": 'body1="b" data="force"',
+    "clock": "",
+    "user": 'dim="2" needstage="pos"',
+}
+"""All others, but for tactile sensors and those of plugins."""
+
+
+def sensed(*kinds: str) -> str:
+    """Write a model with sensors of some kinds, each named as its kind."""
+    lines = "".join(f'<{kind} name="{kind}" {(SENSORS | REFUSED)[kind]}/>' for kind in kinds)
+    return f"<mujoco>{SENSED}<sensor>{lines}</sensor></mujoco>"
+
+
+def test_every_type_of_sensor_is_tried_or_refused() -> None:
+    """MuJoCo has no other types than those that are tried here, but two that need more files."""
+    mj = mujoco.MjModel.from_xml_string(sensed(*SENSORS, *REFUSED))
+    missing = set(range(len(mujoco.mjtSensor.__members__))) - set(mj.sensor_type.tolist())
+    assert missing == {int(mujoco.mjtSensor.mjSENS_TACTILE), int(mujoco.mjtSensor.mjSENS_PLUGIN)}
+    for kind in REFUSED:
+        with pytest.raises(ModelError, match=f"readouts='{kind}.value': (it|what it) "):
+            read_model(sensed(kind), readouts=[f"{kind}.value"])
+
+
+@pytest.mark.parametrize("kinds", [*((kind,) for kind in SENSORS), tuple(SENSORS)], ids="+".join)
+def test_a_sensor_has_the_value_that_mj_forward_gives_it(kinds: tuple[str, ...]) -> None:
+    """Also after positions, velocities, parameters and time changed in any order."""
+    world = World.from_mjcf(sensed(*kinds), outcomes=[f"{kind}.value" for kind in kinds])
+    world.reset(seed=0)
+    mj, rng = copy.copy(compiled(world.task.system)), np.random.default_rng(3)
+    places, layout = permutation(mj), world.task.system.layout
+    seen = set()
+    for _ in range(48):
+        turn = rng.normal(size=4)
+        changes: list[Any] = [
+            {"activation.position": rng.uniform(-0.34, 0.34)},
+            {"slide.position": rng.uniform(-1.0, 1.0)},
+            {"b.cartesian_position": rng.uniform([-0.7, -0.7, 0.3], [0.7, 0.7, 1.7])},
+            {f"{rng.choice(['b', 'ball'])}.orientation": turn / np.linalg.norm(turn)},
+            {f"{rng.choice(['activation', 'slide'])}.velocity": rng.normal()},
+            {f"b.{rng.choice(['linear', 'angular'])}_velocity": rng.normal(size=3)},
+            {"ball.angular_velocity": rng.normal(size=3)},
+            {"fore.mass": rng.uniform(0.1, 2.0)},
+            None,
+        ]
+        change = changes[int(rng.integers(len(changes)))]
+        if change is None:
+            world.step(rng.uniform(-1.0, 1.0, size=2))
+        else:
+            world.do(change)
+        mj.body("fore").mass[0] = world["fore.mass"]
+        mujoco.mj_setConst(mj, mujoco.MjData(mj))
+        vector = np.concatenate([np.atleast_1d(world[name]) for name in layout.names])
+        data = mujoco.MjData(mj)
+        data.qpos[:], data.qvel[:] = vector[places.positions], vector[places.velocities]
+        data.act[:] = vector[places.activations]
+        mujoco.mj_forward(mj, data)
+        for kind in rng.permutation(kinds):
+            found = world[f"{kind}.value"]
+            expected = data.sensor(str(kind)).data.reshape(found.shape)
+            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12, err_msg=str(kind))
+            seen.add((str(kind), found.tobytes()))
+    assert len(seen) >= 2 * len(kinds)

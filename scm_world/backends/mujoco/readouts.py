@@ -83,6 +83,9 @@ class Computed:
         if any(slots[key].constant for key in self.keys):
             mujoco.mj_setConst(mj, scratch)
         if self.kind == "sensor":
+            # MuJoCo keeps what it computed for an earlier sensor until the velocity stage is over,
+            # which sensors of the position stage (e_kinetic is one) do not reach here.
+            data.flg_energyvel = data.flg_subtreevel = False
             mujoco.mj_fwdPosition(mj, data)
             mujoco.mj_sensorPos(mj, data)
             if mj.sensor_needstage[self.index] == int(_STAGE.mjSTAGE_VEL):
@@ -288,7 +291,7 @@ class _Finder:
             states = [row.name for row, a, _, j in self._states if a == array and j == joint]
             keys: tuple[ParameterKey, ...] = ()
         elif objects is None:
-            states = [row.name for row, *_ in self._states if "activation" not in row.name]
+            states = [row.name for row, array, *_ in self._states if array != "act"]
             keys = tuple(row.key for row in self._parameters)
         else:
             states, keys = self._parents(objects, velocity)
