@@ -50,6 +50,74 @@ PENDULUM = """
 </mujoco>
 """
 
+_MACHINES = """
+<option gravity="0 0 -2"/>
+<worldbody>
+  <geom name="floor" type="plane" size="9 9 .1"/><site name="world" pos="0 0 2"/>
+  <body name="drone" pos="0 0 .3"><freejoint/>
+    <geom type="box" size=".1 .1 .03" mass="1"/>
+    <site name="rotor" pos=".1 .1 0"/><site name="left" pos="-.1 -.1 .05"/>
+  </body>
+  <body name="arm" pos="2 0 1"><joint name="shoulder" axis="0 1 0" damping=".1"/>
+    <geom type="capsule" size=".03 .2" mass=".5"/><site name="elbow" pos="0 0 .2"/>
+    <body name="hand" pos="0 0 .3"><joint name="wrist" type="ball"/>
+      <geom size=".05" mass=".2"/><site name="tip" pos="0 .1 .2"/>
+    </body>
+  </body>
+  <body name="piston" pos="-2 0 1"><joint name="slide" type="slide" axis="1 0 0"/>
+    <geom size=".05" mass=".3"/><site name="rod"/>
+  </body>
+  <body name="wheel" pos="-2 1 1"><joint name="turn" axis="0 0 1"/>
+    <geom size=".05" mass=".3" pos=".1 0 0"/><site name="crank" pos=".1 0 0"/>
+  </body>
+</worldbody>
+"""
+_ROPE = '<spatial name="rope"><site site="left"/><site site="elbow"/></spatial>'
+_BELT = '<fixed name="belt"><joint joint="slide" coef="1"/><joint joint="turn" coef=".3"/></fixed>'
+_SO3 = 'gaintype="so3" biastype="so3" gainprm="5" biasprm="0 -5 -1"'
+TRANSMISSIONS = {
+    "site": ('<motor name="m" site="rotor" gear="0 0 1 0 0 .1"/>', "drone"),
+    "refsite": ('<position name="m" site="tip" refsite="world" gear="1 0 0 0 0 0"/>', "arm"),
+    "two sites": (
+        '<position name="m" site="rotor" refsite="tip" gear="1 0 0 0 .1 0"/>',
+        "drone arm",
+    ),
+    "rope": ('<motor name="m" tendon="rope" gear="2"/>', "drone arm"),
+    "belt": ('<position name="m" tendon="belt" kp="3"/>', "piston wheel"),
+    "muscle": ('<muscle name="m" tendon="belt" force="9" lengthrange="0 1"/>', "piston wheel"),
+    "damper": ('<damper name="m" tendon="belt" kv="3" ctrlrange="0 1"/>', "piston wheel"),
+    "crank": (
+        '<motor name="m" cranksite="crank" slidersite="rod" cranklength="1.5"/>',
+        "piston wheel",
+    ),
+    "joint": ('<intvelocity name="m" joint="slide" actrange="-1 1"/>', "piston"),
+    "ball": ('<motor name="m" joint="wrist" gear="1 .5 0"/>', "arm"),
+    "parent": ('<motor name="m" jointinparent="wrist" gear="1 .5 0"/>', "arm"),
+    "adhesion": ('<adhesion name="m" body="drone" gain="5" ctrlrange="0 1"/>', ""),
+    "orientation": (f'<general name="m" joint="wrist" {_SO3}/>', "arm"),
+    "orientation of a site": (
+        f'<general name="m" site="tip" refsite="rotor" {_SO3}/>',
+        "drone arm",
+    ),
+    "general site": (
+        '<general name="m" site="rotor" gear="1 0 0 0 0 0" dyntype="filter" dynprm=".1" '
+        'gainprm="3" biastype="affine" biasprm="0 -1 -.1"/>',
+        "drone",
+    ),
+    "general crank": (
+        '<general name="m" cranksite="crank" slidersite="rod" cranklength="1.5" gainprm="3"/>',
+        "piston wheel",
+    ),
+}
+"""An actuator of every transmission, and the trees that it acts on without contact."""
+
+
+def driven(kind: str) -> str:
+    """Write a model with a drone, an arm, a piston and a wheel, and one actuator called ``m``."""
+    actuator = TRANSMISSIONS[kind][0]
+    tendons = _ROPE * ("rope" in actuator) + _BELT * ("belt" in actuator)
+    return f"<mujoco>{_MACHINES}<tendon>{tendons}</tendon><actuator>{actuator}</actuator></mujoco>"
+
 
 def model_file(name: str) -> Path:
     """Find a file in an installed package, without importing it."""

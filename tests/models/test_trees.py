@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from model_files import GYMNASIUM, SUITE, URDFS, model_file, pile
+from model_files import GYMNASIUM, SUITE, TRANSMISSIONS, URDFS, driven, model_file, pile
 
 from scm_world.backends import read_model
 from scm_world.backends.mujoco.fields import slots
@@ -187,6 +187,7 @@ COUPLED = [
     f"{SUITE}ball_in_cup.xml",
     f"{SUITE}finger.xml",
     f"{GYMNASIUM}reacher.xml",
+    *(pytest.param(driven(kind), id=kind) for kind in TRANSMISSIONS),
     *(
         pytest.param(name, marks=pytest.mark.slow)
         for name in (
@@ -217,3 +218,13 @@ def test_nothing_acts_where_nothing_is_declared(source: str) -> None:
             fired += len(reached)
     assert not undeclared
     assert fired > len(model.states)
+
+
+@pytest.mark.parametrize("kind", TRANSMISSIONS)
+def test_an_actuator_of_every_transmission_has_its_edges(kind: str) -> None:
+    """Its control acts on the trees that the transmission joins, and the bodies are described."""
+    model = read_model(driven(kind))
+    trees = set(TRANSMISSIONS[kind][1].split())
+    assert {model.trees[tree] for tree in model.inputs[0].always} == trees
+    known = {actuator.name for actuator in model.bodies.actuators}
+    assert known == (set() if any("'m'" in missing for missing in model.bodies.missing) else {"m"})

@@ -244,6 +244,8 @@ def _is_linear(mj: mujoco.MjModel, equality: int) -> bool:
 def _odd_actuator(mj: mujoco.MjModel, actuator: int) -> str:
     """Say what is special about an actuator, if anything is."""
     if mj.actuator_trntype[actuator] not in (int(_TRN.mjTRN_JOINT), int(_TRN.mjTRN_JOINTINPARENT)):
+        if mj.actuator_trntype[actuator] == int(_TRN.mjTRN_SO3):
+            return "is a servo of an orientation"
         kind = mujoco.mjtTrn(int(mj.actuator_trntype[actuator])).name
         return f"acts on a {kind.removeprefix('mjTRN_').lower()}, not on a joint"
     kind = int(mj.jnt_type[mj.actuator_trnid[actuator, 0]])
@@ -332,8 +334,7 @@ def _places(
             continue
         number = names[field.kind].index(field.element) if field.element else 0
         row = rows[field.kind].get(number) if field.kind in rows else number
-        parts = tuple(_parts(mj, field, number))
-        if row is not None and parts:
+        if row is not None and (parts := tuple(_parts(mj, field, number))):
             yield field.key, Place(_TABLES[field.kind], row, parts)
 
 
