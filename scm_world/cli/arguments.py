@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -139,7 +140,7 @@ def split(text: str) -> list[str]:
 
 
 def load_task(name: str, option: Sequence[str] | None = None) -> Task:
-    """Return a task.
+    """Return a task, and print what its model does differently from its file.
 
     Args:
         name: Of the task, or what else ``make_task`` takes.
@@ -162,7 +163,12 @@ def load_task(name: str, option: Sequence[str] | None = None) -> Task:
             given[key] = tuple(value)
         elif isinstance(value, str):
             given[key] = WORDS.get(value.lower(), value)
-    return make_task(name, **given)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # they are among the notes
+        task = make_task(name, **given)
+    for note in getattr(getattr(task, "system", None), "notes", ()):
+        typer.echo(f"note: {note}", err=True)
+    return task
 
 
 def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:

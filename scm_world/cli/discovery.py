@@ -356,14 +356,15 @@ def verify(
         name: option or (SMALL.get(name, ()) if every else ())
         for name in (TASKS if every else (task,))
     }
-    first = load_system(*next(iter(systems.items())))
+    loaded = {name: load_system(name, given) for name, given in systems.items()}
+    first = next(iter(loaded.values()))
     used = "both" if both else backend or getattr(first, "backend", "equations")
     words = (*(option or ()), resolution or "")
     folder = console.results_folder(out, "verify", tag(task), used, f"seed{seed}", option=words)
     interrupted = False
     found: list[tuple[Verification | Agreement, tuple[Verification, ...]]] = []
     for name, given in systems.items():
-        system = load_system(name, given)
+        system = loaded[name]
         settings: dict[str, Any] = {"probes": probes, "least": min(LEAST, probes), "seed": seed}
         settings["held_out"] = held_out
         if not isinstance(system, SCM):

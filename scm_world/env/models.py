@@ -9,7 +9,8 @@ from typing import Any
 from scm_world.env.batched import ScmWorldVectorEnv
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import UnknownOption
-from scm_world.tasks import ModelTask, Task, make_task
+from scm_world.tasks import ModelTask, Task
+from scm_world.world.structures import as_task
 
 MODEL_ID = "scm_world/Model-v0"
 
@@ -84,10 +85,4 @@ def _split(
     for name in of_env:
         if name not in OF_ENV:
             raise UnknownOption(f"option of {MODEL_ID}", name, (*OF_TASK, *OF_ENV, *besides))
-    if isinstance(model, Task):
-        if of_task:
-            raise UnknownOption(
-                "options of the model", of_task, ("none, with a task that is made",)
-            )
-        return model, of_env
-    return (make_task if isinstance(model, str) else ModelTask)(model, **of_task), of_env
+    return as_task(model, of_task), of_env

@@ -64,13 +64,13 @@ class Parameter(Row):
 
     Attributes:
         key: The element and the property, as backends know it.
-        kind: ``"real"``, ``"rotation"`` (unit quaternion) or ``"inertia"`` (principal moments,
-            which obey the triangle inequality).
+        kind: ``"real"``, ``"rotation"`` (unit quaternion), ``"inertia"`` (principal moments, which
+            obey the triangle inequality) or ``"switch"`` (0 or 1).
         visual: Whether it acts on pictures only.
     """
 
     key: ParameterKey = ("", "")
-    kind: Literal["real", "rotation", "inertia"] = "real"
+    kind: Literal["real", "rotation", "inertia", "switch"] = "real"
     visual: bool = False
 
 

@@ -113,6 +113,15 @@ ParameterKey = tuple[str, str]
 Parameters = Mapping[ParameterKey, Floats]
 """Physical parameters: scalars have shape (), sizes, colors and gravity shape (3,)."""
 
+RANGES = frozenset({"range", "springlength", "ctrlrange", "forcerange", "actuatorfrcrange"})
+"""Properties that are a lower and an upper end."""
+REVERSED = "the upper end comes first; give the lower end first"
+
+
+def reversed_ranges(parameters: Mapping[ParameterKey, Any]) -> list[ParameterKey]:
+    """List the ranges whose lower end is above the upper one."""
+    return [key for key, ends in parameters.items() if key[1] in RANGES and ends[0] > ends[1]]
+
 
 class ControlMode(StrEnum):
     """What the numbers of a command mean."""

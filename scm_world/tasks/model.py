@@ -25,6 +25,7 @@ from scm_world.variables import (
     Box,
     Exogenous,
     Function,
+    Integers,
     Measured,
     Parent,
     Rotations,
@@ -166,6 +167,8 @@ class ModelTask(DeclaredTask):
         control_dt: Length of a control step [s], a multiple of the physics step.
         frame_skip: The same in physics steps.
         fixed_base: Whether the root link of a URDF is fixed to the world.
+        keyframe: Name of a keyframe of the file in which episodes begin. Its controls are the idle
+            action, which holds a robot with servos there.
 
     Raises:
         ModelError: The file cannot be read as a model, or a variable is declared wrongly.
@@ -185,6 +188,7 @@ class ModelTask(DeclaredTask):
     control_dt: float | None = None
     frame_skip: int | None = None  # type: ignore[assignment] # filled in below
     fixed_base: bool = True
+    keyframe: str | None = None
 
     def __init__(self, model: Any = None, **settings: Any) -> None:
         super().__init__(ModelTask, settings)
@@ -200,7 +204,11 @@ class ModelTask(DeclaredTask):
             source
             if isinstance(source, Model)
             else read_model(
-                source, expose=self.expose, readouts=readouts, fixed_base=self.fixed_base
+                source,
+                expose=self.expose,
+                readouts=readouts,
+                fixed_base=self.fixed_base,
+                keyframe=self.keyframe,
             )
         )
         self.name = getattr(self, "name", self.system.name)
@@ -279,6 +287,11 @@ class ModelTask(DeclaredTask):
         """Say why something of this name cannot be set, if the model has it."""
         return dict(self.system.refused).get(name)
 
+    def idle(self, world: Any) -> Floats:
+        """Return the controls of the keyframe; zero, or what is nearest to it, if there is none."""
+        start = [row.default for row in self.system.inputs]
+        return np.asarray(np.clip(start, world.action_low, world.action_high))
+
     def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
         """Declare what the tables have, and what counts."""
         system, ties = self.system, {variable.name: variable for variable in self.ties}
@@ -310,12 +323,15 @@ class ModelTask(DeclaredTask):
         bounds = (
             Rotations(keeps_sign=True)
             if kind == "rotation"
+            else Integers(0, 1)
+            if kind == "switch"
             else Box(row.low, row.high)
             if bounded
             else None
         )
         fields: dict[str, Any] = {
             "name": row.name,
+            "dtype": "integer" if kind == "switch" else "real",
             "unit": row.unit,
             "shape": row.shape,
             "doc": given.get("doc", row.doc),

@@ -65,8 +65,9 @@ class Simulation(WorldAttributes):
     """The causal model of a task, stepped by a physics backend; ``scm_world.World`` adds questions.
 
     Args:
-        task: A registered name, a task, or the ``structures`` of a world that was made with the
-            same options: then they share what is compiled.
+        task: A registered name, a task, a model (a path, XML text, an ``MjSpec`` or ``MjModel``),
+            or the ``structures`` of a world that was made with the same options: then they share
+            what is compiled.
         backend: ``"mujoco"``, ``"bullet"``, ``"step"``, ``"fake"``, or a backend that is not used
             elsewhere; that of the task if None.
         preset: Of the robot's tasks: ``"fast"`` (4 ms physics steps) or ``"precise"`` (2 ms).
@@ -82,6 +83,8 @@ class Simulation(WorldAttributes):
         conventions: ``"scm_world"``, or ``"causal_world"`` for the predecessor's.
         variables_space: The space that every target of an intervention must lie in, unless ``do``
             is given another one: ``"A"``, ``"B"``, ``"A|B"`` or a ``Subset``.
+        task_options: Of the task, where it is given by its name or as a model: those of
+            ``ModelTask`` for a model (``control_dt``, ``expose``, ``fixed_base``, …).
 
     Raises:
         UnknownOption: One of the names does not exist.
@@ -110,10 +113,11 @@ class Simulation(WorldAttributes):
         max_episode_length: int | None = None,
         conventions: str = "scm_world",
         variables_space: AnyRegion | None = None,
+        **task_options: Any,
     ) -> None:
         self.variables_space = as_region("variables_space", variables_space)
         shared = task if isinstance(task, StructureCache) else None
-        given = as_task(task) if shared is None else shared.task
+        given = as_task(task if shared is None else shared.task, task_options)
         self.backend = _as_backend(given.backend if backend is None else backend)
         kind = given if shared is not None else given.on(self.backend)
         self.options = Options.checked(

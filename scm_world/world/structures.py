@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import cached_property
 from hashlib import blake2b
 from os import PathLike
+from types import MappingProxyType
 from typing import Any, final
 from weakref import WeakKeyDictionary
 
@@ -127,18 +128,25 @@ class StructureCache:
         return self.plan(values)
 
 
-def as_task(task: Any) -> Task:
-    """Take a task, or make the one of a name.
+def as_task(task: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Task:
+    """Take a task, or make the one of a name or model.
+
+    Args:
+        task: A task, a registered name, or a model in any form that ``ModelTask`` takes.
+        options: Of the task, where it is made here.
 
     Raises:
-        UnknownOption: There is none of this name, or it is neither.
+        UnknownOption: There is none of this name, it is neither, or an option is not one of it.
     """
     if isinstance(task, Task):
+        if options:
+            allowed = ("none, with a task that is made",)
+            raise UnknownOption("options of the task", [*options], allowed)
         return task
     if isinstance(task, str):
-        return make_task(task)
+        return make_task(task, **options)
     if isinstance(task, Model | PathLike) or type(task).__name__ in ("MjSpec", "MjModel"):
-        return ModelTask(task)
+        return ModelTask(task, **options)
     made = f"{task.__name__}()" if isinstance(task, type) else "Pushing()"
     raise UnknownOption("task", task, (*tasks(), f"a task that is made, such as {made}"))
 

@@ -122,6 +122,8 @@ def other_value(row: Parameter, value: Floats) -> Floats:
         return quaternion_product(from_rotation_vector([0.02, -0.03, 0.05]), value)
     if row.kind == "inertia":
         return np.asarray(1.2 * value)
+    if row.kind == "switch":
+        return 1.0 - value
     if row.key[1] == "axis":
         turned = value + np.array([0.1, -0.05, 0.02])
         return np.asarray(turned / np.linalg.norm(turned))

@@ -65,10 +65,11 @@ def test_writing_and_undoing_leaves_no_trace(model: Model) -> None:
     for row in model.parameters:
         slot, default = places[row.key], value(row, row.default)
         assert np.array_equal(slot.read(), default)
-        slot.write(default * 0.9 if default.any() else default + 0.01)
+        written = default * 0.9 if default.any() else default + 0.01
+        written = 1.0 - default if row.kind == "switch" else written
+        slot.write(written)
         if slot.constant:
             mujoco.mj_setConst(mj, scratch)
-        written = default * 0.9 if default.any() else default + 0.01
         np.testing.assert_allclose(slot.read(), written, rtol=0.0, atol=1e-6 * row.visual)
         slot.write(default)
     mujoco.mj_setConst(mj, scratch)
@@ -247,7 +248,8 @@ def test_servos_have_gains_instead_of_numbered_slots() -> None:
         ("motor.kv", 0.5, "N m s/rad"),
     ]
     mj = copy.copy(compiled(model))
-    slots(compiled(model), model.default_parameters(), mj)["motor", "kp"].write(np.array(7.0))
+    places = slots(compiled(model), model.default_parameters(), mj, mujoco.MjData(mj))
+    places["motor", "kp"].write(np.array(7.0))
     assert (mj.actuator_gainprm[0, 0], mj.actuator_biasprm[0, 1]) == (7.0, -7.0)
 
 
@@ -260,7 +262,7 @@ def test_a_color_is_that_of_the_material_until_it_is_set() -> None:
     mj = copy.copy(compiled(model))
     before, slot = (
         arrays(mj),
-        slots(compiled(model), model.default_parameters(), mj)["rod", "color"],
+        slots(compiled(model), model.default_parameters(), mj, mujoco.MjData(mj))["rod", "color"],
     )
     assert model.parameters[0].default == (0.9, 0.1, 0.2, 1.0)
     for color in ([0.3, 0.4, 0.5, 1.0], [0.5, 0.5, 0.5, 1.0]):
@@ -275,7 +277,7 @@ def test_sizes_act_as_in_a_model_that_is_compiled_with_them() -> None:
     wide = pile(5).replace('size="0.1 0.1 0.1"', 'size="0.13 0.11 0.12"')
     model, other = read_model(pile(5)), read_model(wide)
     mj = copy.copy(compiled(model))
-    places = slots(compiled(model), model.default_parameters(), mj)
+    places = slots(compiled(model), model.default_parameters(), mj, mujoco.MjData(mj))
     for row in other.parameters:
         places[row.key].write(value(row, row.default))
     mujoco.mj_setConst(mj, mujoco.MjData(mj))
@@ -302,8 +304,6 @@ def test_mocap_bodies_have_a_pose_that_can_be_set() -> None:
     )
     mujoco.mj_step(mj, data, 500)
     assert data.body("held").xpos[1] == pytest.approx(0.3, abs=0.05)
-    with pytest.raises(TypeError, match="needs the MjData"):
-        slots(compiled(model), model.default_parameters(), mj)
 
 
 def test_contacts_name_bodies() -> None:
@@ -451,6 +451,175 @@ def test_what_is_no_model_is_one_typed_error(source: Any, error: Any, message: s
     """The error names the file and what to do."""
     with pytest.raises(error, match=re.escape(message)):
         read_model(source)
+
+
+LINK = (
+    '<link name="{}"><inertial><mass value="1"/>'
+    '<inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+)
+HINGE = (
+    '<joint name="{}" type="continuous"><parent link="{}"/><child link="{}"/>'
+    '<axis xyz="0 1 0"/></joint>'
+)
+
+
+@pytest.mark.parametrize(
+    ("links", "joints", "message"),
+    [
+        (("l", "r"), (("a", "base", "l"), ("a", "l", "r")), "2 joints called 'a'"),
+        (("l", "l"), (("a", "base", "l"),), "2 links called 'l'"),
+        (("l",), (("", "base", "l"),), "a joint without a name"),
+    ],
+)
+def test_names_of_a_urdf_that_are_not_unique_are_named(
+    links: tuple[str, ...], joints: tuple[tuple[str, ...], ...], message: str
+) -> None:
+    """MuJoCo leaves out the second name, and motors would have no joint."""
+    parts = [LINK.format(name) for name in links] + [HINGE.format(*joint) for joint in joints]
+    with pytest.raises(ModelError, match=message):
+        read_model(f'<robot name="r"><link name="base"/>{"".join(parts)}</robot>')
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        (
+            "".join(
+                f'<joint name="j{i}" type="slide" axis="{axis}"/>'
+                for i, axis in enumerate(("1 0 0", "0 1 0", "0 0 1", "1 1 0"))
+            ),
+            "'j0', 'j1', 'j3' depend on one another",
+        ),
+        (
+            '<joint name="one"/><joint name="two" pos="0 .1 0" axis="0 0 1"/><joint name="three"/>',
+            "'one', 'three' depend on one another",
+        ),
+    ],
+)
+def test_joints_that_depend_on_one_another_are_named(text: str, named: str) -> None:
+    """A singular mass matrix is refused when the model is read, not at the first reset."""
+    body = f'<body name="b">{text}<geom type="box" size=".05 .05 .05" mass="1"/></body>'
+    with pytest.raises(ModelError, match=named):
+        read_model(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+
+
+def test_a_compiled_model_without_sense_is_refused() -> None:
+    """Masses, and ranges with the upper end first, that were written into a compiled model."""
+    for array, value, message in (
+        ("body_mass", -1.0, "no body has such a mass, or such moments of inertia, as 'pole'"),
+        ("jnt_range", (1.0, -1.0), "hinge.range: the upper end comes first"),
+    ):
+        mj = mujoco.MjModel.from_xml_string(PENDULUM)
+        getattr(mj, array)[-1] = value
+        with pytest.raises(ModelError, match=message):
+            read_model(mj, expose=["*", "*.range"])
+
+
+# --- files that MuJoCo reads, too --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("declared", "encoding", "joint"),
+    [
+        ("ISO-8859-1", "latin-1", "Gelenk_ä"),
+        ("Shift_JIS", "shift-jis", "関節"),
+        ("UTF-16", "utf-16", "Gelenk_ä"),
+        ("UTF-16", "utf-8", "Gelenk_ä"),
+        ("utf-8", "utf-8-sig", "Gelenk_ä"),
+        ("no-such-encoding", "utf-8", "Gelenk_ä"),
+        ("utf-8", "cp1252", "joint"),
+    ],
+)
+@pytest.mark.parametrize("part", ["whole", "included"])
+def test_xml_is_read_in_the_encoding_that_it_declares(
+    declared: str, encoding: str, joint: str, part: str, tmp_path: Path
+) -> None:
+    """As well as with a byte order mark, or with stray bytes in a comment."""
+    comment = "Länge" if joint.isascii() else joint
+    head = f'<?xml version="1.0" encoding="{declared}"?><!-- {comment} -->'
+    body = f'<body name="b"><joint name="{joint}"/><geom size=".1"/></body>'
+    world = f"<worldbody>{body}</worldbody>"
+    path = tmp_path / "m.xml"
+    path.write_bytes(f"{head}<mujoco>{world}</mujoco>".encode(encoding))
+    if part == "included":
+        path.rename(tmp_path / "part.xml")
+        path.write_text('<mujoco><include file="part.xml"/></mujoco>')
+    assert read_model(path).layout.names == (f"{joint}.position", f"{joint}.velocity")
+
+
+def test_folders_that_a_file_strips_from_its_paths_are_stripped(tmp_path: Path) -> None:
+    """The mesh is beside the model, whatever folder the file names."""
+    mesh = "<mesh name='m' file='/home/me/cad/part.obj'/>"
+    (tmp_path / "part.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\n")
+    path = tmp_path / "m.xml"
+    path.write_text(
+        f'<mujoco><compiler strippath="true"/><asset>{mesh}</asset><worldbody><body><joint/>'
+        '<geom type="mesh" mesh="m"/></body></worldbody></mujoco>'
+    )
+    assert compiled(read_model(path)).nmesh == 1
+
+
+def plate(mass: str, moments: str) -> str:
+    """Write a URDF with one link."""
+    x, y, z = moments.split()
+    inertia = f'<inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/>'
+    link = f'<link name="plate"><inertial><mass value="{mass}"/>{inertia}</inertial></link>'
+    joint = HINGE.format("j", "base", "plate")
+    return f'<robot name="r"><link name="base"/>{link}{joint}</robot>'
+
+
+@pytest.mark.parametrize(
+    ("mass", "moments", "notes"),
+    [
+        ("1", "0.01 0.01 0.01", ()),
+        ("1", "0.01 0.01 0.1", ("plate (0.01 0.01 0.1, now 0.04 0.04 0.04 kg m²)",)),
+        ("0", "0 0 0", ("plate (0, now 1e-06 kg)", "plate (0 0 0, now 1e-09 1e-09 1e-09 kg m²)")),
+    ],
+)
+def test_a_mass_or_inertia_that_is_replaced_is_noted(
+    mass: str, moments: str, notes: tuple[str, ...]
+) -> None:
+    """What no body can have is replaced by the compiler, and a note has both numbers."""
+    found = read_model(plate(mass, moments)).notes
+    assert len(found) == len(notes)
+    assert all(one in note for one, note in zip(notes, found, strict=True))
+
+
+def test_a_note_tells_how_far_few_iterations_lead_away() -> None:
+    """The difference to plain MuJoCo after half a second, as a warning and among the notes."""
+    with pytest.warns(UserWarning, match="With 1 iteration the solver"):
+        model = read_model(pile(2, '<option iterations="1" integrator="implicitfast"/>'))
+    ends = []
+    for mj in (compiled(model), model.source.compile()):
+        data = mujoco.MjData(mj)
+        mujoco.mj_step(mj, data, 250)
+        ends.append(data.qpos.reshape(2, 7)[:, :3].copy())
+    (note,) = model.notes
+    assert f"{np.abs(ends[0] - ends[1]).max():.2g} m;" in note
+    assert not read_model(pile(2, '<option iterations="40" integrator="implicitfast"/>')).notes
+
+
+# --- keyframes ---------------------------------------------------------------------------------
+
+RAISED = PENDULUM.replace(
+    "</mujoco>",
+    '<keyframe><key name="up" qpos="1" qvel=".5" ctrl=".7"/><key qpos="-1"/></keyframe></mujoco>',
+)
+
+
+@pytest.mark.parametrize(("keyframe", "begin"), [("up", (1.0, 0.5, 0.7)), ("1", (-1.0, 0.0, 0.0))])
+def test_a_keyframe_is_where_everything_begins(keyframe: str, begin: tuple[float, ...]) -> None:
+    """Positions, velocities and controls are defaults; without a name it has its number."""
+    model = read_model(RAISED, keyframe=keyframe)
+    assert tuple(row.default for row in (*model.states, *model.inputs)) == begin
+    assert model != read_model(RAISED)
+    assert not model.notes
+
+
+def test_an_unknown_keyframe_is_answered_with_all_there_are() -> None:
+    """By name, or by number where there is none."""
+    with pytest.raises(UnknownOption, match=r"no keyframe is named 'down'.*: up, 1"):
+        read_model(RAISED, keyframe="down")
 
 
 def test_plugins_are_refused_by_name() -> None:

@@ -172,7 +172,8 @@ class Physics:
             after = self.run(vector, control)
         else:
             default = np.array(np.broadcast_to(row.default, row.shape))
-            self.write(row, default * 1.2 if default.any() else default + 0.05)
+            other = default * 1.2 if default.any() else default + 0.05
+            self.write(row, 1.0 - default if row.kind == "switch" else other)
             after = self.run(vector, control)
             self.write(row, default)
         return set(self.tree[(before != after) & ~(np.isnan(before) & np.isnan(after))].tolist())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import re
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from scm_world.errors import (
     UnknownOption,
 )
 from scm_world.queries import Contact, On
+from scm_world.variables import Integers
 
 PENDULUM = """
 <mujoco model="pendulum">
@@ -214,3 +216,132 @@ def test_a_pickled_snapshot_leaves_the_model_out() -> None:
     assert all(np.array_equal(other[name], value) for name, value in world.values().items())
     with pytest.raises(SnapshotMismatch, match="another task, of other arguments"):
         World.from_mjcf(PENDULUM.format(actuator=MOTOR).replace("0.5", "0.6")).restore(again)
+
+
+# --- ranges, constraints, keyframes --------------------------------------------------------------
+
+ROPE = """
+<mujoco>
+  <worldbody><site name="o"/>
+    <body name="a" pos="0 0 1">
+      <joint name="j" axis="0 1 0" range="-40 40" limited="true" actuatorfrcrange="-1 1"/>
+      <geom size=".05" pos=".2 0 0"/><site name="s" pos=".2 0 0"/>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial name="t" stiffness="5" springlength=".1 .3" range="0 2" limited="true">
+      <site site="s"/><site site="o"/>
+    </spatial>
+  </tendon>
+  <actuator><motor name="m" joint="j" ctrlrange="-1 1" forcerange="-2 2"/></actuator>
+</mujoco>
+"""
+
+
+def test_no_range_begins_with_its_upper_end() -> None:
+    """MuJoCo refuses each of them in a file; the world stays as it was."""
+    ranges = [
+        "t.springlength", "t.range", "j.range", "j.actuatorfrcrange", "m.ctrlrange", "m.forcerange",
+    ]  # fmt: skip
+    world = World.from_mjcf(ROPE, expose=["*", *ranges])
+    world.reset(seed=0)
+    pairs = {row.name for row in world.task.system.parameters if row.shape == (2,)}
+    assert pairs == {*ranges}
+    for name in ranges:
+        before = world[name]
+        with pytest.raises(Infeasible, match=rf"do\({name}\).*give the lower end first"):
+            world.do({name: [before[1] + 1.0, before[0]]})
+        np.testing.assert_array_equal(world[name], before)
+        world.do({name: np.add(before, 0.01)})
+
+
+def test_no_limit_of_a_joint_is_reversed_on_bullet() -> None:
+    """It is refused as on MuJoCo."""
+    pytest.importorskip("pybullet")
+    text = PENDULUM.format(actuator="").replace("damping", 'range="-9 9" limited="true" damping')
+    world = World.from_mjcf(text, backend="bullet", expose=["hinge.range"])
+    world.reset(seed=0)
+    with pytest.raises(Infeasible, match="give the lower end first"):
+        world.do({"hinge.range": [0.1, -0.1]})
+    world.do({"hinge.range": [-0.1, 0.1]})
+
+
+WELDED = """
+<mujoco>
+  <worldbody>
+    <body name="a" pos="0 0 1"><freejoint/><geom size=".1"/></body>
+    <body name="b" pos="1 0 1"><freejoint/><geom size=".1" mass="3"/></body>
+  </worldbody>
+  <equality><weld name="weld" body1="a" body2="b" active="false"/></equality>
+  <keyframe>
+    <key name="up" qpos="0 0 2 1 0 0 0 1 0 2 1 0 0 0" qvel="1 0 0 0 0 0 0 0 0 0 0 0"/>
+  </keyframe>
+</mujoco>
+"""
+
+
+def test_a_constraint_can_be_switched() -> None:
+    """The weld carries the speed of one body to the other, until the reset."""
+    world = World.from_mjcf(WELDED, keyframe="up")
+    switch = world.model.declared("weld.active")
+    assert (switch.dtype, switch.bounds, switch.default) == ("integer", Integers(0, 1), 0)
+    world.reset(seed=0)
+    assert world.do({"weld.active": 1}).targets["weld.active"].read_back == 1
+    for _ in range(10):
+        world.step([])
+    assert world["b.linear_velocity"][0] > 0.1
+    world.reset(seed=0)
+    assert world["weld.active"] == 0
+    for _ in range(10):
+        world.step([])
+    assert world["b.linear_velocity"][0] == 0.0
+    with pytest.raises(OutOfBounds):
+        world.do({"weld.active": 2})
+    plain = world.rollout(None, seed=0, steps=10)
+    assert plain.counterfactual({}, at=4) == plain
+    other = plain.counterfactual({"weld.active": 1}, at=4)
+    assert np.array_equal(other["b.linear_velocity"][:5], plain["b.linear_velocity"][:5])
+    assert other["b.linear_velocity"][-1, 0] > 0.1
+    children = world.model.children("weld.active")
+    assert {"a.linear_velocity", "b.cartesian_position"} <= set(children)
+
+
+def test_the_controls_of_a_keyframe_are_the_idle_action() -> None:
+    """A servo that begins in a keyframe stays there, on both engines."""
+    servo = '<actuator><position name="m" joint="hinge" kp="50" kv="5"/></actuator>'
+    key = '<keyframe><key name="home" qpos=".8" ctrl=".8"/></keyframe>'
+    for backend in ("mujoco", "bullet") if find_spec("pybullet") else ("mujoco",):
+        world = pendulum(servo + key, keyframe="home", backend=backend)
+        world.reset(seed=0)
+        assert world["hinge.position"] == 0.8
+        np.testing.assert_array_equal(world.task.idle(world), [0.8])
+        episode = world.rollout(None, seed=0, steps=20)
+        np.testing.assert_allclose(episode["hinge.position"], 0.8, atol=0.02)
+
+
+# --- one way to give options ---------------------------------------------------------------------
+
+
+def test_a_world_takes_the_options_of_its_model(tmp_path: Path) -> None:
+    """As ``from_mjcf`` does; a task that is made has its options."""
+    path = tmp_path / "pendulum.xml"
+    path.write_text(PENDULUM.format(actuator=MOTOR))
+    options: Any = {"control_dt": 0.05, "expose": ["*.mass"], "seconds": 1.0}
+    for source in (path, str(path), path.read_text(), mujoco.MjModel.from_xml_path(str(path))):
+        world, other = World(source, **options), World.from_mjcf(source, **options)
+        assert world.model == other.model
+        assert world.control_period == other.control_period == 0.05
+    root = '<robot name="r"><link name="l"><inertial><mass value="1"/><inertia ixx="1" iyy="1" '
+    urdf = root + 'izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
+    assert "l.cartesian_position" in World(urdf, fixed_base=False).model
+    for task in (pendulum().task, pendulum().structures):
+        with pytest.raises(UnknownOption, match="none, with a task that is made"):
+            World(task, control_dt=0.05)
+    with pytest.raises(UnknownOption, match="did you mean 'expose'"):
+        World(str(path), exposed=["*.mass"])
+    assert (
+        World("pushing", backend="fake", tool_block_mass=0.3)
+        .model.declared("tool_block.mass")
+        .default
+        == 0.3
+    )

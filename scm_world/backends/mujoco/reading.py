@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import fnmatch
 import hashlib
 import math
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -23,12 +25,13 @@ from scm_world.backends.mujoco.fields import (
     table,
 )
 from scm_world.backends.mujoco.readouts import find_readouts
-from scm_world.backends.mujoco.realization import callbacks
+from scm_world.backends.mujoco.realization import callbacks, inertia_of, sensible
 from scm_world.backends.mujoco.sources import Source, read_source, realized, understood
 from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import ModelError, nearest
+from scm_world.errors import ModelError, UnknownOption, nearest
 from scm_world.models.bodies import ModelBodies
 from scm_world.models.model import Input, Model, Numbers, Parameter, StateRow
+from scm_world.models.scene import REVERSED, reversed_ranges
 
 _DSBL, _JNT, _TRN, _INT = (
     mujoco.mjtDisableBit,
@@ -51,6 +54,7 @@ def read_model(
     expose: Iterable[str] | str | None = None,
     readouts: Iterable[str] = (),
     fixed_base: bool = True,
+    keyframe: str | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Model:
     """Read a model, and describe it by tables.
@@ -66,26 +70,30 @@ def read_model(
             ``"tip.orientation"``, ``"tip.linear_velocity"``, ``"tip.angular_velocity"`` of sites,
             bodies and shapes, and ``"imu.value"`` of sensors.
         fixed_base: Whether the root link of a URDF is fixed to the world.
+        keyframe: Name or number of a keyframe of the file whose state, controls and mocap poses are
+            the defaults; the pose of the file if None.
         settings: Options of MJCF to be set to something else: ``{"timestep": 0.001}``.
 
     Raises:
         UnreadableFile: There is no such file, or it is no text.
         ModelError: It is no model, or one that cannot be a causal model; or a pattern or readout
             names nothing.
-        UnknownOption: A setting does not exist.
+        UnknownOption: A setting or keyframe does not exist.
     """
     found = callbacks()
     if found:
         raise ModelError(found)
-    sealed, own_name, where = read_source(
+    sealed, own_name, where, replaced = read_source(
         source, fixed_base=fixed_base, options=dict(settings or {})
     )
     with understood(where):
-        mj, notes = realized(sealed)
+        mj, changed = realized(sealed)
     _check(mj, sealed, where)
+    start = _start(mj, keyframe)
     trees = Couplings(mj)
     names = element_names(mj)
-    states, inputs = tuple(_states(mj, names, trees)), tuple(_inputs(mj, names, trees))
+    states = tuple(_states(mj, names, trees, start))
+    inputs = tuple(_inputs(mj, names, trees, start))
     placed = [
         (row, state.array, state.numbers, state.number if state.kind == "joint" else -1)
         for row, state in zip(states, _moving(mj, names), strict=True)
@@ -94,9 +102,14 @@ def read_model(
     fluid = patterns is not None and any(fnmatch.filter(MEDIUM, p) for p in patterns if p != "*")
     fields = table(mj, fluid=fluid)
     chosen = _exposed(fields, patterns)
-    data = mujoco.MjData(mj) if mj.nmocap else None
-    parameters = tuple(_parameter(mj, data, field) for field in fields if field.name in chosen)
-    keys = "\0".join(f"{row.name}\0{row.key}" for row in parameters)
+    parameters = tuple(_parameter(mj, start, field) for field in fields if field.name in chosen)
+    wrong = reversed_ranges({row.key: row.default for row in parameters})
+    if wrong:
+        raise ModelError([f"{where}: {'.'.join(key)}: {REVERSED}" for key in wrong])
+    drift = tuple(_drift(mj, sealed, start))
+    for note in drift:
+        warnings.warn(note, stacklevel=3)
+    keys = "\0".join((keyframe or "", *(f"{row.name}\0{row.key}" for row in parameters)))
     return Model(
         name=name or own_name or "model",
         digest=hashlib.sha256(f"{sealed.digest}\0{keys}".encode()).hexdigest(),
@@ -112,7 +125,7 @@ def read_model(
             for field in fields
             if field.name not in chosen
         ),
-        notes=(*notes, *_notes(mj)),
+        notes=(*replaced, *changed, *drift, *_notes(mj, keyframe)),
         describe=described,
     )
 
@@ -168,18 +181,103 @@ def _check(mj: mujoco.MjModel, source: Source, where: str) -> None:
             f"{where} has plastic springs or flexes, whose rest shape is a hidden state; remove "
             "springyield and yield"
         )
+    problems += _check_inertia(mj, where) if mj.nv else ()
     if problems:
         raise ModelError(problems)
 
 
-def _notes(mj: mujoco.MjModel) -> Iterator[str]:
+def _check_inertia(mj: mujoco.MjModel, where: str) -> Iterator[str]:
+    """Say which bodies have no inertia that there can be, or which joints have none to move."""
+    model, data = copy.copy(mj), mujoco.MjData(mj)
+    data.warning.number[:] = 1  # MuJoCo prints the first warning of a kind
+    mujoco.mj_setConst(model, data)
+    if data.warning.number[0] == 1 and sensible(*inertia_of(model)):
+        return
+    moments, names = mj.body_inertia, element_names(mj)
+    possible = (mj.body_mass >= 0.0) & (moments.min(axis=1) >= 0.0)
+    possible &= 2.0 * moments.max(axis=1) <= moments.sum(axis=1) * (1.0 + 1e-6)
+    if not possible.all():
+        wrong = ", ".join(repr(names["body"][body]) for body in np.flatnonzero(~possible))
+        yield f"{where}: no body has such a mass, or such moments of inertia, as {wrong}"
+        return
+    matrix = np.empty((mj.nv, mj.nv))
+    mujoco.mj_fullM(model, data, matrix)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(scale[:, None] * matrix * scale)
+    weak = np.abs(vectors[:, values < 1e-9]).max(axis=1, initial=0.0) > 1e-6
+    joints = dict.fromkeys(names["joint"][int(joint)] for joint in mj.dof_jntid[weak])
+    yield (
+        f"{where}: the joints {', '.join(map(repr, joints))} depend on one another or move no "
+        "mass, so that the mass matrix is singular; remove one of them, or give them armature"
+    )
+
+
+def _start(mj: mujoco.MjModel, keyframe: str | None) -> mujoco.MjData:
+    """Return the state in which episodes begin.
+
+    Raises:
+        UnknownOption: There is no such keyframe.
+    """
+    data = mujoco.MjData(mj)
+    if keyframe is not None:
+        names = [mj.key(i).name or str(i) for i in range(mj.nkey)]
+        if str(keyframe) not in names:
+            raise UnknownOption("keyframe", keyframe, names)
+        mujoco.mj_resetDataKeyframe(mj, data, names.index(str(keyframe)))
+    return data
+
+
+FEW = 50
+"""Below so many iterations a solver depends on where it begins."""
+DRIFT_SECONDS = 0.5
+DRIFT = 1e-4
+"""Differences that are worth a note [m] or [rad]."""
+
+
+def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator[str]:
+    """Say how far plain MuJoCo, with its warm start, goes elsewhere where iterations are few."""
+    if mj.opt.iterations >= FEW:
+        return
+    ends = []
+    steps = max(1, round(DRIFT_SECONDS / mj.opt.timestep))
+    for model in (mj, source.compile()):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = start.qpos, start.qvel, start.ctrl
+        data.act[:], data.warning.number[:] = start.act, 1
+        mujoco.mj_step(model, data, steps)
+        ends.append(data.qpos.copy())
+    apart = np.empty(mj.nv)
+    mujoco.mj_differentiatePos(mj, apart, 1.0, *ends)
+    kinds = mj.jnt_type[mj.dof_jntid]
+    place = np.arange(mj.nv) - mj.jnt_dofadr[mj.dof_jntid]
+    slides = (kinds == int(_JNT.mjJNT_SLIDE)) | ((kinds == int(_JNT.mjJNT_FREE)) & (place < 3))
+    found = [
+        f"{np.abs(apart[which]).max():.2g} {unit}"
+        for which, unit in ((~slides, "rad"), (slides, "m"))
+        if np.abs(apart[which]).max(initial=0.0) > DRIFT or not np.isfinite(apart[which]).all()
+    ]
+    if found:
+        few = mj.opt.iterations
+        yield (
+            f"With {few} iteration{'s' * (few > 1)} the solver has to begin with the solution of "
+            "the last step; here every step begins anew, because that solution is no variable. "
+            f"After {steps * mj.opt.timestep:g} s without commands, "
+            f"MuJoCo with the file as it is differs by up to {' and '.join(found)}; "
+            "<option iterations='100' ls_iterations='50'/> brings both together."
+        )
+
+
+def _notes(mj: mujoco.MjModel, keyframe: str | None) -> Iterator[str]:
     """Say what acts without having a variable, and what is not used."""
     if mj.nflex:
         yield f"{mj.nflex} flex(es) act through their vertices; their material has no variables."
     if mj.nskin:
         yield f"{mj.nskin} skin(s) act on pictures only."
-    if mj.nkey:
-        yield f"{mj.nkey} keyframe(s) are not used: episodes begin in the pose of the file."
+    if mj.nkey and keyframe is None:
+        yield (
+            f"{mj.nkey} keyframe(s) are not used: episodes begin in the pose of the file; "
+            "keyframe='name' begins with one."
+        )
 
 
 # --- parameters --------------------------------------------------------------------------------
@@ -218,7 +316,7 @@ def _exposed(fields: Sequence[Field], patterns: Sequence[str] | None) -> set[str
     return found
 
 
-def _parameter(mj: mujoco.MjModel, data: mujoco.MjData | None, field: Field) -> Parameter:
+def _parameter(mj: mujoco.MjModel, data: mujoco.MjData, field: Field) -> Parameter:
     """Describe a field with what it is in the model as it was given."""
     if field.slot is None:
         raise TypeError(f"{field.name} has no place")
@@ -339,10 +437,9 @@ def _moving(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterato
 
 
 def _states(
-    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings
+    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings, data: mujoco.MjData
 ) -> Iterator[StateRow]:
-    """Describe what moves, in the order of the state vector."""
-    data = mujoco.MjData(mj)
+    """Describe what moves, in the order of the state vector; the data are where it begins."""
     states = list(_moving(mj, names))
     named = Counter(f"{state.element}.{state.attribute}" for state in states)
     for state in states:
@@ -385,9 +482,9 @@ def _of_actuator(
 
 
 def _inputs(
-    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings
+    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings, data: mujoco.MjData
 ) -> Iterator[Input]:
-    """Describe the components of a command."""
+    """Describe the components of a command; the data have those of the beginning."""
     for actuator in range(mj.nactuator):
         name = names["actuator"][actuator]
         first, count = int(mj.actuator_ctrladr[actuator]), int(mj.actuator_ctrlnum[actuator])
@@ -401,7 +498,7 @@ def _inputs(
                 name=f"{name}.control" if count == 1 else f"{name}.control_{i}",
                 unit=unit,
                 shape=(),
-                default=min(max(0.0, float(low)), float(high)),
+                default=min(max(float(data.ctrl[first + i]), float(low)), float(high)),
                 low=float(low),
                 high=float(high),
                 doc=doc,

@@ -21,7 +21,13 @@ from scm_world._types import Floats, Integers
 from scm_world.backends.mujoco.contacts import Touches, earlier_stages, has_stages, touches
 from scm_world.backends.mujoco.slots import Slot
 from scm_world.errors import EngineFailure, Infeasible, UnknownOption
-from scm_world.models.scene import ControlMode, ParameterKey, Parameters
+from scm_world.models.scene import (
+    REVERSED,
+    ControlMode,
+    ParameterKey,
+    Parameters,
+    reversed_ranges,
+)
 
 
 @numba.njit("b1(f8[::1], f8[::1], f8[::1], i4[:])", cache=True)
@@ -133,6 +139,11 @@ def sensible(
         if not (0.0 < inertia[dof] < math.inf and 0.0 <= dof_weights[dof] < math.inf):
             return False
     return True
+
+
+def inertia_of(mj: mujoco.MjModel) -> tuple[Floats, ...]:
+    """Return views of what ``sensible`` looks at."""
+    return mj.body_mass, mj.body_inertia, mj.dof_M0, mj.dof_invweight0, mj.body_invweight0
 
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -249,13 +260,7 @@ class Realization(ABC):
         self.command = data.ctrl[: structure.n_commands]
         self._positions, self._velocities, self._activations = data.qpos, data.qvel, data.act
         self._counts = data.warning.number
-        self._weights = (
-            model.body_mass,
-            model.body_inertia,
-            model.dof_M0,
-            model.dof_invweight0,
-            model.body_invweight0,
-        )
+        self._weights = inertia_of(model)
         self._size = int(mujoco.mj_stateSize(model, STATE))
         # MuJoCo prints a warning, and writes it to a file, when it counts the first of its kind.
         self._counts[:] = self._scratch.warning.number[:] = 1
@@ -418,9 +423,10 @@ class Realization(ABC):
             if not before:
                 return
             self.edited, self._numbers = True, None
-            reason = self.followed(before)
+            wrong = reversed_ranges({key: kept[key] for key in before})
+            reason = REVERSED if wrong else self.followed(before)
             if reason:
-                wrong = self._culprits(before)
+                wrong = wrong or self._culprits(before)
                 names = ", ".join(".".join(key).strip(".") for key in wrong)
                 values = [parameters[key] for key in wrong]
                 raise Infeasible(names, values[0] if len(values) == 1 else values, [reason])

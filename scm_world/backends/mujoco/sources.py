@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import codecs
 import hashlib
 import os
 import re
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, final
+from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
 import mujoco
 import numpy as np
 
+from scm_world._types import Floats
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.output.reading import read_bytes, read_text, regular
+from scm_world.output.reading import read_bytes, regular
 
 _CHOICES = {
     "integrator": mujoco.mjtIntegrator,
@@ -113,7 +117,7 @@ def realized(source: Source) -> tuple[mujoco.MjModel, tuple[str, ...]]:
 
 def read_source(
     source: Any, *, fixed_base: bool, options: Mapping[str, Any]
-) -> tuple[Source, str, str]:
+) -> tuple[Source, str, str, tuple[str, ...]]:
     """Read a model.
 
     Args:
@@ -122,7 +126,7 @@ def read_source(
         options: Options of MJCF that are set to something else.
 
     Returns:
-        The source, a name for the model, and how to call it in errors.
+        The source, a name for the model, how to call it in errors, and what its compiler replaces.
 
     Raises:
         UnreadableFile: A file cannot be read.
@@ -135,7 +139,7 @@ def read_source(
         mujoco.mj_saveModel(source, None, binary)
         name = source.names.split(b"\0", 1)[0].decode()
         name = "" if name == _UNNAMED else name
-        return _sealed("", {}, binary.tobytes(), chosen), name, "the MjModel"
+        return _sealed("", {}, binary.tobytes(), chosen), name, "the MjModel", ()
     if isinstance(source, mujoco.MjSpec):
         where, folder, stem = "the MjSpec", Path(source.modelfiledir), ""
         spec, urdf = source.copy(), False
@@ -165,11 +169,12 @@ def read_source(
         attached = _compiled_whole(whole)  # parts of other files keep their own folders
         if urdf or attached is None:
             raise
-        return read_source(attached, fixed_base=fixed_base, options=options)[0], name, where
+        return read_source(attached, fixed_base=fixed_base, options=options)[0], name, where, ()
     if urdf:
         _repair(spec, where)
         _add_motors(spec)
-    return _sealed(*_written(spec, files, where), b"", chosen), name, where
+    notes = tuple(_replaced_inertia(spec, where))
+    return _sealed(*_written(spec, files, where), b"", chosen), name, where, notes
 
 
 def _contents(path: Path) -> str:
@@ -180,11 +185,33 @@ def _contents(path: Path) -> str:
     """
     advice = "give the path of an MJCF (.xml, .mjcf) or URDF (.urdf) file, or XML text"
     try:
-        return read_text(path, "utf-8-sig")
+        text = _decoded(read_bytes(path))
     except OSError as error:
         raise UnreadableFile(str(path), (error.strerror or str(error)).lower(), advice) from error
-    except UnicodeDecodeError as error:
-        raise UnreadableFile(str(path), "it is no text", advice) from error
+    if "\0" in text.rstrip("\0"):
+        raise UnreadableFile(str(path), "it is no text", advice)
+    return text
+
+
+def _decoded(data: bytes) -> str:
+    """Decode XML by its byte order mark, or by the encoding that it declares; else as UTF-8.
+
+    Bytes without a meaning become U+FFFD, because they count in names alone.
+
+    Source:
+        *Extensible Markup Language (XML) 1.0*, appendix F.
+    """
+    declared = re.match(rb"\s*<\?xml[^>]*?\bencoding\s*=\s*[\"']([\w.:-]+)", data)
+    encoding = declared[1].decode("ascii", "replace") if declared else "utf-8"
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encoding = "utf-16"
+    elif encoding.lower().startswith("utf"):  # what declares UTF-16 in ASCII is not in UTF-16
+        encoding = "utf-8-sig"
+    try:
+        text = data.decode(encoding, "replace")
+    except LookupError:  # MuJoCo reads it as UTF-8, too
+        text = data.decode("utf-8-sig", "replace")
+    return text.replace("\r\n", "\n")
 
 
 def _root_tag(text: str) -> str:
@@ -208,11 +235,48 @@ def _parsed(text: str, where: str, path: Path | None = None) -> mujoco.MjSpec:
                 "which begins with <robot>"
             ]
         )
+    if tag == "robot":
+        _check_names(text, where)
     with understood(where):
         included = _included(text, Path() if path is None else path.parent)
-        if path is not None and path.suffix in (".xml", ".urdf"):
+        if path is not None and path.suffix in (".xml", ".urdf") and _is_plain(path, included):
             return mujoco.MjSpec.from_file(str(path))
-        return mujoco.MjSpec.from_string(text, include={} if path is None else included)
+        texts = {name: _decoded(data).encode() for name, data in included.items()}
+        return mujoco.MjSpec.from_string(text, include={} if path is None else texts)
+
+
+def _check_names(text: str, where: str) -> None:
+    """Refuse links and moving joints of a URDF that share a name, which MuJoCo would leave out.
+
+    Raises:
+        ModelError: With the names.
+    """
+    try:
+        root = ElementTree.fromstring(text)  # noqa: S314 # expat bounds what entities become
+    except ElementTree.ParseError:  # MuJoCo minds less, or says what is wrong
+        return
+    problems = []
+    for kind in ("link", "joint"):
+        found = [one.get("name", "") for one in root.findall(kind) if one.get("type") != "fixed"]
+        problems += [
+            f"{where} has {n} {kind}s called {name!r}; give each a name of its own"
+            for name, n in Counter(found).items()
+            if name and n > 1
+        ]
+        if "" in found:
+            problems.append(f"{where} has a {kind} without a name; give it one")
+    if problems:
+        raise ModelError(problems)
+
+
+def _is_plain(path: Path, included: Mapping[str, bytes]) -> bool:
+    """Tell whether a file and those that it includes are in UTF-8, which MuJoCo reads."""
+    try:
+        for data in (read_bytes(path), *included.values()):
+            data.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def _included(text: str, folder: Path) -> dict[str, bytes]:
@@ -228,7 +292,7 @@ def _included(text: str, folder: Path) -> dict[str, bytes]:
             path = folder / name
             if name not in found and path.exists():
                 found[name] = _part(path, read_bytes)
-                texts.append(found[name].decode(errors="replace"))
+                texts.append(_decoded(found[name]))
     return found
 
 
@@ -315,6 +379,7 @@ def _located(spec: mujoco.MjSpec, folder: Path, where: str) -> dict[str, str]:
     if problems:
         raise ModelError(list(dict.fromkeys(problems)))
     spec.meshdir = spec.texturedir = ""
+    spec.strippath = False
     return found
 
 
@@ -331,15 +396,61 @@ def _path(name: str, directory: str, folder: Path) -> Path | None:
 
 
 def _repair(spec: mujoco.MjSpec, where: str) -> None:
-    """Let the compiler balance and bound the inertias of a URDF, where it needs to."""
-    spec.compiler.balanceinertia = True
-    try:
-        with understood(where):
-            spec.copy().compile()
-    except ModelError as error:
-        if "inertia" not in str(error):
-            raise
-        spec.compiler.boundmass, spec.compiler.boundinertia = 1e-6, 1e-9
+    """Let the compiler balance, then bound the inertias of a URDF, as far as it has to.
+
+    Raises:
+        ModelError: MuJoCo does not compile it for another reason.
+    """
+    for repair in ({"balanceinertia": True}, {"boundmass": 1e-6, "boundinertia": 1e-9}):
+        try:
+            with understood(where):
+                spec.copy().compile()
+            return
+        except ModelError as error:
+            if "inertia" not in str(error):
+                raise
+        for name, value in repair.items():
+            setattr(spec.compiler, name, value)
+
+
+def _replaced_inertia(spec: mujoco.MjSpec, where: str) -> Iterator[str]:
+    """Say which masses and moments of inertia of a file its compiler replaces."""
+    compiler = spec.compiler
+    if not (compiler.balanceinertia or compiler.boundmass or compiler.boundinertia):
+        return
+    with understood(where):
+        mj = spec.copy().compile()
+    masses, moments = list[str](), list[str]()
+    for body in spec.bodies[1:]:
+        number = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_BODY, body.name)
+        if number < 1:
+            continue  # it is part of its parent
+        if body.mass < mj.body_mass[number] == compiler.boundmass:
+            masses.append(f"{body.name} ({body.mass:g}, now {compiler.boundmass:g} kg)")
+        if body.explicitinertial:
+            given, now = _principal(body), np.sort(mj.body_inertia[number])
+            mean = np.full(3, given.mean())
+            replaced = any(
+                np.allclose(now, one, 1e-9, 0.0) for one in (mean, compiler.boundinertia)
+            )
+            if replaced and not np.allclose(now, given, 1e-9, 0.0):
+                numbers = "{:.3g} {:.3g} {:.3g}, now {:.3g} {:.3g} {:.3g} kg m²"
+                moments.append(f"{body.name} ({numbers.format(*given, *now)})")
+    for found, why in (
+        (masses, "Nothing moves without a mass, so that the compiler gave one to"),
+        (moments, "No body has such moments of inertia, so that the compiler replaced those of"),
+    ):
+        more = f" and {len(found) - 4} more" if len(found) > 4 else ""
+        if found:
+            yield f"{why} {', '.join(found[:4])}{more}."
+
+
+def _principal(body: Any) -> Floats:
+    """Compute the moments of inertia that a specification gives a body, in ascending order."""
+    if np.isnan(body.fullinertia[0]):
+        return np.sort(body.inertia)
+    xx, yy, zz, xy, xz, yz = body.fullinertia
+    return np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
 
 
 def _add_motors(spec: mujoco.MjSpec) -> None:

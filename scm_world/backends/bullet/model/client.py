@@ -13,10 +13,10 @@ from scm_world.backends.bullet.client import Client, Values
 from scm_world.backends.bullet.model.build import Built, build, solid
 from scm_world.backends.bullet.model.forces import Forces
 from scm_world.backends.bullet.model.support import changes, shares, unsupported, usual_friction
-from scm_world.errors import ModelError, NotIntervenable, UnknownOption
+from scm_world.errors import Infeasible, ModelError, NotIntervenable, UnknownOption
 from scm_world.models.bodies import ModelBodies
 from scm_world.models.model import Model
-from scm_world.models.scene import ControlMode, ParameterKey
+from scm_world.models.scene import REVERSED, ControlMode, ParameterKey, reversed_ranges
 
 Numbers = Sequence[float]
 
@@ -171,11 +171,14 @@ class ModelClient(Client):
         Raises:
             ModelError: All of it that is in the model.
             NotIntervenable: A parameter that the engine lacks is not as in the model.
+            Infeasible: The ends of a range are the wrong way round.
         """
         problems = unsupported(structure)
         if problems:
             advice = "take it out of the model, or use backend='mujoco'"
             raise ModelError([f"Bullet cannot honour {what}; {advice}" for what in problems])
+        for key in reversed_ranges(parameters):
+            raise Infeasible(".".join(key), parameters[key], [REVERSED])
         known = changes(structure.bodies)
         for row in structure.parameters:
             if row.visual or row.key in known:

@@ -126,7 +126,7 @@ def slots(
     compiled: mujoco.MjModel,
     keys: Iterable[ParameterKey],
     mj: mujoco.MjModel,
-    data: mujoco.MjData | None = None,
+    data: mujoco.MjData,
 ) -> dict[ParameterKey, Slot]:
     """Find the places of some parameters in a model.
 
@@ -136,7 +136,7 @@ def slots(
         compiled: What was compiled; it is not written.
         keys: Of the parameters.
         mj: A copy of it.
-        data: Where the copy is stepped; only models with mocap bodies need it.
+        data: Where the copy is stepped.
     """
     wanted = frozenset(keys)
     return {

@@ -90,11 +90,11 @@ def _body(scope: Scope, body: int) -> Iterator[Field]:
     if mocap >= 0:
         yield row(
             "position", "m", "Place of a body that is moved from outside.",
-            lambda _, data: place(_held(data).mocap_pos[mocap]),
+            lambda _, data: place(data.mocap_pos[mocap]),
         )  # fmt: skip
         yield row(
             "orientation", "1", "Orientation of a body that is moved from outside.",
-            lambda _, data: turn(_held(data).mocap_quat[mocap], constant=False),
+            lambda _, data: turn(data.mocap_quat[mocap], constant=False),
             low=-1.0, high=1.0, nature="rotation",
         )  # fmt: skip
     elif first >= 0 and mj.jnt_type[first] == FREE:
@@ -119,13 +119,6 @@ def _turns(mj: mujoco.MjModel, body: int) -> bool:
             return True
         body = int(mj.body_parentid[body])
     return False
-
-
-def _held(data: mujoco.MjData | None) -> mujoco.MjData:
-    """Give the data, which holds the places of bodies that are moved from outside."""
-    if data is None:
-        raise TypeError("this model has mocap bodies: slots() needs the MjData, too")
-    return data
 
 
 def joints(scope: Scope) -> Iterator[Field]:

@@ -22,6 +22,7 @@ from scm_world.backends.mujoco.fields.rows import (
     solver_rows,
 )
 from scm_world.backends.mujoco.slots import gain as gain_slot
+from scm_world.backends.mujoco.slots import place
 
 _TRN, _WRAP = mujoco.mjtTrn, mujoco.mjtWrap
 _GAIN, _BIAS, _DYN = mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtDyn
@@ -113,12 +114,24 @@ def equalities(scope: Scope) -> Iterator[Field]:
     curves = int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)
     for equality in range(mj.neq):
         row = scope.rows("equality", equality, partial(scope.trees.equality, equality))
+        off = scope.off(OFF.mjDSBL_EQUALITY, "equality constraints")
+        yield row(
+            "active", "1", "Whether the constraint is in force: 1, or 0.",
+            _active(equality), low=0.0, high=1.0, nature="switch",
+            refusal=off or scope.off(OFF.mjDSBL_CONSTRAINT, "constraints"),
+        )  # fmt: skip
         yield from solver_rows(row, mj, "eq", equality, usual=False)
         if mj.eq_type[equality] in curves:
             yield row(
                 "polycoef", "1", "Coefficients of the polynomial that gives one from the other.",
                 at("eq_data", equality, slice(5), constant=True), usual=False,
             )  # fmt: skip
+
+
+def _active(equality: int) -> Slots:
+    """Find the switch of a constraint: in the state, and in the model that a reset copies."""
+    where = (equality, ...)
+    return lambda mj, data: place(mj.eq_active0[where], data.eq_active[where])
 
 
 # --- actuators ---------------------------------------------------------------------------------

@@ -128,7 +128,7 @@ FREE, BALL, SLIDE, HINGE = (
 )
 OFF = mujoco.mjtDisableBit
 
-Slots = Callable[[mujoco.MjModel, mujoco.MjData | None], Slot]
+Slots = Callable[[mujoco.MjModel, mujoco.MjData], Slot]
 """Finds a place in a model and its data."""
 
 
@@ -163,7 +163,7 @@ class Field:
     effect: Callable[[], Effect] = lambda: NOTHING
     low: Numbers = -math.inf
     high: Numbers = math.inf
-    nature: Literal["real", "rotation", "inertia"] = "real"
+    nature: Literal["real", "rotation", "inertia", "switch"] = "real"
     usual: bool = True
     visual: bool = False
     refusal: str = ""
