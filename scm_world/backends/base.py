@@ -124,6 +124,14 @@ class Backend(ABC):
             UnknownOption: There is no such body.
         """
 
+    def remarks(self, before: Parameters) -> tuple[str, ...]:
+        """Say which changes of parameters have no effect, and why; one sentence each.
+
+        Args:
+            before: The parameters that were changed, as they were.
+        """
+        return ()
+
     @abstractmethod
     def read(self, into: State) -> None:
         """Write the present state into an existing vector, without allocating."""
@@ -325,6 +333,10 @@ class BackendWrapper(Backend, ABC):
     def inertia(self, body: str) -> Floats:
         """Read the principal moments of inertia of a body, shape (3,) [kg m²]."""
         return self.engine.inertia(body)
+
+    def remarks(self, before: Parameters) -> tuple[str, ...]:
+        """Say which changes of parameters have no effect, and why."""
+        return self.engine.remarks(before)
 
     def read(self, into: State) -> None:
         """Write the present state into an existing vector."""

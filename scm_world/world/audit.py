@@ -51,6 +51,7 @@ class Audit:
             whose mass or size changed [kg m²], before and after.
         came: Blocks and obstacles that were not there before.
         went: Those that are not there any more.
+        remarks: What has no effect although it was set, and why.
     """
 
     targets: Mapping[str, Applied]
@@ -58,6 +59,7 @@ class Audit:
     engine: Mapping[str, tuple[Value, Value]]
     came: tuple[str, ...] = ()
     went: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         lines = []
@@ -72,6 +74,7 @@ class Audit:
                 lines.append(f"  {title}: {name} {_show(before)} → {_show(after)}")
         lines += [f"  new: {name}" for name in self.came]
         lines += [f"  gone: {name}" for name in self.went]
+        lines += [f"  note: {remark}" for remark in self.remarks]
         return "\n".join(lines)
 
 
@@ -131,7 +134,10 @@ def report(
         for one in (now, before)
     )
     came, went = sorted(there - were), sorted(were - there)
-    return Audit(targets, followed, engine, tuple(came), tuple(went))
+    remarks: tuple[str, ...] = ()
+    if change.structure is None and any(what.endswith("friction") for _, what in change.parameters):
+        remarks = backend.remarks(before.inverse(change).parameters)
+    return Audit(targets, followed, engine, tuple(came), tuple(went), remarks)
 
 
 def _typed(old: Value, new: Value) -> Value:

@@ -345,3 +345,50 @@ def test_a_world_takes_the_options_of_its_model(tmp_path: Path) -> None:
         .default
         == 0.3
     )
+
+
+# --- what has no effect --------------------------------------------------------------------------
+
+SLIPPERY = """
+<mujoco><worldbody>
+  <geom name="floor" type="plane" size="1 1 1" friction="1"/>
+  <body name="c" pos="0 0 .1"><freejoint/>
+    <geom name="cube" type="box" size=".1 .1 .1" friction=".5"/>
+  </body>
+  <body name="d" pos="0 0 .4"><freejoint/>
+    <geom name="ball" size=".1" friction=".3" priority="{priority}"/>
+  </body>
+</worldbody></mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("priority", "request_", "decide"),
+    [
+        (0, {"cube.friction": 0.8}, "floor (1)"),
+        (0, {"cube.friction": 1.5}, ""),
+        (0, {"ball.friction": 0.4}, "floor (1), cube (0.5)"),
+        (1, {"cube.friction": 0.8}, "floor (1), ball (0.3)"),
+        (1, {"ball.friction": 0.1}, ""),
+        (1, {"cube.mass": 2.0}, ""),
+    ],
+)
+def test_the_audit_says_where_a_friction_has_no_effect(
+    priority: int, request_: dict[str, float], decide: str
+) -> None:
+    """MuJoCo takes the larger of two coefficients, unless one shape has a higher priority."""
+    world = World.from_mjcf(SLIPPERY.format(priority=priority))
+    world.reset(seed=0)
+    (name,) = request_
+    expected = f"{name} has no effect in contacts with {decide}: the larger coefficient counts"
+    audit = world.do(request_)
+    assert len(audit.remarks) == bool(decide)
+    assert (f"note: {expected}" in str(audit)) == bool(decide)
+
+
+def test_bullet_multiplies_frictions() -> None:
+    """So that none of them is without effect."""
+    pytest.importorskip("pybullet")
+    world = World.from_mjcf(SLIPPERY.format(priority=0), backend="bullet")
+    world.reset(seed=0)
+    assert world.do({"cube.friction": 0.8}).remarks == ()

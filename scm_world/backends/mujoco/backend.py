@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, final
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
+from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.backends.base import (
@@ -29,6 +31,7 @@ from scm_world.backends.mujoco.realization import (
     refuse_callbacks,
     write_vector,
 )
+from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import EngineFailure, ModelError
 from scm_world.models.model import Model
 from scm_world.models.scene import (
@@ -61,6 +64,38 @@ class Articulated(Realization):
             reading.contact_bodies(compiled),
         )
         self._places = np.concatenate(reading.permutation(compiled)).astype(np.int64)
+        self._compiled = compiled
+
+    @cached_property
+    def _dynamic(self) -> NDArray[np.bool_]:
+        """Which shapes touch with coefficients of their own, shape (ngeom, ngeom)."""
+        return Couplings(self._compiled).dynamic
+
+    def remarks(self, before: Parameters) -> tuple[str, ...]:
+        """Say with which shapes a friction that was changed has no effect.
+
+        Source:
+            MuJoCo, *Computation, Contact*: of two shapes the one with the higher priority decides,
+            and with equal priorities the larger of each of their coefficients.
+        """
+        mj, names = self.model, fields.element_names(self._compiled)["geom"]
+        found = []
+        for (element, attribute), old in before.items():
+            name = element.removeprefix("geom:")
+            if attribute not in fields.FRICTIONS or name not in names:
+                continue
+            geom, column = names.index(name), fields.FRICTIONS.index(attribute)
+            rank, theirs = mj.geom_priority, mj.geom_friction[:, column]
+            larger = (rank == rank[geom]) & (theirs >= max(float(old), theirs[geom]))
+            others = np.flatnonzero(self._dynamic[geom] & ((rank > rank[geom]) | larger))
+            if len(others):
+                shown = [f"{names[i]} ({theirs[i]:g})" for i in others[:4].tolist()]
+                more = f" and {len(others) - 4} more" if len(others) > 4 else ""
+                found.append(
+                    f"{element}.{attribute} has no effect in contacts with {', '.join(shown)}{more}"
+                    ": the larger coefficient counts, or the one with priority"
+                )
+        return tuple(found)
 
     def read(self, into: Floats) -> None:
         """Write the state into a vector, shape (nq + nv + na,)."""
@@ -187,6 +222,10 @@ class MujocoBackend(Backend):
             UnknownOption: There is no such body.
         """
         return self._now.inertia(body)
+
+    def remarks(self, before: Parameters) -> tuple[str, ...]:
+        """Say with which shapes a friction that was changed has no effect."""
+        return self._now.remarks(before)
 
     def read(self, into: State) -> None:
         """Write the present state into an existing vector."""

@@ -372,6 +372,10 @@ class Realization(ABC):
         moments: Floats = self.model.body_inertia[self.number(body)].copy()
         return moments
 
+    def remarks(self, before: Parameters) -> tuple[str, ...]:
+        """Say which changes of parameters have no effect, and why."""
+        return ()
+
     def number(self, body: str) -> int:
         """Find a body.
 

@@ -153,7 +153,7 @@ class Couplings:
 
     def highest_condim(self, geom: int) -> int:
         """Give the largest number of dimensions of the contacts of a shape; 0 if it has none."""
-        others = np.flatnonzero(self._dynamic[geom])
+        others = np.flatnonzero(self.dynamic[geom])
         if not len(others):
             return 0
         mj = self._mj
@@ -170,7 +170,7 @@ class Couplings:
         return not any(disabled(self._mj, flag) for flag in off)
 
     @cached_property
-    def _dynamic(self) -> NDArray[np.bool_]:
+    def dynamic(self) -> NDArray[np.bool_]:
         """Which shapes may touch by their masks, as MuJoCo filters them, shape (ngeom, ngeom)."""
         mj = self._mj
         if not self._contacts_on:
@@ -203,7 +203,7 @@ class Couplings:
     @cached_property
     def touches(self) -> NDArray[np.bool_]:
         """Which shapes may touch, by their masks or because a pair says so."""
-        found: NDArray[np.bool_] = self._dynamic.copy()
+        found: NDArray[np.bool_] = self.dynamic.copy()
         if self._contacts_on:
             for first, second in zip(self._mj.pair_geom1, self._mj.pair_geom2, strict=True):
                 found[first, second] = found[second, first] = True

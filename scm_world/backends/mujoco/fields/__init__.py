@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import mujoco
 
-from scm_world.backends.mujoco.fields.bodies import bodies, joints, shapes
+from scm_world.backends.mujoco.fields.bodies import FRICTIONS, bodies, joints, shapes
 from scm_world.backends.mujoco.fields.drives import (
     actuators,
     control_unit,
@@ -147,6 +147,7 @@ def slots(
 
 
 __all__ = [
+    "FRICTIONS",
     "MEDIUM",
     "Field",
     "clean",

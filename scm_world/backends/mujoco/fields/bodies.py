@@ -39,6 +39,7 @@ _FRICTIONS = (
     ("torsional_friction", 4, "m", "Coefficient of friction against turning on a spot."),
     ("rolling_friction", 6, "m", "Coefficient of friction against rolling."),
 )
+FRICTIONS = tuple(attribute for attribute, *_ in _FRICTIONS)
 _SHOWN = 3
 """MuJoCo draws the first groups of shapes unless it is asked for others."""
 
