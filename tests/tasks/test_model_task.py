@@ -370,7 +370,7 @@ SLIPPERY = """
         (0, {"ball.friction": 0.4}, "floor (1), cube (0.5)"),
         (1, {"cube.friction": 0.8}, "floor (1), ball (0.3)"),
         (1, {"ball.friction": 0.1}, ""),
-        (1, {"cube.mass": 2.0}, ""),
+        (1, {"c.mass": 2.0}, ""),
     ],
 )
 def test_the_audit_says_where_a_friction_has_no_effect(
@@ -386,9 +386,22 @@ def test_the_audit_says_where_a_friction_has_no_effect(
     assert (f"note: {expected}" in str(audit)) == bool(decide)
 
 
-def test_bullet_multiplies_frictions() -> None:
-    """So that none of them is without effect."""
+def test_the_audit_of_bullet_says_that_a_friction_has_no_effect() -> None:
+    """Nothing that the engine was given changes below the friction of the floor."""
     pytest.importorskip("pybullet")
     world = World.from_mjcf(SLIPPERY.format(priority=0), backend="bullet")
     world.reset(seed=0)
-    assert world.do({"cube.friction": 0.8}).remarks == ()
+    (remark,) = world.do({"cube.friction": 0.8}).remarks
+    assert remark.startswith("cube.friction has no effect: the larger coefficient")
+    assert world.do({"cube.friction": 1.5}).remarks == ()
+
+
+def test_a_body_below_the_floor_is_accepted() -> None:
+    """In a world of any model overlaps are not refused; contact pushes the body out."""
+    world = World.from_mjcf(SLIPPERY.format(priority=0))
+    world.reset(seed=0)
+    world.do({"c.cartesian_position": [0.0, 0.0, 0.05], "d.cartesian_position": [1.0, 0.0, 2.0]})
+    assert world["c.cartesian_position"][2] == 0.05
+    for _ in range(25):
+        world.step([])
+    assert world["c.cartesian_position"][2] > 0.09

@@ -334,6 +334,10 @@ class BulletBackend(Backend):
         """
         return self._now().inertia(body)
 
+    def remarks(self, before: Parameters) -> tuple[str, ...]:
+        """Say which frictions were changed without an effect."""
+        return self._now().remarks(dict(before))
+
     def read(self, into: State) -> None:
         """Write the present state into an existing vector."""
         numbers = self._now().read(self._reported)

@@ -245,6 +245,10 @@ class Client(ABC):
         info = self.engine.getDynamicsInfo(*self.carrier(body), physicsClientId=self.handle)
         return np.array(info[2])
 
+    def remarks(self, before: Values) -> tuple[str, ...]:
+        """Say which parameters were changed without an effect; see ``Backend.remarks``."""
+        return ()
+
     def push(self, body: str, force: Sequence[float], torque: Sequence[float]) -> None:
         """Act on a body during the next physics step; see ``Backend.push``."""
         engine, handle, (multibody, link) = self.engine, self.handle, self.carrier(body)

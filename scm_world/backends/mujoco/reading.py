@@ -263,7 +263,7 @@ def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator
             "the last step; here every step begins anew, because that solution is no variable. "
             f"After {steps * mj.opt.timestep:g} s without commands, "
             f"MuJoCo with the file as it is differs by up to {' and '.join(found)}; "
-            "<option iterations='100' ls_iterations='50'/> brings both together."
+            "<option iterations='100' ls_iterations='50'/> makes that small."
         )
 
 

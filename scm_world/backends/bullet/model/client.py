@@ -387,6 +387,18 @@ class ModelClient(Client):
             return np.array(info[0] if field == "mass" else info[2])
         return value
 
+    def remarks(self, before: Values) -> tuple[str, ...]:
+        """Say which frictions were changed without an effect; see ``shares``."""
+        usual, places = usual_friction(self._model.bodies), self._bodies.places
+        return tuple(
+            f"{'.'.join(key)} has no effect: the larger coefficient of two shapes counts, and "
+            "those of the others are larger"
+            for key, old in before.items()
+            if key in places and places[key].parts[0].field == "friction"
+            if places[key].table == "geoms"
+            if shares(self._bodies.with_parameters({key: old}), usual) == self._shares
+        )
+
     def carrier(self, body: str) -> tuple[int, int]:
         """Give multibody and link that carry the mass of a body that can move."""
         names = {self._bodies.bodies[number].name: number for number in self._built.bodies}
