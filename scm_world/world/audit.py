@@ -136,7 +136,8 @@ def report(
     came, went = sorted(there - were), sorted(were - there)
     remarks: tuple[str, ...] = ()
     if change.structure is None and any(what.endswith("friction") for _, what in change.parameters):
-        remarks = backend.remarks(before.inverse(change).parameters)
+        old = before.compiled.parameter_keys.items()
+        remarks = backend.remarks({k: before.values[n] for n, k in old if k in change.parameters})
     return Audit(targets, followed, engine, tuple(came), tuple(went), remarks)
 
 
