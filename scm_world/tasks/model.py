@@ -200,6 +200,8 @@ class ModelTask(DeclaredTask):
             found = os.path.abspath(source) if os.path.exists(source) else str(source)
             self.given, self.is_named = {"model": found, **settings}, True
         readouts = tuple(name for name in self.outcomes if isinstance(name, str))
+        if isinstance(source, Model):
+            self._check_read(source, readouts)
         self.system = (
             source
             if isinstance(source, Model)
@@ -231,6 +233,17 @@ class ModelTask(DeclaredTask):
         for option in ("spaces", "start"):
             if not isinstance(getattr(self, option), Mapping):
                 raise UnknownOption(option, getattr(self, option), ("a dictionary by name",))
+
+    def _check_read(self, source: Model, readouts: Iterable[str]) -> None:
+        """Refuse what would have to be asked of a file, where the model is read already."""
+        for option in ("expose", "fixed_base", "keyframe"):
+            if getattr(self, option) != getattr(ModelTask, option):
+                allowed = ("left out: the model is read already; give it to read_model",)
+                raise UnknownOption(option, getattr(self, option), allowed)
+        known = [row.name for row in source.readouts]
+        for name in readouts:
+            if name not in known:
+                raise UnknownOption("outcomes", name, known)
 
     def _steps(self) -> int:
         """Give the length of a control step in physics steps."""

@@ -62,6 +62,8 @@ class Server:
         )
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
+        while line.startswith("note: "):
+            line = self._process.stdout.readline()
         if not line.startswith("http://"):
             said = line + self._process.stdout.read()
             self.stop()

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from scm_world import Box, Derived, Exogenous, World
+from scm_world.backends import read_model
 from scm_world.errors import (
     ActionError,
     EngineFailure,
@@ -405,3 +406,21 @@ def test_a_body_below_the_floor_is_accepted() -> None:
     for _ in range(25):
         world.step([])
     assert world["c.cartesian_position"][2] > 0.09
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"expose": "*.mass"},
+        {"fixed_base": False},
+        {"keyframe": "up"},
+        {"outcomes": ["rod.position"]},
+    ],
+    ids=lambda options: next(iter(options)),
+)
+def test_a_model_that_is_read_already_is_not_read_again(options: dict[str, Any]) -> None:
+    """What is asked of a file comes too late, and is refused instead of forgotten."""
+    model = read_model(PENDULUM.format(actuator=MOTOR), readouts=["pole.position"])
+    with pytest.raises(UnknownOption):
+        World(model, **options)
+    assert "pole.position" in World(model, outcomes=["pole.position"], control_dt=0.05).model
