@@ -167,8 +167,8 @@ class ModelTask(DeclaredTask):
         control_dt: Length of a control step [s], a multiple of the physics step.
         frame_skip: The same in physics steps.
         fixed_base: Whether the root link of a URDF is fixed to the world.
-        keyframe: Name of a keyframe of the file in which episodes begin. Its controls are the idle
-            action, which holds a robot with servos there.
+        keyframe: Name, or number, of a keyframe of the file in which episodes begin. Its controls
+            are the idle action, which holds a robot with servos there.
 
     Raises:
         ModelError: The file cannot be read as a model, or a variable is declared wrongly.
@@ -188,7 +188,7 @@ class ModelTask(DeclaredTask):
     control_dt: float | None = None
     frame_skip: int | None = None  # type: ignore[assignment] # filled in below
     fixed_base: bool = True
-    keyframe: str | None = None
+    keyframe: str | int | None = None
 
     def __init__(self, model: Any = None, **settings: Any) -> None:
         super().__init__(ModelTask, settings)

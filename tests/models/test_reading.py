@@ -607,8 +607,10 @@ RAISED = PENDULUM.replace(
 )
 
 
-@pytest.mark.parametrize(("keyframe", "begin"), [("up", (1.0, 0.5, 0.7)), ("1", (-1.0, 0.0, 0.0))])
-def test_a_keyframe_is_where_everything_begins(keyframe: str, begin: tuple[float, ...]) -> None:
+@pytest.mark.parametrize(("keyframe", "begin"), [("up", (1.0, 0.5, 0.7)), (1, (-1.0, 0.0, 0.0))])
+def test_a_keyframe_is_where_everything_begins(
+    keyframe: str | int, begin: tuple[float, ...]
+) -> None:
     """Positions, velocities and controls are defaults; without a name it has its number."""
     model = read_model(RAISED, keyframe=keyframe)
     assert tuple(row.default for row in (*model.states, *model.inputs)) == begin

@@ -54,7 +54,7 @@ def read_model(
     expose: Iterable[str] | str | None = None,
     readouts: Iterable[str] = (),
     fixed_base: bool = True,
-    keyframe: str | None = None,
+    keyframe: str | int | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Model:
     """Read a model, and describe it by tables.
@@ -109,7 +109,8 @@ def read_model(
     drift = tuple(_drift(mj, sealed, start))
     for note in drift:
         warnings.warn(note, stacklevel=3)
-    keys = "\0".join((keyframe or "", *(f"{row.name}\0{row.key}" for row in parameters)))
+    keys = "\0".join(f"{row.name}\0{row.key}" for row in parameters)
+    keys += "" if keyframe is None else f"\0{keyframe}"
     return Model(
         name=name or own_name or "model",
         digest=hashlib.sha256(f"{sealed.digest}\0{keys}".encode()).hexdigest(),
@@ -212,7 +213,7 @@ def _check_inertia(mj: mujoco.MjModel, where: str) -> Iterator[str]:
     )
 
 
-def _start(mj: mujoco.MjModel, keyframe: str | None) -> mujoco.MjData:
+def _start(mj: mujoco.MjModel, keyframe: str | int | None) -> mujoco.MjData:
     """Return the state in which episodes begin.
 
     Raises:
@@ -267,7 +268,7 @@ def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator
         )
 
 
-def _notes(mj: mujoco.MjModel, keyframe: str | None) -> Iterator[str]:
+def _notes(mj: mujoco.MjModel, keyframe: str | int | None) -> Iterator[str]:
     """Say what acts without having a variable, and what is not used."""
     if mj.nflex:
         yield f"{mj.nflex} flex(es) act through their vertices; their material has no variables."
