@@ -136,8 +136,9 @@ def report(
     came, went = sorted(there - were), sorted(were - there)
     remarks: tuple[str, ...] = ()
     if change.structure is None and any(what.endswith("friction") for _, what in change.parameters):
-        old = before.compiled.parameter_keys.items()
-        remarks = backend.remarks({k: before.values[n] for n, k in old if k in change.parameters})
+        known_keys = before.compiled.parameter_keys.items()
+        changed = {key: before.values[name] for name, key in known_keys if key in change.parameters}
+        remarks = backend.remarks(changed)
     return Audit(targets, followed, engine, tuple(came), tuple(went), remarks)
 
 
