@@ -147,7 +147,7 @@ def in_one_line(error: Exception) -> str:
 
 
 class ModelError(ScmWorldError, ValueError):
-    """A causal model that cannot be built.
+    """A causal model, a table or a graph that cannot be built or used.
 
     Attributes:
         problems: One sentence for each fault.
@@ -155,8 +155,8 @@ class ModelError(ScmWorldError, ValueError):
 
     def __init__(self, problems: Sequence[str]) -> None:
         self.problems = tuple(problems)
-        lines = "\n".join(f"  - {problem}" for problem in self.problems)
-        super().__init__(f"the model has {len(self.problems)} problem(s):\n{lines}")
+        several = [f"{len(self.problems)} problems:", *(f"  - {one}" for one in self.problems)]
+        super().__init__("\n".join(self.problems if len(self.problems) == 1 else several))
 
 
 class ImpossibleObservation(ModelError):

@@ -60,7 +60,7 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
     ),
     (
         ImpossibleObservation("x", "no value of its noise gives what was observed"),
-        "the model has 1 problem(s):\n  - 'x': no value of its noise gives what was observed",
+        "'x': no value of its noise gives what was observed",
         {"variable": "x"},
     ),
     (
@@ -124,7 +124,7 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
     ),
     (
         ModelError(["one", "two"]),
-        "the model has 2 problem(s):\n  - one\n  - two",
+        "2 problems:\n  - one\n  - two",
         {"problems": ("one", "two")},
     ),
     (
@@ -134,7 +134,7 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
     ),
     (
         CyclicModel([("x", "y")]),
-        "the model has 1 problem(s):\n  - contemporaneous edges form a cycle: x → y → x",
+        "contemporaneous edges form a cycle: x → y → x",
         {"cycles": (("x", "y"),)},
     ),
     (ActionError("an action is 9 numbers", 3), "an action is 9 numbers", {"action": 3}),

@@ -439,7 +439,8 @@ def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> float |
     Args:
         found: A graph over columns or variables of the tables; columns it does not know are left
             out. An edge between two vectors joins all their components.
-        train: With rows in which nothing was done.
+        train: With rows in which nothing was done. Rows in which a variable was set that is in no
+            column are left out, here and in ``test``.
         test: With rows in which something was done.
 
     Returns:
@@ -457,9 +458,10 @@ def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> float |
         Peters, Janzing and Schölkopf, *Elements of Causal Inference*, 2017, section 6.3, for the
         truncated factorization; of linear mechanisms only means are needed.
     """
+    train, test = (table.rows(~table.hidden_targets) for table in (train, test))
     if not len(train.observational):
         raise ModelError(["train has no row in which nothing was done"])
-    if not any(test.regimes[number].targets for number in np.unique(test.regime)):
+    if not test.intervened.any():
         raise ModelError(["test has no row in which something was done"])
     dag = None if found.edges[1:].any() else extension(found.edges[0])
     if dag is None:

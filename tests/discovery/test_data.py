@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-import io
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from scm_world import SCM, Box, Derived, Exogenous, Linear
+from scm_world.discovery import learn, learners
 from scm_world.discovery.data import (
     Dataset,
     Design,
     as_causal_learn,
     as_frame,
     as_gies,
+    as_numpy,
     as_tigramite,
     collect,
     from_frame,
+    load,
+    save,
 )
-from scm_world.errors import ModelError, UnknownVariable
+from scm_world.errors import ModelError, UnknownOption, UnknownVariable
 from scm_world.queries import World
 from scm_world.variables import Categories, Parent
 
@@ -147,6 +152,79 @@ def test_gies_gets_each_row_once_with_its_targets(table: Dataset) -> None:
         np.testing.assert_array_equal(rows, table.values[(table.targeted == mask).all(axis=1)])
 
 
+@pytest.fixture(scope="module")
+def hidden(table: Dataset) -> Dataset:
+    """The rows of the chain without x, which was set in some of them."""
+    return table.hide(["x"])
+
+
+def test_where_a_hidden_column_was_set_something_was_done(table: Dataset, hidden: Dataset) -> None:
+    """These rows are no observational ones, and have no number that was set."""
+    assert hidden.observational.values.tolist() == table.observational.values[:, 2:].tolist()
+    assert hidden.hidden_targets.tolist() == [targets == ("x",) for targets in table.targets]
+    assert not hidden.targeted[hidden.hidden_targets].any()
+    assert not table.hidden_targets.any()
+    arrays = as_numpy(hidden)
+    assert arrays.observational.tolist() == [targets == () for targets in table.targets]
+
+
+def test_gies_gets_no_rows_in_which_a_hidden_column_was_set(
+    table: Dataset, hidden: Dataset
+) -> None:
+    """It has no word for them."""
+    data, targets = as_gies(hidden)
+    assert targets == [[], [0], [1]]
+    assert data[0].tolist() == table.observational.values[:, 2:].tolist()
+    with pytest.raises(ModelError, match="in every row"):
+        as_gies(hidden.rows(hidden.hidden_targets))
+
+
+def test_a_frame_names_hidden_columns_that_were_set(table: Dataset, hidden: Dataset) -> None:
+    """None is for rows in which nothing was done; the frame comes back the same."""
+    pytest.importorskip("pandas")
+    frame = as_frame(hidden)
+    cells = {(): None, ("x",): ("x",), ("y",): ("y",), ("z",): ("z",)}
+    assert list(frame["intervention_targets"]) == [cells[targets] for targets in table.targets]
+    assert from_frame(frame) == hidden
+
+
+def test_hidden_targets_are_a_domain_of_their_own(table: Dataset, hidden: Dataset) -> None:
+    """CD-NOD and DCDI number the sets of targets, with the hidden ones."""
+    assert as_causal_learn(hidden).c_indx.tolist() == as_causal_learn(table).c_indx.tolist()
+
+
+def test_a_file_names_hidden_columns_that_were_set(hidden: Dataset, tmp_path: Path) -> None:
+    """A reader of the Parquet file alone tells observational rows from others."""
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    save(hidden, tmp_path)
+    frame = pandas.read_parquet(tmp_path / "shard-00000.parquet")
+    assert list(frame["intervention_targets"]) == [";".join(names) for names in hidden.targets]
+    assert load(tmp_path) == hidden
+
+
+def test_learners_with_known_targets_leave_hidden_ones_out() -> None:
+    """Rows in which a hidden cause was set say so in the notes, and do not count."""
+    model = SCM(
+        [
+            Exogenous(name="u", distribution=Box(0.0, 1.0), a=Box(9.0, 10.0)),
+            *(
+                Derived(
+                    name=name, parents=("u",), mechanism=TWICE, noise=Box(0.0, 1.0), a=Box(5, 6)
+                )
+                for name in ("a", "b")
+            ),
+        ]
+    )
+    table = collect(model, Design("single", ("u", "a", "b")), 400, seed=0).hide(["u"])
+    for name in ("gies", "do_order", "do_gp"):
+        if learners.learners()[name].is_installed:
+            mine = learn(name, table)
+            assert any("a variable that is in no column was set" in note for note in mine.notes)
+            other = learn(name, table.rows(~table.hidden_targets))
+            assert (mine.edges == other.edges).all()
+
+
 def test_gies_learns_from_it(table: Dataset) -> None:
     """``gies.fit_bic`` takes it as it is, and finds the last edge."""
     gies = pytest.importorskip("gies")
@@ -213,23 +291,81 @@ def test_targets_do_not_vanish_when_columns_are_renamed(table: Dataset) -> None:
         from_frame(as_frame(table).drop(columns="step"))
 
 
-def test_a_frame_survives_csv(table: Dataset) -> None:
-    """Targets are read from the text of a tuple; the numbers of the rows are no variable."""
+@pytest.mark.parametrize(
+    ("cell", "message"), [(1, "intervention_targets has 1"), ("q", "'q'"), (("q",), "'q'")]
+)
+def test_targets_that_are_no_names_of_columns_are_refused(cell: object, message: str) -> None:
+    """A number, and a name that the frame does not have, are named."""
     pandas = pytest.importorskip("pandas")
-    frame = as_frame(table)
-    back = from_frame(
-        pandas.read_csv(io.StringIO(frame.to_csv(index=False))).drop(columns="regime")
-    )
-    np.testing.assert_array_equal(back.targeted, table.targeted)
-    with pytest.raises(ModelError, match="index=False"):
-        from_frame(pandas.read_csv(io.StringIO(frame.to_csv())))
-    for cell, message in ((1, r"intervention_targets has 1"), ("q", "'q'")):
-        frame = pandas.DataFrame({"x": [0.0], "intervention_targets": [cell]})
-        with pytest.raises((ModelError, UnknownVariable), match=message):
-            from_frame(frame)
-    words = pandas.DataFrame({"x": ["red"], "intervention_targets": [None]})
-    with pytest.raises(ModelError, match="have to be numbers"):
-        from_frame(words)
+    frame = pandas.DataFrame({"x": [0.0], "intervention_targets": [cell]})
+    with pytest.raises((ModelError, UnknownVariable), match=message):
+        from_frame(frame)
+
+
+@pytest.mark.parametrize(
+    ("cells", "kind"),
+    [
+        (np.array(["2020-01-01", "2020-01-02"], "M8[D]"), "dates"),
+        (np.array([1, 2], "m8[s]"), "durations"),
+        (np.array([1.0 + 2.0j, 3.0]), "complex numbers"),
+        (["1", "2"], "text"),
+        ([[1.0], [2.0]], "type list"),
+    ],
+)
+def test_a_column_without_real_numbers_is_refused(cells: Any, kind: str) -> None:
+    """The column and its kind are named, in a frame and in a table of columns."""
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"x": [0.0, 1.0], "intervention_targets": None})
+    frame["y"] = pandas.Series(list(cells) if isinstance(cells, list) else cells)
+    message = f"the column 'y' holds .*{kind}.*: give"
+    for call in (lambda: from_frame(frame), lambda: Dataset.of(frame, ["x", "y"])):
+        with pytest.raises(ModelError, match=message):
+            call()
+    if isinstance(cells, np.ndarray):
+        with pytest.raises(ModelError, match=message):
+            Dataset.of(cells[:, None], ["y"])
+
+
+def test_numbers_of_pandas_and_python_are_read() -> None:
+    """Nullable whole numbers, yes and no, and numbers as objects; a missing one is named."""
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"x": pandas.array([1, 2], dtype="Int64"), "y": [True, False]})
+    frame["z"] = np.array([1, 2.5], dtype=object)
+    assert Dataset.of(frame, ["z", "y", "x"]).values.tolist() == [[1, 1, 1], [2.5, 0, 2]]
+    frame["x"] = pandas.array([1, None], dtype="Int64")
+    with pytest.raises(ModelError, match="row 1 of 'x' is not finite"):
+        Dataset.of(frame, ["x"])
+
+
+def test_columns_of_a_frame_are_taken_by_name() -> None:
+    """The order of the names does not relabel them; a name that is not there is refused."""
+    pandas = pytest.importorskip("pandas")
+    for frame in (pandas.DataFrame({"x": [1.0], "y": [10.0]}), {"x": [1.0], "y": [10.0]}):
+        assert Dataset.of(frame, ["y", "x"]).values.tolist() == [[10.0, 1.0]]
+        with pytest.raises(UnknownVariable, match="'z'"):
+            Dataset.of(frame, ["x", "z"])
+
+
+def test_names_of_columns_are_text() -> None:
+    """Whole numbers as names are refused, with what to do; so are numbers as targets."""
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame(np.ones((2, 2))).assign(intervention_targets=[None, (0,)])
+    with pytest.raises(ModelError, match=r"a column is named 0; .*rename\(columns=str\)"):
+        from_frame(frame)
+    with pytest.raises(ModelError, match="a column is named 0"):
+        Dataset.of([[1.0]], [0])  # type: ignore[list-item] # it is refused
+    with pytest.raises(UnknownOption, match="targets"):
+        Dataset.of([[1.0]], ["x"], targets=[0])  # type: ignore[list-item] # it is refused
+    assert Dataset.of([[1.0], [2.0]], ["ab"], targets=["ab", None]).targets == (("ab",), ())
+
+
+@pytest.mark.parametrize("episode", [[0.5, 1.0], [float("nan"), 1.0], ["a", "b"]])
+def test_episodes_have_whole_numbers(episode: list[Any]) -> None:
+    """Others are refused, not cut off."""
+    with pytest.raises(
+        ModelError, match=r"'episode' holds numbers of dtype .*: give whole numbers"
+    ):
+        Dataset.of([[1.0], [2.0]], ["x"], episode=episode)
 
 
 def test_a_frame_has_room_for_its_own_columns() -> None:

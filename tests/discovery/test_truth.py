@@ -161,6 +161,16 @@ def test_dcdi_reads_what_is_written(tmp_path: Path) -> None:
     assert len(np.load(folder / "data3.npy")) == (regimes == 0).sum()
 
 
+def test_dcdi_gets_hidden_targets_as_a_regime(tmp_path: Path) -> None:
+    """Its observational file and regime 0 have no rows in which a hidden column was set."""
+    whole = collect(line(), Design("single", ("a", "b"), 2.0, 0.4), 60)
+    folder = as_dcdi(whole.hide(["a"]), tmp_path)
+    regimes = np.genfromtxt(folder / "regime1.csv", delimiter=",").astype(int)
+    assert [number == 0 for number in regimes] == [not targets for targets in whole.targets]
+    assert len(np.load(folder / "data1.npy")) == len(whole.observational)
+    assert sorted(set(regimes.tolist())) == [0, 1, 2]
+
+
 def test_ancestral_graphs_of_a_table() -> None:
     """Of two instruments and a hidden common cause: what is true, and what can be learned."""
     two = Linear(weights=(1.0, 1.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, final
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.errors import ModelError, UnknownVariable
+from scm_world.errors import ModelError, UnknownOption, UnknownVariable
 from scm_world.queries.plans import Plan
 from scm_world.variables import SOFT, Mechanism
 
@@ -157,7 +158,7 @@ class Dataset:
         values: Any,
         names: Sequence[str],
         *,
-        targets: Sequence[Iterable[str]] | None = None,
+        targets: Sequence[Iterable[str] | None] | None = None,
         episode: Any = None,
         step: Any = None,
         **about: Any,
@@ -165,16 +166,23 @@ class Dataset:
         """Make a table of numbers from elsewhere.
 
         Args:
-            values: Shape (n, p).
+            values: Shape (n, p); of a data frame, or of columns by name, those with these names.
             names: Of the p columns; scalars all.
             targets: For each row the columns that were intervened on; nowhere if None.
             episode: Of each row; each row is its own if None.
             step: Of each row; 0 if None.
             about: Where it comes from.
+
+        Raises:
+            ModelError: A column has no numbers, a name is no text, or shapes do not fit together.
+            UnknownVariable: A target, or a name in a data frame, is no column.
         """
-        table = np.array(values, dtype=np.float64)
+        table = numbers(values, names)
         n = len(table)
-        rows = [tuple(sorted(set(t))) for t in targets] if targets is not None else [()] * n
+        given = [()] * n if targets is None else targets
+        if any(not isinstance(t, Iterable | None) for t in given):
+            raise UnknownOption("targets", targets, ("for each row a list of names, or None",))
+        rows = [tuple(sorted({t} if isinstance(t, str) else set(t or ()))) for t in given]
         unknown = sorted({name for row in rows for name in row} - set(names))
         if unknown:
             raise UnknownVariable(unknown[0], names)
@@ -185,8 +193,8 @@ class Dataset:
             columns=tuple(Column(name, name) for name in names),
             regimes=tuple(Regime(targets=kind) for kind in kinds),
             regime=np.array([number[row] for row in rows], dtype=np.int64),
-            episode=np.arange(n) if episode is None else np.array(episode, dtype=np.int64),
-            step=np.zeros(n, np.int64) if step is None else np.array(step, dtype=np.int64),
+            episode=np.arange(n) if episode is None else whole_numbers("episode", episode),
+            step=np.zeros(n, np.int64) if step is None else whole_numbers("step", step),
             about=dict(about),
         )
 
@@ -280,6 +288,30 @@ class Dataset:
         return tuple(self.regimes[kind].targets for kind in self.regime.tolist())
 
     @cached_property
+    def target_names(self) -> tuple[tuple[str, ...], ...]:
+        """Names of the columns set in each regime, then of the variables that are in no column."""
+        shown = [column for column in self.columns if not column.lag]
+        there = {column.variable for column in shown}
+        return tuple(
+            (
+                *(column.name for column in shown if column.variable in regime.targets),
+                *(name for name in regime.targets if name not in there),
+            )
+            for regime in self.regimes
+        )
+
+    @cached_property
+    def intervened(self) -> Bools:
+        """The rows in which something was set, be it in a column or not, shape (n,)."""
+        return np.array([bool(r.targets) for r in self.regimes], dtype=bool)[self.regime]
+
+    @cached_property
+    def hidden_targets(self) -> Bools:
+        """The rows in which a variable that is in no column was set, shape (n,)."""
+        there = {column.variable for column in self.columns if not column.lag}
+        return np.array([not there.issuperset(r.targets) for r in self.regimes], bool)[self.regime]
+
+    @cached_property
     def truth(self) -> GroundTruth | None:
         """The true graph over exactly these variables; None where it is not known.
 
@@ -365,12 +397,8 @@ class Dataset:
 
     @property
     def observational(self) -> Dataset:
-        """The rows in which nothing was done."""
-        return self.rows(~self._acted[self.regime])
-
-    @cached_property
-    def _acted(self) -> Bools:
-        return np.array([bool(regime.targets) for regime in self.regimes], dtype=bool)
+        """The rows in which nothing was done, to columns or to variables that are in none."""
+        return self.rows(~self.intervened)
 
     def first(self, episodes: int) -> Dataset:
         """Take the rows of the first episodes, in their order."""
@@ -444,6 +472,86 @@ class Dataset:
             episode=np.concatenate([part.episode for part in parts]),
             step=np.concatenate([part.step for part in parts]),
         )
+
+
+KINDS = {
+    "M": ("dates", "give numbers, such as seconds since the first one"),
+    "m": ("durations", "give numbers, such as .dt.total_seconds()"),
+    "U": ("text", "give numbers, such as a code for each category, or pandas.to_numeric"),
+    "c": ("complex numbers", "give the real and the imaginary part as two columns"),
+}
+"""Of dtypes that are no real numbers: their name, and what to do."""
+
+
+def numbers(values: Any, names: Sequence[str]) -> Floats:
+    """Read columns of real numbers, shape (n, p).
+
+    Args:
+        values: Shape (n, p), or a data frame or mapping that has columns of these names.
+        names: Of the columns.
+
+    Raises:
+        ModelError: A column holds something else than numbers, a name is no text or occurs twice,
+            or there is another number of columns.
+        UnknownVariable: The frame has no such column.
+    """
+    if not isinstance(names, Iterable):
+        raise UnknownOption("names", names, ("a list of the names of the columns",))
+    labels = tuple(names)
+    advice = "names of columns are text: frame.rename(columns=str), and in the targets, too"
+    wrong = [
+        f"a column is named {name!r}; {advice}" for name in labels if not isinstance(name, str)
+    ]
+    columns: list[Any]
+    if isinstance(values, Mapping) or hasattr(values, "columns"):
+        there = list(values if isinstance(values, Mapping) else values.columns)
+        twice = sorted({name for name in map(str, there) if there.count(name) > 1} & {*labels})
+        wrong += [f"two columns are named {name!r}" for name in twice]
+        if wrong:
+            raise ModelError(wrong)
+        for name in labels:
+            if name not in there:
+                raise UnknownVariable(name, map(str, there))
+        columns = [np.asarray(values[name]) for name in labels]
+    else:
+        table = values if isinstance(values, np.ndarray) else np.array(values, dtype=object)
+        if table.ndim != 2 or table.shape[1] != len(labels):
+            wrong.append(f"values have shape {table.shape}, of {len(labels)} columns")
+        if wrong:
+            raise ModelError(wrong)
+        columns = [*table.T]
+    made = []
+    for name, column in zip(labels, columns, strict=True):
+        array = column
+        if array.dtype.kind == "O":  # numbers of Python are numbers
+            with suppress(ValueError):
+                array = np.array(column.tolist())
+        if array.ndim != 1 or array.dtype.kind not in "biuf":
+            first = type(next(iter(array.tolist()), None)).__name__
+            other = f"values of type {first}", "give one number in each row"
+            what, advice = KINDS.get(array.dtype.kind, other)
+            wrong.append(f"the column {name!r} holds {what}, not real numbers: {advice}")
+        made.append(array)
+    if wrong:
+        raise ModelError(wrong)
+    if len({len(array) for array in made}) > 1:
+        raise ModelError([f"the columns have {[len(array) for array in made]} rows"])
+    return np.stack(made, axis=1).astype(np.float64) if made else np.empty((len(values), 0))
+
+
+def whole_numbers(name: str, values: Any) -> Ints:
+    """Read the whole numbers of a column, shape (n,).
+
+    Raises:
+        ModelError: It holds something else.
+    """
+    found = np.asarray(values)
+    whole = found.dtype.kind in "iu"
+    if found.dtype.kind == "f":
+        whole = bool(np.isfinite(found).all() and np.array_equal(found, np.rint(found)))
+    if not whole and found.size:
+        raise ModelError([f"{name!r} holds numbers of dtype {found.dtype}: give whole numbers"])
+    return found.astype(np.int64)
 
 
 def _disorder(episode: Ints, step: Ints) -> list[str]:

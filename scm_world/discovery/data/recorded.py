@@ -116,10 +116,27 @@ def is_state(model: SCM, name: str) -> bool:
     return model.declared(model.target(name)).role == "state"
 
 
-def reached(model: SCM, names: Iterable[str]) -> tuple[str, ...]:
-    """Name the variables that interventions set: with coordinates, the quantity, too."""
-    given = tuple(names)
-    return tuple(sorted({*given, *(target for name in given for target in model.targets(name))}))
+def reached(
+    model: SCM, names: Iterable[str], columns: Iterable[Column], *, first: bool = False
+) -> tuple[str, ...]:
+    """Name the variables that interventions set.
+
+    With coordinates the quantity is set, too. It is named where it has a column; otherwise the
+    coordinates stand for it.
+
+    Args:
+        model: Of the system.
+        names: The targets of the interventions.
+        columns: Of a row.
+        first: Whether a row has the beginning of a state under a name of its own.
+    """
+
+    def named(name: str) -> str:
+        return first_name(model, name) if first else name
+
+    given, shown = tuple(names), {column.variable for column in columns}
+    whole = (target for name in given for target in model.targets(name) if named(target) in shown)
+    return tuple(named(name) for name in sorted({*given, *whole}))
 
 
 def columns_of_outcome(variable: Variable, outcome: Outcome) -> tuple[Column, ...]:

@@ -78,10 +78,7 @@ def raw_of(table: Dataset, header: dict[str, Any] | None = None) -> Raw:
     """
     head = _regimes(table.regimes) if header is None else header
     numbers = {name: getattr(table, name) for name in NUMBERS}
-    texts = [
-        ";".join(c.name for c in table.columns if not c.lag and c.variable in regime.targets)
-        for regime in table.regimes
-    ]
+    texts = [";".join(names) for names in table.target_names]
     return Raw(head, numbers, [texts[number] for number in table.regime], table.values)
 
 

@@ -136,7 +136,7 @@ class ModelSource:
                 values=vectors.reshape(n * length, size),
                 columns=self.columns,
                 regimes=tuple(
-                    replace(regime, targets=reached(self._model, regime.targets))
+                    replace(regime, targets=reached(self._model, regime.targets, self.columns))
                     for regime in regimes
                 ),
                 regime=np.repeat(kind_of, length),

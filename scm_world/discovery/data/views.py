@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import json
 from collections.abc import Container, Iterable
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,9 +12,17 @@ import numpy as np
 
 from scm_world._arguments import load
 from scm_world._types import Floats
-from scm_world.discovery.data.dataset import Bools, Column, Dataset, Ints, Regime
+from scm_world.discovery.data.dataset import (
+    Bools,
+    Column,
+    Dataset,
+    Ints,
+    Regime,
+    numbers,
+    whole_numbers,
+)
 from scm_world.discovery.data.shards import NUMBERS, TARGETS, check_names
-from scm_world.errors import ModelError
+from scm_world.errors import ModelError, UnknownOption
 
 KEY = "scm_world"
 
@@ -24,9 +30,15 @@ KEY = "scm_world"
 def as_gies(dataset: Dataset) -> tuple[list[Floats], list[list[int]]]:
     """Give a dataset the way ``gies.fit_bic(data, I)`` takes it.
 
+    GIES takes every column that is not a target for one with its own mechanism. So rows in which a
+    variable was set that is in no column are left out.
+
     Returns:
         For each set of targets its rows, shape (n_k, p), and the numbers of the columns that were
         intervened on, in the order in which they first occur. Of a vector all columns are.
+
+    Raises:
+        ModelError: In every row a variable was set that is in no column.
 
     Example:
         >>> table = Dataset.of([[0.0], [1.0], [2.0]], ["x"], targets=[(), ("x",), ()])
@@ -34,13 +46,24 @@ def as_gies(dataset: Dataset) -> tuple[list[Floats], list[list[int]]]:
         >>> [rows.tolist() for rows in data], targets
         ([[[0.0], [2.0]], [[1.0]]], [[], [0]])
     """
-    kinds, first, where = np.unique(
-        dataset.targeted, axis=0, return_index=True, return_inverse=True
-    )
-    order = np.argsort(first)
-    where = where.reshape(-1)
-    data = [dataset.values[where == kind] for kind in order]
-    return data, [np.flatnonzero(kinds[kind]).tolist() for kind in order]
+    if len(dataset) and dataset.hidden_targets.all():
+        raise ModelError(
+            ["in every row a variable was set that is in no column: GIES needs others"]
+        )
+    known = dataset.rows(~dataset.hidden_targets)
+    kind = _target_sets(known)
+    groups = [np.flatnonzero(kind == number) for number in range(kind.max(initial=-1) + 1)]
+    targets = [np.flatnonzero(known.targeted[rows[0]]).tolist() for rows in groups]
+    return [known.values[rows] for rows in groups], targets
+
+
+def _target_sets(dataset: Dataset, *, observational_first: bool = False) -> Ints:
+    """Number the sets of targets of the rows, hidden ones among them, in order; shape (n,)."""
+    names, number = dataset.target_names, dict[tuple[str, ...], int]()
+    if observational_first:
+        number[()] = 0
+    kinds = (number.setdefault(names[kind], len(number)) for kind in dataset.regime.tolist())
+    return np.fromiter(kinds, np.int64, len(dataset))
 
 
 class Arrays(NamedTuple):
@@ -52,6 +75,8 @@ class Arrays(NamedTuple):
         soft: What of it still follows its causes, shape (n, p).
         regime: Number of the regime of each row, shape (n,).
         adjacency: The true edges of lag 0, row causes column, shape (p, p); None if not known.
+        observational: Rows in which nothing was done, shape (n,). In a row without ``targeted``
+            numbers a variable that is in no column may have been set.
     """
 
     values: Floats
@@ -59,6 +84,7 @@ class Arrays(NamedTuple):
     soft: Bools
     regime: Ints
     adjacency: Bools | None
+    observational: Bools
 
 
 def as_numpy(dataset: Dataset) -> Arrays:
@@ -69,16 +95,24 @@ def as_numpy(dataset: Dataset) -> Arrays:
         >>> as_numpy(table).targeted.ravel().tolist(), as_numpy(table).adjacency
         ([False, True], None)
     """
-    known = None if dataset.truth is None else dataset.adjacency()
-    targeted, soft = dataset.targeted.copy(), dataset.soft.copy()
-    return Arrays(dataset.values.copy(), targeted, soft, dataset.regime.copy(), known)
+    return Arrays(
+        values=dataset.values.copy(),
+        targeted=dataset.targeted.copy(),
+        soft=dataset.soft.copy(),
+        regime=dataset.regime.copy(),
+        adjacency=None if dataset.truth is None else dataset.adjacency(),
+        observational=~dataset.intervened,
+    )
 
 
 def as_dcdi(dataset: Dataset, folder: Path | str, number: int = 1) -> Path:
     """Write a dataset the way DCDI reads it: ``--data-path folder --i-dataset number``.
 
-    Rows without an intervention are regime 0. Its perfect interventions are hard: a dataset with
-    soft ones is for ``--intervention-type imperfect``, which the file ``soft<number>.csv`` tells.
+    Rows in which nothing was done are regime 0, and ``data<number>.npy``. Each other set of targets
+    is a regime; variables that are in no column are among its targets, though its mask cannot name
+    them: such regimes are for ``--intervention-knowledge unknown``, or for
+    ``regimes_to_ignore`` of its loader. Its perfect interventions are hard: a dataset with soft
+    ones is for ``--intervention-type imperfect``, which the file ``soft<number>.csv`` tells.
 
     Args:
         dataset: Rows that are episodes, of a known graph without lags.
@@ -98,18 +132,13 @@ def as_dcdi(dataset: Dataset, folder: Path | str, number: int = 1) -> Path:
         raise ModelError(["DCDI takes rows that are episodes; collect without control steps"])
     adjacency, target = dataset.adjacency().astype(float), Path(folder)
     target.mkdir(parents=True, exist_ok=True)
-    kinds, where = np.unique(dataset.targeted, axis=0, return_inverse=True)
-    none = ~kinds.any(axis=1)
-    order = np.argsort(~none, kind="stable")  # without intervention first
-    rank = np.argsort(order) + (0 if none.any() else 1)
-    seen = dataset.values[~dataset.targeted.any(axis=1)]
     np.save(target / f"DAG{number}.npy", adjacency)
-    np.save(target / f"data{number}.npy", seen)
+    np.save(target / f"data{number}.npy", dataset.observational.values)
     np.save(target / f"data_interv{number}.npy", dataset.values)
     for name, table in (("intervention", dataset.targeted), ("soft", dataset.soft)):
         lines = (",".join(map(str, np.flatnonzero(row).tolist())) for row in table)
         (target / f"{name}{number}.csv").write_text("\n".join(lines) + "\n")
-    regimes = rank[where.reshape(-1)].tolist()
+    regimes = _target_sets(dataset, observational_first=True).tolist()
     (target / f"regime{number}.csv").write_text("\n".join(map(str, regimes)) + "\n")
     return target
 
@@ -123,8 +152,9 @@ def as_frame(dataset: Dataset) -> Any:
     Returns:
         The columns ``episode``, ``step``, ``regime`` and ``intervention_targets``, then those of
         the dataset. The targets of a row are a tuple of names of columns, None where nothing was
-        done, as proposed in https://github.com/pgmpy/pgmpy/issues/2117. All the rest is in
-        ``frame.attrs``, so that ``from_frame`` gives the same dataset.
+        done, as proposed in https://github.com/pgmpy/pgmpy/issues/2117. A variable that was set and
+        is in no column is named after them. All the rest is in ``frame.attrs``, so that
+        ``from_frame`` gives the same dataset.
 
     Raises:
         MissingExtra: pandas is not installed.
@@ -132,12 +162,12 @@ def as_frame(dataset: Dataset) -> Any:
     """
     pandas = load("pandas", "pandas", "data")
     check_names(dataset.columns)
-    numbers = {name: getattr(dataset, name).copy() for name in NUMBERS}
+    rows = {name: getattr(dataset, name).copy() for name in NUMBERS}
     data = pandas.DataFrame(dataset.values.copy(), columns=list(dataset.names))
-    names = np.array(dataset.names, dtype=object)
-    targets = [tuple(names[row]) or None for row in dataset.targeted]
+    names = dataset.target_names
+    targets = [names[kind] or None for kind in dataset.regime.tolist()]
     column = pandas.Series(targets, dtype=object, name=TARGETS)
-    frame = pandas.concat([pandas.DataFrame(numbers), column, data], axis=1)
+    frame = pandas.concat([pandas.DataFrame(rows), column, data], axis=1)
     about = {
         "columns": [asdict(column) for column in dataset.columns],
         "regimes": [regime.as_dict() for regime in dataset.regimes],
@@ -156,49 +186,42 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
     """Read a frame that ``as_frame`` wrote, or any with a column ``intervention_targets``.
 
     Args:
-        frame: Rows of whole instants and columns may have been taken away, columns reordered. Of a
-            frame without ``attrs`` (read from a CSV file, say) the targets may be a text: names
-            with semicolons, or a tuple as Python writes it.
+        frame: Rows of whole instants and columns may have been taken away, columns reordered. In a
+            frame without ``attrs`` the targets may be a text, as in the files of ``collect``: names
+            with semicolons.
         trusted: Packages whose functions may be mechanisms of its plans.
 
     Raises:
+        UnknownOption: It is no ``pandas.DataFrame``.
         ModelError: It has no column ``intervention_targets``, or other columns than numbers; a
             target is no column any more; or rows of an episode do not stand together.
         UnknownVariable: The frame has no ``attrs``, and a target is no column.
     """
+    if not hasattr(frame, "columns") or not hasattr(frame, "attrs"):
+        raise UnknownOption("frame", type(frame).__name__, ("a pandas.DataFrame",))
     if TARGETS not in frame:
         raise ModelError([f"the frame has no column {TARGETS!r}: None, or a tuple of names, each"])
     names = [name for name in frame.columns if name not in (*NUMBERS, TARGETS)]
-    values = _values(frame, names)
+    values = numbers(frame, names)
     empty = frame[TARGETS].isna()
     given = [() if none else _names_in(c) for c, none in zip(frame[TARGETS], empty, strict=True)]
     if KEY not in frame.attrs:
         rows = {n: frame[n].to_numpy() for n in ("episode", "step") if n in frame}
         return Dataset.of(values, names, targets=given, **rows)
+    lost = [f"the frame has no column {name!r} any more" for name in NUMBERS if name not in frame]
+    if lost:
+        raise ModelError(lost)
     about = json.loads(frame.attrs[KEY])
     columns = {column["name"]: Column(**column) for column in about["columns"]}
-    _check_targets(names, columns, {name for cell in given for name in cell})
-    numbers = {name: frame[name].to_numpy(dtype=np.int64) for name in NUMBERS}
+    hidden = {name for regime in about["regimes"] for name in regime["targets"]}
+    _check_targets(names, {*columns, *hidden}, {name for cell in given for name in cell})
     return Dataset(
         values=values,
         columns=tuple(columns.get(name, Column(name, name)) for name in names),
         regimes=tuple(Regime.from_dict(regime, trusted=trusted) for regime in about["regimes"]),
         about=about["about"],
-        **numbers,
+        **{name: whole_numbers(name, frame[name]) for name in NUMBERS},
     )
-
-
-def _values(frame: Any, names: list[Any]) -> Floats:
-    missing = [name for name in NUMBERS if name not in frame and KEY in frame.attrs]
-    problems = [f"the frame has no column {name!r} any more" for name in missing]
-    if any(str(name).startswith("Unnamed: ") for name in names):
-        problems.append("a column holds the numbers of the rows: write CSV with index=False")
-    if problems:
-        raise ModelError(problems)
-    try:
-        return np.asarray(frame[names].to_numpy(dtype=np.float64))
-    except (TypeError, ValueError) as error:
-        raise ModelError([f"the columns of a frame have to be numbers: {error}"]) from None
 
 
 def _check_targets(names: list[Any], known: Container[str], targets: set[str]) -> None:
@@ -216,15 +239,12 @@ def _check_targets(names: list[Any], known: Container[str], targets: set[str]) -
 
 
 def _names_in(cell: Any) -> tuple[str, ...]:
-    """Read a cell: names with semicolons, or in a sequence or the text of one.
+    """Read a cell: names with semicolons, or in a sequence.
 
     Example:
-        >>> [_names_in(cell) for cell in ("a; b", "('a', 'b')", ["a", "b"])]
+        >>> [_names_in(cell) for cell in ("a; b", ("a", "b"), ["a", "b"])]
         [('a', 'b'), ('a', 'b'), ('a', 'b')]
     """
-    if isinstance(cell, str) and cell.startswith(("(", "[")):
-        with suppress(ValueError, SyntaxError):  # else it is a name like that
-            cell = ast.literal_eval(cell)
     if isinstance(cell, str):
         return tuple(name.strip() for name in cell.split(";") if name.strip())
     if isinstance(cell, Iterable):
@@ -274,7 +294,8 @@ class CausalLearn(NamedTuple):
     Attributes:
         data: Shape (n, p).
         node_names: Of the p columns.
-        c_indx: For ``cdnod``: number of the set of targets of each row, shape (n, 1).
+        c_indx: For ``cdnod``: number of the set of targets of each row, shape (n, 1). Variables
+            that are in no column are among the targets: CD-NOD looks for what changes itself.
     """
 
     data: Floats
@@ -285,13 +306,13 @@ class CausalLearn(NamedTuple):
 def as_causal_learn(dataset: Dataset) -> CausalLearn:
     """Give a dataset the way causal-learn takes it: ``pc(data)``, ``cdnod(data, c_indx)``.
 
+    It has all rows; ``pc`` and others that know of no regimes take those of
+    ``dataset.observational``.
+
     Example:
         >>> table = Dataset.of([[0.0], [1.0], [2.0]], ["x"], targets=[(), ("x",), ()])
         >>> as_causal_learn(table).c_indx.ravel().tolist()
         [0, 1, 0]
     """
-    _, first, where = np.unique(dataset.targeted, axis=0, return_index=True, return_inverse=True)
-    rank = np.argsort(np.argsort(first))
-    return CausalLearn(
-        dataset.values.copy(), list(dataset.names), rank[where.reshape(-1)].reshape(-1, 1)
-    )
+    index = _target_sets(dataset).reshape(-1, 1)
+    return CausalLearn(dataset.values.copy(), list(dataset.names), index)

@@ -19,7 +19,6 @@ from scm_world.discovery.data.recorded import (
     columns_of_outcome,
     default_causes,
     default_outcomes,
-    first_name,
     is_state,
     labelled,
     reached,
@@ -236,11 +235,9 @@ class WorldSource:
 
     def _targets(self, names: Iterable[str], step: int) -> tuple[str, ...]:
         """Name the columns' variables that are set in a row; a state is at the first step only."""
-        model = self._world.model
-        there = reached(model, names)
-        if self._every_step:
-            return tuple(n for n in there if step == 0 or not is_state(model, n))
-        return tuple(first_name(model, n) for n in there)
+        model, whole = self._world.model, not self._every_step
+        there = reached(model, names, self.columns, first=whole)
+        return tuple(n for n in there if whole or step == 0 or not is_state(model, n))
 
     def _row(self, episode: Episode) -> Floats:
         """Read an episode, shape (rows, p)."""
@@ -406,6 +403,5 @@ class Experiments:
         return SourceRows(Dataset.stacked(self.columns, rows, self.about), tuple(refused))
 
     def _named(self, regime: Regime) -> Regime:
-        model = self._model
-        names = (first_name(model, name) for name in reached(model, regime.targets))
-        return replace(regime, targets=tuple(names))
+        names = reached(self._model, regime.targets, self.columns, first=True)
+        return replace(regime, targets=names)

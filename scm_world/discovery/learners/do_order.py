@@ -268,7 +268,8 @@ def do_order(
     """Find a graph from rows with known intervention targets.
 
     Args:
-        data: Rows in which nothing is done, or some variables are set at random.
+        data: Rows in which nothing is done, or some variables are set at random. Those in which a
+            variable was set that is in no column are left out.
         seed: Not used: nothing is drawn.
         q: Expected share of false edges among those found, at most; not with ``ranks``.
         features: Highest power in which a cause may act: 1 for straight lines.
@@ -289,6 +290,8 @@ def do_order(
         raise UnknownOption("q", q, ("a share between 0 and 1",))
     if not isinstance(features, int) or features not in POWERS:
         raise UnknownOption("features", features, map(str, POWERS))
+    hidden_targets = data.hidden_targets
+    data = data.rows(~hidden_targets)
     rows, still = _rows(data, blocks), _still(data)
     hidden = _hidden(rows, data)
     causes = rows.alive & (rows.targeted.any(axis=0) | rows.past)
@@ -320,6 +323,9 @@ def do_order(
     weight = np.where(tested, -np.log10(np.clip(p_values, SMALLEST, 1.0)), 0.0)
     matrix, sure = chosen[rows.block_of], weight[rows.block_of]
     notes = (*_notes(data, rows, causes, separable, hidden), *_bent(rows, matrix, form))
+    if hidden_targets.any():
+        count = f"{hidden_targets.sum()} of {len(hidden_targets)} rows were left out"
+        notes = (*notes, f"{count}: a variable that is in no column was set in them")
     if ranks:
         notes = (*notes, "of ranks: the share of false edges is not bounded by q")
     settings = {"q": q, "features": features, "ranks": ranks, "spread": spread, "blocks": blocks}

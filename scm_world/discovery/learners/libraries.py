@@ -35,6 +35,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.discovery.data.dataset import Bools, Dataset, Regime
+from scm_world.discovery.data.views import as_gies
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption
 from scm_world.graph.ancestral import CIRCLE, HEAD, TAIL, Marks
@@ -273,15 +274,14 @@ def permscore(
         "margin": _number("margin of 'permscore'", margin),
         "single": _switch("single of 'permscore'", single),
     }
-    done = np.array([bool(regime.targets) for regime in data.regimes])
-    kinds = [k for k in np.unique(data.regime).tolist() if done[k]]
-    if not kinds or done[data.regime].all():
+    kinds = np.unique(data.regime[data.intervened]).tolist()
+    if not kinds or data.intervened.all():
         needed = "rows in which nothing is done, and rows of at least one other regime"
         raise ModelError([f"'permscore' needs {needed}; there are {len(kinds)} other regimes"])
     targets: list[tuple[str, ...]] = [()] * len(data.regimes)
 
     def search(table: Dataset) -> tuple[Bools, str]:
-        groups = [~done[data.regime], *(data.regime == k for k in kinds)]
+        groups = [~data.intervened, *(data.regime == k for k in kinds)]
         fitted = import_module("permscore").fit(
             [table.values[rows] for rows in groups],
             restarts=restarts, margin=margin, assignment=single, seed=seed,
@@ -366,9 +366,7 @@ def environments(data: Dataset) -> tuple[list[Floats], list[list[int]]]:
     ]
     if always:
         raise ModelError(always)
-    kinds, number = np.unique(data.targeted, axis=0, return_inverse=True)
-    parts = [data.values[number.reshape(-1) == kind] for kind in range(len(kinds))]
-    return parts, [np.flatnonzero(kind).tolist() for kind in kinds]
+    return as_gies(data)
 
 
 def likelihood_gain(data: Dataset, edges: Bools) -> Floats:
@@ -630,16 +628,16 @@ def usable(learner: str, data: Dataset, *, done: bool = False) -> tuple[Dataset,
     Args:
         learner: Its name, for messages.
         data: Rows under any regime.
-        done: Whether it can use rows in which something is done; they are left out otherwise.
+        done: Whether it can use rows in which something is done; they are left out otherwise. So
+            are those in which a variable was set that is in no column, always.
 
     Raises:
         ModelError: No row is left, or not more rows than columns.
     """
-    rows = data if done else data.observational
+    what = "a variable that is in no column was set" if done else "something is done"
+    rows = data.rows(~data.hidden_targets) if done else data.observational
     if len(rows) == 0:
-        raise ModelError(
-            [f"{learner!r} uses only rows in which nothing is done, and there are none; add some"]
-        )
+        raise ModelError([f"{learner!r} uses no rows in which {what}, and there are no others"])
     values = rows.standardised().values
     varying = np.flatnonzero(values.any(axis=0))
     if len(rows) <= len(varying):
@@ -649,7 +647,7 @@ def usable(learner: str, data: Dataset, *, done: bool = False) -> tuple[Dataset,
     order = varying[np.argsort(-lags, kind="stable")]
     kept = np.sort(order[independent(values[:, order])])
     left, names = len(data) - len(rows), np.array(data.names, dtype=object)
-    notes = [f"{left} of {len(data)} rows were left out: something is done in them"] * bool(left)
+    notes = [f"{left} of {len(data)} rows were left out: {what} in them"] * bool(left)
     constant = np.delete(np.arange(len(names)), varying)
     for what, which in (
         ("taken for real numbers", [i for i in kept if data.columns[i].dtype != "real"]),

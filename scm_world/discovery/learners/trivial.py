@@ -85,7 +85,7 @@ def sort_regress(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
     """
     from scipy.special import log_ndtr
 
-    free = ~data.targeted.any(axis=1)
+    free = ~data.intervened
     rows = data.values[free if free.sum() > len(data.names) + LEAST else slice(None)]
     n, p = rows.shape
     centered, spread = rows - rows.mean(axis=0), rows.std(axis=0)
@@ -140,7 +140,7 @@ def _correlated(data: Dataset) -> Floats:
     from scipy.special import log_ndtr
 
     values, targeted = data.values, data.targeted
-    free = ~targeted.any(axis=1)
+    free = ~data.intervened
     strength = np.zeros((values.shape[1],) * 2)
     for i in range(values.shape[1]):
         mine = targeted[:, i]
