@@ -31,7 +31,6 @@ def main(backend: str = "fake", episodes: int = 60) -> None:
                 n,
                 out=folder,
                 shard=20,
-                format="csv",
                 steps=5,
                 nature=nature,
                 causes=CAUSES,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from importlib.util import find_spec
 from typing import Annotated, Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from scm_world.cli.arguments import (
     refused,
     tag,
 )
-from scm_world.errors import UnknownOption
 from scm_world.output.remote import Location
 
 Describe = Annotated[
@@ -34,17 +32,6 @@ Describe = Annotated[
 ]
 Size = Annotated[int, typer.Option(min=1, help="Height and width of a picture in pixels.")]
 SHOWN, POINTS = 12, 40  # targets, and points of a grid, that are printed
-
-
-def check_parquet(form: str) -> None:
-    """Refuse Parquet where nothing is installed that writes it.
-
-    Raises:
-        UnknownOption: Nothing is.
-    """
-    if form == "parquet" and find_spec("pyarrow") is None:
-        allowed = ("csv", "parquet after: pip install 'scm-world[data]'")
-        raise UnknownOption("format", "parquet", allowed)
 
 
 def collect(
@@ -69,7 +56,6 @@ def collect(
     goal_pictures: bool = False,
     croissant: Describe = False,
     shard: options.Shard = 100,
-    format_: options.Files = "parquet",
     workers: options.Workers = None,
     executor: options.Executor = None,
     address: options.Address = None,
@@ -104,7 +90,6 @@ def collect(
     from scm_world.variables.kinds import SPACES
 
     one_of("values", values, SPACES)
-    check_parquet(format_)
     asked: dict[str, Any] = {
         "policy": policy,
         "nature": parse_assignments(nature, "'--nature'"),
@@ -140,7 +125,6 @@ def collect(
                 seed=seed,
                 out=folder,
                 shard=shard,
-                format=format_,
                 progress=tell,
                 engine=pool,
                 **asked,
@@ -262,7 +246,6 @@ def sweep(
     seed: options.Seed = 0,
     preset: options.Preset = None,
     shard: options.Shard = 100,
-    format_: options.Files = "parquet",
     workers: options.Workers = None,
     executor: options.Executor = None,
     address: options.Address = None,
@@ -283,7 +266,6 @@ def sweep(
     from scm_world.discovery.data import sweep as swept
     from scm_world.discovery.data.sweeps import ENDS, SUMMARY, TABLE, points_of
 
-    check_parquet(format_)
     grid, held = read_over(over), parse_assignments(do, "'--do'")
     measured = [parse_outcome(text) for text in outcome or ()] or None
     with (
@@ -309,7 +291,6 @@ def sweep(
                 seed=seed,
                 out=folder,
                 shard=shard,
-                format=format_,
                 engine=pool,
                 progress=tell,
             )

@@ -13,7 +13,6 @@ import typer
 from scm_world._arguments import one_of
 from scm_world.cli import console, options
 from scm_world.cli.arguments import load_task, parse_assignments
-from scm_world.cli.datasets import check_parquet
 from scm_world.errors import UnknownOption
 
 WORDS = {"true": True, "false": False, "none": None}
@@ -87,7 +86,9 @@ def evaluate(
         raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")
     one_of("metric", metric, (None, *METRICS))
     one_of("format", format_, CODECS)
-    check_parquet(format_)
+    if format_ == "parquet" and find_spec("pyarrow") is None:
+        allowed = ("csv", "parquet after: pip install 'scm-world[data]'")
+        raise UnknownOption("format", "parquet", allowed)
     if videos and find_spec("moviepy") is None:
         needed = ("none, or after: pip install 'scm-world[video]'",)
         raise UnknownOption("videos", "--videos", needed)

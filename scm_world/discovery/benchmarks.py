@@ -585,9 +585,9 @@ class _Runner:
             self._key, self._data, self._held_out = key, {}, []
         if run.data != "paired" and run.data not in self._data:
             options: dict[str, Any] = {}
-            if job.folder is not None and self._problem.truth.about.get("kind") != "model":
-                written = "parquet" if find_spec("pyarrow") else "csv"
-                options = {"out": job.folder / f"{run.data}-seed{run.seed}", "format": written}
+            is_slow = self._problem.truth.about.get("kind") != "model"
+            if job.folder is not None and is_slow and find_spec("pyarrow"):
+                options = {"out": job.folder / f"{run.data}-seed{run.seed}"}
             self._data[run.data] = self._problem.data(run.data, job.collected, run.seed, **options)
 
     def run(self, job: _Job) -> BenchmarkRun:

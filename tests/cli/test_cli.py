@@ -427,7 +427,7 @@ def test_assignments_are_read() -> None:
 def test_a_sweep_counts_episodes_at_a_point() -> None:
     """Where a folder has more episodes already, the number is that of ``-n``."""
     command = ("sweep", "pushing", "--over=tool_block.mass=0.02,0.03,0.04", "--backend=fake")
-    options = ("--steps=1", "--outcome=reward", "--out=swept", "--format=csv")
+    options = ("--steps=1", "--outcome=reward", "--out=swept")
     assert call(*command, *options, "-n7").exit_code == 0
     refused = call(*command, *options, "-n5")
     assert refused.exit_code == 2

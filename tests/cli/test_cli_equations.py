@@ -81,7 +81,7 @@ def test_the_graph_and_the_variables_are_shown(file: str) -> None:
 
 def test_a_dataset_is_collected(file: str) -> None:
     """It is that of the function; a model with lagged edges has a row per control step."""
-    given = ("--design", "single", "-n", "6", "--format", "csv", "--out")
+    given = ("--design", "single", "-n", "6", "--out")
     done = call("collect", f"{file}:chain", *given, "static")
     assert done.exit_code == 0, done.output
     assert "do(x)" in done.output
@@ -113,7 +113,7 @@ def test_what_equations_do_not_have_is_refused(
     file: str, wrong: tuple[str, ...], said: str
 ) -> None:
     """A policy, a context distribution and a backend are those of a world."""
-    done = call("collect", f"{file}:chain", *wrong, "--format", "csv", "--out", "out")
+    done = call("collect", f"{file}:chain", *wrong, "--out", "out")
     assert done.exit_code == 2, done.output
     assert said in " ".join(done.output.split())
     assert not Path("out").exists()
@@ -168,13 +168,13 @@ def test_do_refuses_settings_of_a_world(file: str, setting: str) -> None:
 
 def test_a_sweep_has_the_same_units_at_every_point(file: str) -> None:
     """The means are those of samples of the model, and what is done besides holds everywhere."""
-    given = ("--over", "x=0,1", "-n", "5", "--format", "csv")
+    given = ("--over", "x=0,1", "-n", "5")
     done = call("sweep", f"{file}:chain", *given, "--out", "static")
     assert done.exit_code == 0, done.output
     assert "on equations" in done.output
     rows = json.loads(Path("static/sweep.json").read_text())["rows"]
     assert [row["y.change"] for row in rows] == [0.0, pytest.approx(2.0)]
-    given = ("--over", "rate=0.5,1", "-n", "2", "--format", "csv", "--steps", "4")
+    given = ("--over", "rate=0.5,1", "-n", "2", "--steps", "4")
     done = call("sweep", f"{file}:growth", *given, "--do", "size=2", "--out", "lagged")
     assert done.exit_code == 0, done.output
     rows = json.loads(Path("lagged/sweep.json").read_text())["rows"]

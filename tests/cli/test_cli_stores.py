@@ -44,7 +44,7 @@ def test_an_evaluation_goes_to_a_store(tmp_path: Path) -> None:
 def test_other_results_go_to_a_store(tmp_path: Path) -> None:
     """A dataset, and the files of a question."""
     here = ("reaching", "--backend", "fake", "--steps", "2")
-    done = call("collect", *here, "-n", "3", "--format", "csv", "--out", "memory://cli/data")
+    done = call("collect", *here, "-n", "3", "--out", "memory://cli/data")
     assert done.exit_code == 0, done.output
     assert len(load("memory://cli/data")) == 3
     asked = ("effect", *here, "gravity[2]", "gravity=0,0,-5", "-n", "2")

@@ -38,7 +38,6 @@ DESIGN = Design(
     "half", ("tool_block.mass", "floor_friction", "gravity"), observational_fraction=0.3
 )
 HOW: dict[str, Any] = {"steps": 2, "seed": 5, "shard": 4, "nature": {"sensor_noise": 0.01}}
-KINDS = ("parquet", "csv")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -52,18 +51,15 @@ def world() -> World:
     return World("pushing", backend="fake")
 
 
-@pytest.fixture(scope="module", params=KINDS)
-def written(
-    request: pytest.FixtureRequest, world: World, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, Dataset, str]:
-    """A folder, what is in it, and the kind of its files."""
+@pytest.fixture(scope="module")
+def written(world: World, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Dataset]:
+    """A folder, and what is in it."""
     folder = tmp_path_factory.mktemp("data") / "whole"
-    found = collect(world, DESIGN, 10, out=folder, format=request.param, **HOW)
-    return folder, found, request.param
+    return folder, collect(world, DESIGN, 10, out=folder, **HOW)
 
 
 @pytest.fixture
-def copied(written: tuple[Path, Dataset, str], tmp_path: Path) -> Path:
+def copied(written: tuple[Path, Dataset], tmp_path: Path) -> Path:
     """A copy of the folder, to be spoiled."""
     folder = tmp_path / "copy"
     folder.mkdir()
@@ -75,37 +71,34 @@ def copied(written: tuple[Path, Dataset, str], tmp_path: Path) -> Path:
 # --- whole ------------------------------------------------------------------------------------
 
 
-def test_a_folder_holds_what_was_collected(
-    written: tuple[Path, Dataset, str], world: World
-) -> None:
+def test_a_folder_holds_what_was_collected(written: tuple[Path, Dataset], world: World) -> None:
     """Loaded, it is bit for bit what came out, and what comes out without a folder."""
-    folder, found, kind = written
+    folder, found = written
     names = sorted(path.name for path in folder.iterdir())
-    assert names == ["dataset.json", *(f"shard-0000{i}.{kind}" for i in range(3))]
+    assert names == ["dataset.json", *(f"shard-0000{i}.parquet" for i in range(3))]
     assert load(folder) == found
     assert collect(world, DESIGN, 10, **HOW) == found
 
 
-def test_saving_is_without_loss(written: tuple[Path, Dataset, str], tmp_path: Path) -> None:
+def test_saving_is_without_loss(written: tuple[Path, Dataset], tmp_path: Path) -> None:
     """Any table comes back: extreme numbers, several rows per episode, unused regimes."""
-    _, found, kind = written
+    _, found = written
     values = [[-0.0, 1e-310], [np.nextafter(1.0, 2.0), -1.7976931348623157e308], [0.1, 1 / 3]]
     table = Dataset.of(
         values, ["a", 'b;"c'], targets=[(), ("a",), ()], episode=[7, 7, 9], step=[0, 1, 0], x=[1]
     )
     for number, data in enumerate((found, table, table.rows([0]), table.rows([]))):
-        back = load(save(data, tmp_path / str(number), shard=1, format=kind))
+        back = load(save(data, tmp_path / str(number), shard=1))
         assert back == data
         assert back.values.tobytes() == data.values.tobytes()
 
 
-def test_files_are_tables_for_others(written: tuple[Path, Dataset, str]) -> None:
+def test_files_are_tables_for_others(written: tuple[Path, Dataset]) -> None:
     """Other libraries read them without this package, targets included."""
     pandas = pytest.importorskip("pandas")
-    folder, found, kind = written
-    path = folder / f"shard-00000.{kind}"
-    read = pandas.read_parquet if kind == "parquet" else pandas.read_csv
-    frame = read(path, **({"comment": "#"} if kind == "csv" else {}))
+    folder, found = written
+    path = folder / "shard-00000.parquet"
+    frame = pandas.read_parquet(path)
     rows = frame["tool_block.mass"].to_numpy()
     np.testing.assert_array_equal(rows, found["tool_block.mass"][:4])
     told = frame["intervention_targets"].fillna("")[1]
@@ -139,25 +132,23 @@ def test_mechanisms_are_read_back_where_they_are_trusted(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("after", [1, 4, 7, 9])
 def test_ctrl_c_keeps_what_is_complete(
-    written: tuple[Path, Dataset, str], world: World, tmp_path: Path, after: int
+    written: tuple[Path, Dataset], world: World, tmp_path: Path, after: int
 ) -> None:
     """The same call goes on, and every file is as if nothing had happened."""
-    folder, found, kind = written
+    folder, found = written
 
     def interrupt(done: int, planned: int) -> None:
         if done == after:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        collect(world, DESIGN, 10, out=tmp_path, format=kind, progress=interrupt, **HOW)
+        collect(world, DESIGN, 10, out=tmp_path, progress=interrupt, **HOW)
     assert len(list(tmp_path.glob("shard-*"))) == (after - 1) // 4
     with pytest.raises(UnreadableFile, match="it is not there yet"):
         load(tmp_path)
     assert load(tmp_path, partial=True) == found.first((after - 1) // 4 * 4)
     told: list[int] = []
-    again = collect(
-        world, DESIGN, 10, out=tmp_path, format=kind, progress=lambda d, _: told.append(d), **HOW
-    )
+    again = collect(world, DESIGN, 10, out=tmp_path, progress=lambda d, _: told.append(d), **HOW)
     assert again == found
     assert contents(tmp_path) == contents(folder)
     assert told[-1] == 10
@@ -207,26 +198,24 @@ def test_a_killed_process_leaves_nothing_broken(
 
 def test_drafts_of_the_dead_are_swept_away(copied: Path, world: World) -> None:
     """Half a file under another name is no part of anything; other hidden files are left alone."""
-    kind = next(copied.glob("shard-*")).suffix.removeprefix(".")
-    (copied / f".shard-00001.{kind}.part").write_bytes(b"half a")
+    (copied / ".shard-00001.parquet.part").write_bytes(b"half a")
     (copied / ".mine").write_text("to be kept")
-    collect(world, DESIGN, 10, out=copied, format=kind, **HOW)
+    collect(world, DESIGN, 10, out=copied, **HOW)
     assert sorted(path.name for path in copied.glob(".*")) == [".mine"]
 
 
 def test_more_episodes_go_on_from_there(
-    written: tuple[Path, Dataset, str], copied: Path, world: World, tmp_path: Path
+    written: tuple[Path, Dataset], copied: Path, world: World, tmp_path: Path
 ) -> None:
     """Complete files stay as they are; the folder becomes that of the larger collection."""
-    kind = written[2]
-    before = (copied / f"shard-00000.{kind}").stat().st_mtime_ns
-    more = collect(world, DESIGN, 15, out=copied, format=kind, **HOW)
+    before = (copied / "shard-00000.parquet").stat().st_mtime_ns
+    more = collect(world, DESIGN, 15, out=copied, **HOW)
     assert more.first(10) == written[1]
-    assert (copied / f"shard-00000.{kind}").stat().st_mtime_ns == before
-    collect(world, DESIGN, 15, out=tmp_path / "new", format=kind, **HOW)
+    assert (copied / "shard-00000.parquet").stat().st_mtime_ns == before
+    collect(world, DESIGN, 15, out=tmp_path / "new", **HOW)
     assert contents(copied) == contents(tmp_path / "new")
     with pytest.raises(UnknownOption, match="15 or more"):
-        collect(world, DESIGN, 10, out=copied, format=kind, **HOW)
+        collect(world, DESIGN, 10, out=copied, **HOW)
 
 
 # --- spoiled ----------------------------------------------------------------------------------
@@ -235,7 +224,7 @@ def test_more_episodes_go_on_from_there(
 def test_every_kind_of_damage_is_seen(copied: Path, world: World) -> None:
     """A file that was cut, changed or exchanged is named, and what to do with it."""
     paths = sorted(copied.glob("shard-*"))
-    data, kind = paths[1].read_bytes(), paths[1].suffix.removeprefix(".")
+    data = paths[1].read_bytes()
     generator = np.random.default_rng(0)
     spoiled = [b"", data[:-1], data[: len(data) // 2], paths[0].read_bytes()]
     places = generator.integers(len(data), size=40)
@@ -249,39 +238,25 @@ def test_every_kind_of_damage_is_seen(copied: Path, world: World) -> None:
         except UnreadableFile as error:
             assert error.path == str(paths[1])  # noqa: PT017 # both outcomes are allowed
             with pytest.raises(UnreadableFile, match=r"delete it|under its own name"):
-                collect(world, DESIGN, 10, out=copied, format=kind, **HOW)
+                collect(world, DESIGN, 10, out=copied, **HOW)
     paths[1].unlink()
-    assert collect(world, DESIGN, 10, out=copied, format=kind, **HOW) == whole
+    assert collect(world, DESIGN, 10, out=copied, **HOW) == whole
     assert paths[1].read_bytes() == data
 
 
-def test_changed_numbers_are_seen(copied: Path) -> None:
-    """A value that someone corrected in a CSV file is not what was written."""
-    path = copied / "shard-00001.csv"
-    if not path.exists():
-        pytest.skip("Parquet is not corrected by hand")
-    lines = path.read_text().splitlines()
-    cells = lines[2].split(",")
-    cells[-1] = repr(float(cells[-1]) + 1.0)
-    lines[2] = ",".join(cells)
-    path.write_text("\n".join(lines) + "\n")
-    with pytest.raises(UnreadableFile, match=r"shard-00001\.csv.*not what was written"):
-        load(copied)
-
-
 def test_files_of_another_dataset_are_foreign(
-    written: tuple[Path, Dataset, str], copied: Path, world: World, tmp_path: Path
+    written: tuple[Path, Dataset], copied: Path, world: World, tmp_path: Path
 ) -> None:
     """A shard of the same shape from another seed is refused, and so is one too many."""
-    kind, name = written[2], f"shard-00001.{written[2]}"
-    collect(world, DESIGN, 10, out=tmp_path / "other", format=kind, **{**HOW, "seed": 6})
+    name = "shard-00001.parquet"
+    collect(world, DESIGN, 10, out=tmp_path / "other", **{**HOW, "seed": 6})
     mine = (copied / name).read_bytes()
     (copied / name).write_bytes((tmp_path / "other" / name).read_bytes())
     with pytest.raises(UnreadableFile, match="belongs to another dataset"):
         load(copied)
     (copied / name).write_bytes(mine)
-    (copied / f"shard-00007.{kind}").write_bytes(mine)
-    with pytest.raises(UnreadableFile, match=rf"shard-00007.{kind}.*remove it"):
+    (copied / "shard-00007.parquet").write_bytes(mine)
+    with pytest.raises(UnreadableFile, match=r"shard-00007.parquet.*remove it"):
         load(copied)
 
 
@@ -290,15 +265,15 @@ def test_files_of_another_dataset_are_foreign(
     [({"seed": 6}, "seed"), ({"steps": 3}, "steps"), ({"nature": None}, "nature")],
 )
 def test_another_collection_is_not_mixed_in(
-    written: tuple[Path, Dataset, str], world: World, change: dict[str, Any], named: str
+    written: tuple[Path, Dataset], world: World, change: dict[str, Any], named: str
 ) -> None:
     """The folder of another one is refused, and the error says what differs."""
-    folder, _, kind = written
+    folder, _ = written
     before = contents(folder)
     with pytest.raises(UnreadableFile, match=f"another dataset: {named} differ"):
-        collect(world, DESIGN, 10, out=folder, format=kind, **{**HOW, **change})
+        collect(world, DESIGN, 10, out=folder, **{**HOW, **change})
     with pytest.raises(UnreadableFile, match="design differ"):
-        collect(world, Design(), 10, out=folder, format=kind, **HOW)
+        collect(world, Design(), 10, out=folder, **HOW)
     assert contents(folder) == before
 
 
@@ -340,21 +315,20 @@ def test_a_folder_with_other_things_is_left_alone(world: World, tmp_path: Path) 
 
 def test_two_processes_do_not_write_to_one_folder(copied: Path, world: World) -> None:
     """The second one is told."""
-    kind = next(copied.glob("shard-*")).suffix.removeprefix(".")
     handle = os.open(copied, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
         with pytest.raises(UnreadableFile, match="another process"):
-            collect(world, DESIGN, 10, out=copied, format=kind, **HOW)
+            collect(world, DESIGN, 10, out=copied, **HOW)
     finally:
         os.close(handle)
 
 
 def test_a_full_disk_loses_nothing(
-    written: tuple[Path, Dataset, str], world: World, tmp_path: Path, monkeypatch: Any
+    written: tuple[Path, Dataset], world: World, tmp_path: Path, monkeypatch: Any
 ) -> None:
     """The error says so; with room again the same call goes on."""
-    folder, _, kind = written
+    folder, _ = written
     calls = iter(range(100))
 
     def full(handle: int) -> None:
@@ -364,20 +338,17 @@ def test_a_full_disk_loses_nothing(
     with monkeypatch.context() as patched:
         patched.setattr(durable.os, "fsync", full)
         with pytest.raises(UnwritableFolder, match=r"shard-00001.*No space left"):
-            collect(world, DESIGN, 10, out=tmp_path, format=kind, **HOW)
-    assert sorted(contents(tmp_path)) == ["dataset.json", f"shard-00000.{kind}"]
-    collect(world, DESIGN, 10, out=tmp_path, format=kind, **HOW)
+            collect(world, DESIGN, 10, out=tmp_path, **HOW)
+    assert sorted(contents(tmp_path)) == ["dataset.json", "shard-00000.parquet"]
+    collect(world, DESIGN, 10, out=tmp_path, **HOW)
     assert contents(tmp_path) == contents(folder)
 
 
 def test_a_place_that_cannot_be_is_told(world: World, tmp_path: Path) -> None:
-    """A file where the folder should be, and a format that there is not."""
+    """A file where the folder should be."""
     (tmp_path / "file").write_text("")
     with pytest.raises(UnwritableFolder, match="cannot be written to"):
         collect(world, DESIGN, 10, out=tmp_path / "file", **HOW)
-    with pytest.raises(UnknownOption, match="did you mean 'parquet'"):
-        collect(world, DESIGN, 10, out=tmp_path / "new", format="parket", **HOW)
-    assert not (tmp_path / "new").exists()
 
 
 def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:

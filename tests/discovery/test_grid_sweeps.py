@@ -37,7 +37,6 @@ OVER = {MASS: [0.02, 0.05, 0.08], FRICTION: Levels("A", 2)}
 HOW: dict[str, Any] = {"steps": 2, "seed": 5, "nature": {"gravity": "A"}, "shard": 4}
 FIRST, OTHER = (f"tool_block_{number}.cartesian_position" for number in (1, 2))
 SPEED = Outcome("tool_block.linear_velocity", "final", 2)
-FILES = {**HOW, "format": "csv"}
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +220,7 @@ def test_what_is_given_to_the_world_holds_everywhere(world: World) -> None:
 
 def test_a_folder_holds_the_table_and_the_episodes(world: World, tmp_path: Path) -> None:
     """CSV and JSON say the same; the episodes are a dataset with regimes."""
-    found = sweep(world, OVER, [SPEED], n=3, out=tmp_path, **FILES)
+    found = sweep(world, OVER, [SPEED], n=3, out=tmp_path, **HOW)
     summary = json.loads((tmp_path / "sweep.json").read_text())
     with (tmp_path / "sweep.csv").open(newline="") as stream:
         table = list(csv.DictReader(stream))
@@ -243,28 +242,28 @@ def test_an_interrupted_sweep_goes_on(after: int, world: World, tmp_path: Path) 
         if done == after:
             raise KeyboardInterrupt
 
-    sweep(world, OVER, [SPEED], n=3, out=whole, **FILES)
+    sweep(world, OVER, [SPEED], n=3, out=whole, **HOW)
     with pytest.raises(KeyboardInterrupt):
-        sweep(world, OVER, [SPEED], n=3, out=out, progress=interrupt, **FILES)
+        sweep(world, OVER, [SPEED], n=3, out=out, progress=interrupt, **HOW)
     assert not (out / "sweep.csv").exists()
     assert len(list(out.glob("shard-*"))) == (after - 1) // 4
-    sweep(world, OVER, [SPEED], n=3, out=out, **FILES)
+    sweep(world, OVER, [SPEED], n=3, out=out, **HOW)
     assert contents(out) == contents(whole)
 
 
 def test_a_sweep_can_have_more_units(world: World, tmp_path: Path) -> None:
     """But not other points: that is another one."""
-    sweep(world, OVER, [SPEED], n=2, out=tmp_path, **FILES)
-    more = sweep(world, OVER, [SPEED], n=4, out=tmp_path, **FILES)
+    sweep(world, OVER, [SPEED], n=2, out=tmp_path, **HOW)
+    more = sweep(world, OVER, [SPEED], n=4, out=tmp_path, **HOW)
     assert more.rows() == sweep(world, OVER, [SPEED], n=4, **HOW).rows()
     with pytest.raises(UnreadableFile, match="points differ"):
-        sweep(world, {MASS: [0.02]}, [SPEED], n=4, out=tmp_path, **FILES)
+        sweep(world, {MASS: [0.02]}, [SPEED], n=4, out=tmp_path, **HOW)
 
 
 def test_workers_change_nothing(world: World, tmp_path: Path) -> None:
     """Two processes write the files that one does."""
     for name, workers in (("one", 1), ("two", 2)):
-        sweep(world, OVER, [SPEED], n=3, out=tmp_path / name, workers=workers, **FILES)
+        sweep(world, OVER, [SPEED], n=3, out=tmp_path / name, workers=workers, **HOW)
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
 
 
@@ -280,7 +279,7 @@ def test_what_other_processes_cannot_have_is_refused(world: World, tmp_path: Pat
 
 # --- the command ----------------------------------------------------------------------------------
 
-COMMAND = ["sweep", "pushing", "--backend", "fake", "--steps", "2", "--format", "csv", "-n", "3"]
+COMMAND = ["sweep", "pushing", "--backend", "fake", "--steps", "2", "-n", "3"]
 
 
 def test_the_command_sweeps(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ def evaluated(out: Path | str, *, drawn: bool = False, **more: Any) -> Evaluatio
 def collected(out: Path | str, n: int = 10, **more: Any) -> Dataset:
     """Collect some episodes, four in a file."""
     world = World("pushing", backend="fake")
-    options: dict[str, Any] = {"steps": 2, "seed": 5, "shard": 4, "format": "csv"}
+    options: dict[str, Any] = {"steps": 2, "seed": 5, "shard": 4}
     return collect(world, DESIGN, n, out=out, **options, **more)
 
 
@@ -78,7 +78,7 @@ def test_a_dataset_is_the_same_in_a_store(tmp_path: Path) -> None:
     local, folder = collected(tmp_path / "local"), fresh()
     with pytest.raises(KeyboardInterrupt):
         collected(str(folder), progress=stop_at(6))
-    assert "shard-00001.csv" not in everything(folder)
+    assert "shard-00001.parquet" not in everything(folder)
     assert len(load(str(folder), partial=True)) == 4
     assert collected(str(folder)) == local == load(str(folder))
     assert everything(folder) == below(tmp_path / "local")
@@ -97,11 +97,11 @@ def test_a_url_of_this_machine_is_a_folder(tmp_path: Path) -> None:
 def test_a_saved_dataset_is_the_same_in_a_store(tmp_path: Path) -> None:
     """And a second one beside it is refused."""
     table, folder = collected(tmp_path / "whole"), fresh()
-    save(table, tmp_path / "saved", format="csv")
-    assert str(save(table, str(folder), format="csv")) == str(folder)
+    save(table, tmp_path / "saved")
+    assert str(save(table, str(folder))) == str(folder)
     assert everything(folder) == below(tmp_path / "saved")
     with pytest.raises(UnreadableFile, match=r"memory://.* another dataset"):
-        save(table.first(3), str(folder), format="csv")
+        save(table.first(3), str(folder))
 
 
 def test_a_benchmark_resumes_from_a_store() -> None:
@@ -172,7 +172,7 @@ def test_damaged_objects_are_named() -> None:
     with pytest.raises(UnreadableFile, match=r"memory://.*results\.json"):
         Evaluation.load(str(folder))
     collected(str(data))
-    shard = spoil(data, "shard-00001.csv")
+    shard = spoil(data, "shard-00001.parquet")
     with pytest.raises(UnreadableFile, match=rf"{shard}.*delete it, and collect again"):
         load(str(data))
     (data / shard).unlink()

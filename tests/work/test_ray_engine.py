@@ -156,7 +156,7 @@ def test_a_collection_on_ray_has_the_same_files(ray: Executor, tmp_path: Path) -
     """Byte for byte those of this process; in memory it is the same table."""
     design = Design("half", ("tool_block.mass", "floor_friction", "gravity"))
     world = World("pushing", backend="fake")
-    how: Any = {"steps": 2, "shard": 4, "format": "csv", "nature": {"sensor_noise": 0.01}}
+    how: Any = {"steps": 2, "shard": 4, "nature": {"sensor_noise": 0.01}}
     here = collect(world, design, 14, out=tmp_path / "here", **how)
     there = collect(world, design, 14, out=tmp_path / "there", engine=ray, **how)
     assert here == there == collect(world, design, 14, engine=ray, **how)
@@ -174,7 +174,7 @@ def test_an_evaluation_on_ray_has_the_same_rows(ray: Executor, tmp_path: Path) -
 def test_a_sweep_on_ray_has_the_same_files(ray: Executor, tmp_path: Path) -> None:
     """The table, too."""
     world, over = World("pushing", backend="fake"), {"tool_block.mass": [0.02, 0.08]}
-    how: Any = {"n": 5, "steps": 2, "shard": 3, "format": "csv"}
+    how: Any = {"n": 5, "steps": 2, "shard": 3}
     for name, engine in (("here", None), ("there", ray)):
         sweep(world, over, ["reward"], out=tmp_path / name, engine=engine, **how)
     assert contents(tmp_path / "here") == contents(tmp_path / "there")
@@ -205,7 +205,7 @@ from scm_world.queries import World
 if __name__ == "__main__":
     design = Design("half", ("tool_block.mass", "floor_friction", "gravity"))
     collect(World("pushing", backend="fake"), design, 480, out=sys.argv[1], shard=4, steps=2,
-            format="csv", engine="ray", workers=2)
+            engine="ray", workers=2)
 """
 
 
@@ -222,7 +222,7 @@ def test_a_killed_driver_goes_on_where_it_was(tmp_path: Path, ray: Executor) -> 
     before = contents(out)
     assert 20 <= len(before) - 1 < 120
     design = Design("half", ("tool_block.mass", "floor_friction", "gravity"))
-    how: Any = {"steps": 2, "shard": 4, "format": "csv"}
+    how: Any = {"steps": 2, "shard": 4}
     times = {path: path.stat().st_mtime_ns for path in out.glob("shard-*")}
     world = World("pushing", backend="fake")
     whole = collect(world, design, 480, out=out, engine=ray, **how)

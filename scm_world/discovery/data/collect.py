@@ -50,7 +50,6 @@ def collect(
     seed: int = 0,
     out: Location | str | None = None,
     shard: int = SHARD,
-    format: str = "parquet",  # noqa: A002 # as other libraries call it
     progress: Progress | None = None,
     workers: int | None = None,
     engine: Executor | str | None = None,
@@ -68,9 +67,9 @@ def collect(
         design: What is done in which episode.
         n: How many episodes.
         seed: Of the noise; for a laboratory only of what the design draws by lot.
-        out: A folder, or a URL: new, empty, or one in which this collection was begun.
+        out: A folder, or a URL: new, empty, or one in which this collection was begun. Its files
+            are Parquet, which needs the extra ``data``.
         shard: How many episodes are in one of its files.
-        format: Of the files: ``"parquet"`` (needs the extra ``data``) or ``"csv"``.
         progress: Called with how many episodes are done, and how many there will be: after each
             episode in this process, after each shard of others.
         workers: How many shards are made at the same time. None is one, in this process; with an
@@ -117,7 +116,7 @@ def collect(
         raise UnknownOption("out", str(out), allowed)
     elif about.get("model", "") is None:
         raise ModelError(["a function of the model has no name: define it at the top of a module"])
-    head = Head(about, made.columns, count, size, format, made.edges)
+    head = Head(about, made.columns, count, size, made.edges)
     if out is not None:
         folder = Folder(out, head, design.modules)
     with opened(engine, workers) as executor:

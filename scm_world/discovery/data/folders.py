@@ -11,11 +11,11 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import load as load_library
 from scm_world._arguments import whole_number
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
 from scm_world.discovery.data.pictures import ENDINGS
 from scm_world.discovery.data.shards import (
-    check_kind,
     check_names,
     checksum,
     decoded,
@@ -59,7 +59,6 @@ class Head:
         columns: What stands in a row.
         n: How many episodes there will be.
         shard: How many of them are in a file.
-        kind: Of the files: ``"parquet"`` or ``"csv"``.
         edges: The declared graph, if it may be known.
         content: Sums up the rows of a dataset that was saved; None of one that is collected, of
             which ``about`` decides the rows.
@@ -69,7 +68,6 @@ class Head:
     columns: tuple[Column, ...]
     n: int
     shard: int = SHARD
-    kind: str = "parquet"
     edges: tuple[Edge, ...] | None = None
     content: str | None = None
 
@@ -80,7 +78,7 @@ class Head:
             "about": self.about,
             "columns": [asdict(column) for column in self.columns],
             "shard": self.shard,
-            "files": self.kind,
+            "files": "parquet",
             "content": self.content,
         }
         plain: dict[str, Any] = json.loads(json.dumps(found))
@@ -122,7 +120,7 @@ class Folder:
 
     def shard(self, index: int) -> Location:
         """Name a file."""
-        return self.path / f"shard-{index:05d}.{self.head.kind}"
+        return self.path / f"shard-{index:05d}.parquet"
 
     def pictures(self, index: int) -> Location | None:
         """Name the file with the pictures that belong to a file; None where there are none."""
@@ -149,7 +147,7 @@ class Folder:
         except OSError as error:
             raise UnreadableFile(str(path), said(error), "make it readable") from None
         try:
-            there, part = decoded(data, head.kind, self._plan, head.empty, self._trusted)
+            there, part = decoded(data, self._plan, head.empty, self._trusted)
         except DAMAGED as error:
             if isinstance(error, ModelError) and "trusted" in str(error):
                 raise
@@ -179,7 +177,7 @@ class Folder:
         pictures = self.pictures(index)
         if pictures is not None:  # first, so that a file of the table never lacks them
             write_durably(pictures, part.pictures)
-        write_durably(self.shard(index), encoded(part, self._plan, numbers, self.head.kind))
+        write_durably(self.shard(index), encoded(part, self._plan, numbers))
 
     # --- the sidecar --------------------------------------------------------------------------
 
@@ -192,7 +190,7 @@ class Folder:
             UnknownOption: It has more episodes already.
             UnwritableFolder: There is no permission.
         """
-        check_kind(self.head.kind)
+        load_library("pyarrow.parquet", "pyarrow", "data")  # before time is spent on rows
         check_names(self.head.columns)
         with locked(self.path):
             for stale in self.path.glob(f".*{PARTIAL}"):  # of a process that was killed
@@ -282,7 +280,7 @@ def head_of(found: Mapping[str, Any]) -> Head:
     shard = whole_number("shard", found["shard"], least=1)
     graph = found["graph"]
     edges = None if graph is None else tuple(Edge(*key) for key in graph)
-    return Head(found["about"], columns, n, shard, found["files"], edges, found["content"])
+    return Head(found["about"], columns, n, shard, edges, found["content"])
 
 
 # --- whole datasets -------------------------------------------------------------------------------
@@ -304,11 +302,11 @@ def load(folder: Location | str, *, trusted: Sequence[str] = (), partial: bool =
     """
     place = located(folder)
     head = head_of(read_sidecar(place))
-    check_kind(head.kind)
+    load_library("pyarrow.parquet", "pyarrow", "data")
     files = Folder(place, head, trusted)
     parts, ranges = [], head.ranges()
     known = {files.shard(index) for index in range(len(ranges))}
-    for stranger in sorted(set(place.glob(f"shard-*.{head.kind}")) - known, key=str):
+    for stranger in sorted(set(place.glob("shard-*.parquet")) - known, key=str):
         reason = f"the dataset has {len(ranges)} files, and it is none of them"
         raise UnreadableFile(str(stranger), reason, "remove it from the folder")
     for index, numbers in enumerate(ranges):
@@ -339,7 +337,6 @@ def save(
     folder: Location | str,
     *,
     shard: int = SHARD,
-    format: str = "parquet",  # noqa: A002 # as other libraries call it
 ) -> Location:
     """Write a dataset to a new folder, without loss.
 
@@ -348,12 +345,12 @@ def save(
         folder: New or empty, or one in which saving the same dataset was interrupted; it may be a
             URL.
         shard: How many episodes are in a file.
-        format: ``"parquet"`` or ``"csv"``.
 
     Raises:
         UnreadableFile: Something else is in the folder, be it a dataset with other numbers only.
         UnwritableFolder: There is no room, or no permission.
         ModelError: A part of it cannot be written.
+        MissingExtra: pyarrow, which writes Parquet, is not installed.
     """
     try:
         about = json.loads(json.dumps(dataset.about, allow_nan=False))
@@ -365,7 +362,7 @@ def save(
     starts = np.flatnonzero(np.diff(table.episode, prepend=table.episode[:1] - 1))
     ends = [*starts, len(table)]
     size = whole_number("shard", shard, least=1)
-    head = Head(about, table.columns, len(starts), size, format, content=checksum(raw_of(table)))
+    head = Head(about, table.columns, len(starts), size, content=checksum(raw_of(table)))
     files = Folder(folder, head)
     with files.opened():
         files.note({})

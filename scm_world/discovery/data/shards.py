@@ -1,12 +1,10 @@
-"""Some episodes as the bytes of one file, Parquet or CSV, and back without loss."""
+"""Some episodes as the bytes of a Parquet file, and back without loss."""
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -16,7 +14,7 @@ from scm_world._arguments import load as load_library
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Column, Dataset, Ints, Regime
 from scm_world.discovery.data.sources import SourceRows
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import ModelError
 from scm_world.output.reading import read_table
 from scm_world.queries.plans import FORMAT as PLAN
 from scm_world.queries.plans import Plan
@@ -41,18 +39,13 @@ class Raw:
     values: Floats
 
 
-Encode = Callable[[Raw, Sequence[str]], bytes]
-Decode = Callable[[bytes, Sequence[str]], Raw]
-
-
-def encoded(part: SourceRows, plan: str, numbers: range, kind: str) -> bytes:
+def encoded(part: SourceRows, plan: str, numbers: range) -> bytes:
     """Write episodes as the bytes of a file; the same ones every time.
 
     Args:
         part: The episodes.
         plan: Sums up everything that decides the rows of the dataset they belong to.
         numbers: Of the episodes.
-        kind: Of the file.
 
     Raises:
         ModelError: A plan has a function without a name, or a column has a name of ours.
@@ -67,7 +60,7 @@ def encoded(part: SourceRows, plan: str, numbers: range, kind: str) -> bytes:
     }
     raw = raw_of(part.table, header)
     header["checksum"] = checksum(raw)
-    return CODECS[kind][0](raw, part.table.names)
+    return _to_parquet(raw, part.table.names)
 
 
 def raw_of(table: Dataset, header: dict[str, Any] | None = None) -> Raw:
@@ -83,13 +76,12 @@ def raw_of(table: Dataset, header: dict[str, Any] | None = None) -> Raw:
 
 
 def decoded(
-    data: bytes, kind: str, plan: str, empty: Dataset, trusted: Sequence[str]
+    data: bytes, plan: str, empty: Dataset, trusted: Sequence[str]
 ) -> tuple[range, SourceRows]:
     """Read what ``encoded`` wrote.
 
     Args:
         data: The bytes of the file.
-        kind: Of the file.
         plan: As above.
         empty: The dataset it should belong to, without rows.
         trusted: Packages whose functions may be mechanisms of its plans.
@@ -101,7 +93,7 @@ def decoded(
         ValueError: It is damaged, or belongs to another dataset; with the reason.
         ModelError: A plan names a function outside of the trusted packages.
     """
-    raw = CODECS[kind][1](data, empty.names)
+    raw = _from_parquet(data, empty.names)
     header = raw.header
     if header.get("format") != FORMAT:
         raise ValueError("it is no part of a dataset")
@@ -189,61 +181,3 @@ def _from_parquet(data: bytes, names: Sequence[str]) -> Raw:
         table[TARGETS].to_pylist(),
         np.stack(rows, axis=1) if rows else np.empty((table.num_rows, 0)),
     )
-
-
-# --- CSV --------------------------------------------------------------------------------------
-
-
-def _to_csv(raw: Raw, names: Sequence[str]) -> bytes:
-    stream = io.StringIO(newline="")
-    stream.write(f"# {json.dumps(raw.header, sort_keys=True)}\n")
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow((*RESERVED, *names))
-    whole = np.stack([raw.numbers[name] for name in NUMBERS], axis=1).tolist()
-    rows = zip(whole, raw.targets, raw.values.tolist(), strict=True)
-    writer.writerows((*ints, text, *map(repr, floats)) for ints, text, floats in rows)
-    return stream.getvalue().encode()
-
-
-def _from_csv(data: bytes, names: Sequence[str]) -> Raw:
-    first, _, rest = data.decode().partition("\n")
-    try:
-        rows = list(csv.reader(io.StringIO(rest, newline="")))
-    except csv.Error as error:
-        raise ValueError(f"it is no whole CSV file ({error})") from None
-    if not rows or rows[0] != [*RESERVED, *names]:
-        raise ValueError("it has other columns")
-    for number, row in enumerate(rows[1:], start=1):
-        if len(row) != len(rows[0]):
-            raise ValueError(f"row {number} has {len(row)} cells, not {len(rows[0])}")
-    k = len(NUMBERS)
-    numbers = np.array([row[:k] for row in rows[1:]], dtype=np.int64).reshape(-1, k)
-    values = np.array([row[k + 1 :] for row in rows[1:]], dtype=np.float64)
-    raw = Raw(
-        json.loads(first.removeprefix("# ")),
-        dict(zip(NUMBERS, numbers.T.copy(), strict=True)),
-        [row[k] for row in rows[1:]],
-        values.reshape(len(rows) - 1, len(names)),
-    )
-    if _to_csv(raw, names) != data:  # the same numbers, in other words
-        raise ValueError("it was written by another program")
-    return raw
-
-
-CODECS: dict[str, tuple[Encode, Decode]] = {
-    "parquet": (_to_parquet, _from_parquet),
-    "csv": (_to_csv, _from_csv),
-}
-
-
-def check_kind(kind: str) -> None:
-    """Check that files of a kind can be written, before time is spent on filling them.
-
-    Raises:
-        UnknownOption: There is no such kind.
-        MissingExtra: What it needs is not installed.
-    """
-    if kind not in CODECS:
-        raise UnknownOption("format", kind, tuple(CODECS))
-    if kind == "parquet":
-        load_library("pyarrow.parquet", "pyarrow", "data")

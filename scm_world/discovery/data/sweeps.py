@@ -278,7 +278,6 @@ def sweep(
     n: int = 50,
     out: Location | str | None = None,
     shard: int = SHARD,
-    format: str = "parquet",  # noqa: A002 # as other libraries call it
     workers: int | None = None,
     engine: Executor | str | None = None,
     progress: Progress | None = None,
@@ -298,7 +297,6 @@ def sweep(
         n: Episodes at each point.
         out: A folder, or a URL, for the episodes and the table.
         shard: How many episodes are in one of its files, and run by a worker in one piece.
-        format: Of these files: ``"parquet"`` or ``"csv"``.
         workers: See ``collect``.
         engine: Likewise.
         progress: Called with how many episodes are done, and how many there will be.
@@ -336,7 +334,6 @@ def sweep(
             seed=circumstances.seed,
             out=out,
             shard=shard,
-            format=format,
             progress=progress,
             workers=workers,
             engine=engine,
