@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from inspect import signature
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from scm_world import SCM, Derived, Linear
+from scm_world.discovery.data import Column, Design, collect
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.learners import EstimatedGraph, learn, learners, registry
 from scm_world.discovery.learners.known import OTHERS
 from scm_world.errors import MissingExtra, UnknownOption
+from scm_world.variables import Normal
 
 DEFAULTS = {
     each.name: {
@@ -84,9 +89,60 @@ def own(data: Dataset, *, seed: int = 0, factor: float = 1.0) -> Sequence[Sequen
 
 def test_a_learner_of_ones_own() -> None:
     """A function somewhere is a learner, by the name of its module and its own."""
-    found = learn(f"{__name__}:own", DATA, factor=2.0)
+    found = learn(f"{__name__}:own", DATA, shuffle=False, factor=2.0)
     assert found.directed == (("x", "y", 0),)
     assert found.settings == {"factor": 2.0}
+
+
+def seen(data: Dataset, *, seed: int = 0) -> Any:
+    """Return a graph whose note lists the columns in the order in which they are seen."""
+    matrix = np.triu(np.ones((len(data.names),) * 2), 1)
+    return EstimatedGraph.of(data.names, matrix, notes=(" ".join(data.names),))
+
+
+def test_learners_see_columns_in_an_order_drawn_from_the_seed() -> None:
+    """The graph has them in the order of the table, which ``shuffle=False`` keeps."""
+    table = Dataset.of(np.random.default_rng(0).normal(size=(9, 6)), "abcdef")
+    found = [learn(f"{__name__}:seen", table, seed=seed) for seed in (0, 0, 1, 2, 3)]
+    orders = [graph.notes[0].split() for graph in found]
+    assert orders[0] == orders[1]
+    assert len({*map(tuple, orders)}) == 4
+    for graph, order in zip(found, orders, strict=True):
+        assert graph.names == table.names
+        assert {(c, e) for c, e, _ in graph.directed} == {*combinations(order, 2)}
+    kept = learn(f"{__name__}:seen", table, shuffle=False)
+    assert kept.notes[0] == "a b c d e f"
+    with pytest.raises(UnknownOption, match="seed"):
+        learn("empty", table, seed=-1)
+
+
+def test_an_order_of_columns_in_time_is_drawn_too() -> None:
+    """Earlier columns follow; vectors and lags are taken together as without."""
+    values = np.random.default_rng(0).normal(size=(40, 3))
+    columns = (Column("v[0]", "v", 0), Column("v[1]", "v", 1), Column("y", "y"))
+    table = replace(
+        Dataset.of(values, "abc", episode=np.repeat([0, 1], 20), step=[*range(20)] * 2),
+        columns=columns,
+    )
+    for level, names in (("variable", ("v", "y")), ("component", ("v[0]", "v[1]", "y"))):
+        assert learn("bipartite", table, level=level).names == names
+        drawn = learn("do_order", table, level=level).edges
+        assert (drawn == learn("do_order", table, level=level, shuffle=False).edges).all()
+
+
+def test_declaration_is_no_hint() -> None:
+    """A baseline that looks at no data does not read the causal order off the columns."""
+    one = Linear(weights=(1.0,))
+    line = [Derived(name="a", parents=(), mechanism=Linear(weights=()), noise=Normal())]
+    line += [
+        Derived(name=effect, parents=(cause,), mechanism=one, noise=Normal())
+        for cause, effect in pairwise("abcdef")
+    ]
+    table = collect(SCM(line), Design(), 30)
+    true = {(cause, effect, 0) for cause, effect in pairwise("abcdef")}
+    found = [{*learn("bipartite", table, seed=seed).directed} for seed in range(20)]
+    assert 1.0 < np.mean([len(true & edges) for edges in found]) < 4.0
+    assert true <= {*learn("bipartite", table, shuffle=False).directed}
 
 
 def test_the_document_lists_them() -> None:

@@ -12,12 +12,15 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import user_learners
 
+from scm_world import SCM, Derived, Linear
 from scm_world.discovery import BenchmarkResult, TaskView, benchmark
 from scm_world.discovery.benchmarks import BenchmarkRun, run_path
 from scm_world.discovery.problems import problem, random_model
@@ -29,6 +32,7 @@ from scm_world.errors import (
     UnreadableFile,
 )
 from scm_world.graph import to_json
+from scm_world.variables import Normal
 
 SMALL: dict[str, Any] = {
     "problems": ["er2:5"],
@@ -134,6 +138,21 @@ def test_models_are_problems(tmp_path: Path) -> None:
     assert {run.status for run in result.runs} == {"done"}
     again = benchmark(["pooled"], [*models, "er2:4"], budgets=[40], seeds=1, out=tmp_path / "r")
     assert [run.key for run in again.runs] == [run.key for run in result.runs]
+
+
+def test_the_order_of_declaration_is_no_hint() -> None:
+    """Of a model declared in causal order, each seed permutes the columns, for every learner."""
+    line = [Derived(name="a", parents=(), mechanism=Linear(weights=()), noise=Normal())]
+    line += [
+        Derived(name=effect, parents=(cause,), mechanism=Linear(weights=(1.0,)), noise=Normal())
+        for cause, effect in pairwise("abcde")
+    ]
+    learners = ["user_learners:rightward", "bipartite"]
+    result = benchmark(learners, [SCM(line)], [40], seeds=4, data=["observational"])
+    mine, theirs = ([r for r in result.runs if r.learner == name] for name in learners)
+    assert all(run.found.names == tuple("abcde") for run in result.runs if run.found)
+    assert np.mean([run.scores["recall"] for run in mine]) < 0.8
+    assert [run.scores["shd"] for run in mine] == [run.scores["shd"] for run in theirs]
 
 
 def test_nothing_is_written_without_a_folder(

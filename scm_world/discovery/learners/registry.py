@@ -12,10 +12,12 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from scm_world.discovery.data.dataset import Dataset, Level
+from scm_world._arguments import whole_number
+from scm_world.discovery.data.dataset import Dataset, Level, block
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.graph.ancestral import CIRCLE
+from scm_world.variables import Noise
 
 Source = Literal["observational", "interventional", "paired"]
 SOURCES: tuple[Source, ...] = ("observational", "interventional", "paired")
@@ -133,31 +135,51 @@ def learner(name: str) -> Learner:
 
 
 def learn(
-    given: Learner | str, data: Any, *, seed: int = 0, level: Level = "variable", **settings: Any
+    given: Learner | str,
+    data: Any,
+    *,
+    seed: int = 0,
+    level: Level = "variable",
+    shuffle: bool = True,
+    **settings: Any,
 ) -> EstimatedGraph:
     """Estimate a graph with a learner.
+
+    A table has its columns in the order in which variables were declared, causes before effects,
+    and the result of many searches depends on it. So the learner is given them in an order that
+    is drawn from the seed; the graph has them in the order of the table.
 
     Args:
         given: A learner, or its name.
         data: A ``Dataset``, or a ``PairedSimulator`` for a learner that does its own experiments.
             Earlier control steps are put beside each row of a dataset with several rows per
             episode, if the learner does not use time by itself.
-        seed: Of what the learner draws.
+        seed: Of what the learner draws, and of the order of the columns.
         level: ``"variable"`` for one node per variable, its components taken together;
             ``"component"`` for one per column.
+        shuffle: Whether the order of the columns is drawn; False to keep that of the table.
         settings: Of the learner.
 
     Raises:
-        UnknownOption: There is no such learner or setting.
+        UnknownOption: There is no such learner or setting, or the seed is no whole number from 0.
         MissingExtra: What it needs is not installed.
         ModelError: It cannot use such data, or gave something that is no graph of these columns.
+
+    Source:
+        https://github.com/felixleopoldo/benchpress/issues/129: results of a benchmark whose columns
+        were in causal order.
     """
+    whole_number("seed", seed, least=0)
     chosen = learner(given) if isinstance(given, str) else given
     known = _settings_of(chosen)
     _check(chosen, known, settings, data)
     table = data
-    if isinstance(data, Dataset) and data.is_temporal and not chosen.temporal:
-        table = data.lagged()
+    if isinstance(data, Dataset):
+        if shuffle:
+            drawn = Noise(seed).uniforms("order of columns", n=len(data.names))[0]
+            table = data.select([data.names[i] for i in np.argsort(drawn).tolist()])
+        if data.is_temporal and not chosen.temporal:
+            table = table.lagged()
     if "blocks" in known:  # groups that are distinguished are tested separately
         settings = {"blocks": level == "variable", **settings}
     started = time.perf_counter()
@@ -168,6 +190,11 @@ def learn(
     found = result if isinstance(result, EstimatedGraph) else EstimatedGraph.of(table.names, result)
     if isinstance(table, Dataset):
         found = _folded(found, table, level)
+        place: dict[str, int] = {}
+        for i, column in enumerate(data.columns):
+            for name in (column.name, block(column), column.variable, column.name.split("@-")[0]):
+                place.setdefault(name, i)
+        found = found.restricted(sorted(found.names, key=place.__getitem__))
     version = {chosen.package: chosen.version or ""} if chosen.package else {}
     return replace(
         found,
