@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -89,7 +87,8 @@ def discover(
             with commas between them.
         probes: Number of states to experiment in.
         strict: Exit 1 if the SHD is not 0.
-        learner: Learners to benchmark, with commas; see 'scm-world list'.
+        learner: Learners to benchmark, with commas; see 'scm-world list'. A custom one is
+            module:function or file.py:function.
         baselines: Trivial ones beside learners from data.
         data: Of the benchmark: observational, interventional or paired, with commas; by default
             what each learner can use best.
@@ -250,8 +249,6 @@ def _benchmark(
     from scm_world.policies.scripted import NAMED
 
     problems, learners, (budget, seeds, timeout) = split(task), split(named[0]), spent
-    if ":" in named[0]:  # a custom learner, beside where the command is called
-        sys.path.insert(0, str(Path.cwd()))
     beside = [name for name in trivial() if named[1] and name not in learners]
     if not any(find(name).marked for name in learners):
         beside = [name for name in beside if not find(name).marked]

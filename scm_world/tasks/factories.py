@@ -20,11 +20,29 @@ OWN_TASKS = ("scm_world.tasks.model:ModelTask",)
 
 
 def load_factory(reference: str) -> Callable[..., Any]:
-    """Import a function; of a causal model, one that returns it.
+    """Import a function; of a causal model, return one that returns it.
+
+    Arguments and errors are those of ``load_named``.
+
+    Raises:
+        UnknownOption: It is neither.
+    """
+    found = load_named(reference, "task")
+    if isinstance(found, SCM):
+        return lambda: found
+    if not callable(found):
+        raise UnknownOption("task", reference, ("a function or an SCM",))
+    made: Callable[..., Any] = found
+    return made
+
+
+def load_named(reference: str, what: str) -> Any:
+    """Import an object of a module or a file; a file is run again only if it has changed.
 
     Args:
         reference: ``"package.module:name"``, looked up in the present folder too, or
             ``"path/file.py:name"``.
+        what: The kind of object, for messages.
 
     Raises:
         UnknownOption: There is no such module or file, or nothing of this name in it.
@@ -34,13 +52,17 @@ def load_factory(reference: str) -> Callable[..., Any]:
     if home.endswith(".py"):
         path = Path(home)
         if not path.is_file():
-            raise UnknownOption("task", reference, (f"a file that exists, not {home}",))
+            raise UnknownOption(what, reference, (f"a file that exists, not {home}",))
         module_name = f"scm_world_factory_{path.stem}"
-        spec: Any = importlib.util.spec_from_file_location(module_name, path)
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[module_name] = module
-        with blamed(home):
-            spec.loader.exec_module(module)
+        state = str(path.resolve()), path.stat().st_mtime_ns, path.stat().st_size
+        module: Any = sys.modules.get(module_name)
+        if getattr(module, "__scm_world_state__", None) != state:
+            spec: Any = importlib.util.spec_from_file_location(module_name, path)
+            module = importlib.util.module_from_spec(spec)
+            sys.modules[module_name] = module
+            with blamed(home):
+                spec.loader.exec_module(module)
+            module.__scm_world_state__ = state
     else:
         here = os.getcwd()
         added = here not in sys.path
@@ -51,19 +73,15 @@ def load_factory(reference: str) -> Callable[..., Any]:
                 module = importlib.import_module(home)
         except ModelError as error:
             if isinstance(error.__cause__, ModuleNotFoundError):
-                raise UnknownOption("task", reference, (f"a module: {error.__cause__}",)) from error
+                raise UnknownOption(what, reference, (f"a module: {error.__cause__}",)) from error
             raise
         finally:
             if added and here in sys.path:
                 sys.path.remove(here)
-    found: Any = getattr(module, name, None)
-    if isinstance(found, SCM):
-        return lambda: found
-    if not callable(found):
+    if not hasattr(module, name):
         offered = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
         raise UnknownOption(f"function in {home}", name, offered)
-    made: Callable[..., Any] = found
-    return made
+    return getattr(module, name)
 
 
 def refuse_untrusted(task: str, trusted: Sequence[str] | None) -> None:

@@ -43,6 +43,38 @@ def test_those_with_data_see_one_edge() -> None:
     assert learn("sort_regress", table).directed == (("block.mass", "block.speed", 0),)
 
 
+@pytest.mark.parametrize("set_rows", [(60, 0), (60, 900), (900, 60), (200, 200)])
+def test_how_many_rows_there_are_turns_no_edge(set_rows: tuple[int, int]) -> None:
+    """Correlation points from the column that was set, however often, to the one that follows."""
+    first, second = set_rows
+    targets: list[tuple[str, ...]] = [("x",)] * first + [("y",)] * second + [()] * 400
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=len(targets))
+    y = np.where([t == ("y",) for t in targets], 0.0, x) + rng.normal(size=len(targets))
+    for names, values in (("xy", [x, y]), ("yx", [y, x])):
+        table = Dataset.of(np.stack(values, axis=1), names, targets=targets)
+        assert learn("correlation", table).directed == (("x", "y", 0),)
+        assert learn("correlation", table, shuffle=False).undirected == ()
+
+
+def test_correlation_without_interventions_has_no_direction() -> None:
+    """The same where both columns are set in too few rows to show anything."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=300)
+    for few in (0, 9):
+        targets = [("x",)] * few + [("y",)] * few + [()] * (300 - 2 * few)
+        table = Dataset.of(np.stack([x, x + rng.normal(size=300)], 1), "xy", targets=targets)
+        found = learn("correlation", table)
+        assert (found.directed, found.undirected) == ((), (("x", "y"),))
+
+
+def test_a_table_from_elsewhere_does_not_say_what_has_causes() -> None:
+    """Its columns are causes where they were set, and outcomes otherwise."""
+    table = Dataset.of(np.ones((2, 3)), "xyz", targets=[(), ("y",)])
+    assert {c for c, *_ in learn("bipartite", table).directed} == {"y"}
+    assert {column.kind for column in table.columns} == {"unknown"}
+
+
 def test_variance_gives_the_order_away_unless_it_is_taken_away() -> None:
     """Sorting by variance nearly solves er2 and fails on iscm2 (Reisach et al. 2021)."""
 

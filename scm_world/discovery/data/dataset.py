@@ -37,8 +37,10 @@ class Column:
         variable: Which variable it belongs to, without component and lag.
         component: Which number of it; None for a scalar.
         unit: Of the variable.
-        kind: Of the variable: ``"exogenous"``, ``"derived"``, ``"measured"``, ``"action"``.
-        role: Of the variable: ``"parameter"``, ``"state"``, ``"readout"``, ``"action"``.
+        kind: Of the variable: ``"exogenous"``, ``"derived"``, ``"measured"``, ``"action"``; or
+            ``"unknown"``, in a table from elsewhere.
+        role: Of the variable: ``"parameter"``, ``"state"``, ``"readout"``, ``"action"``, or
+            ``"unknown"``.
         dtype: ``"real"``, ``"integer"`` or ``"categorical"``.
         lag: How many control steps before the row it was measured.
         how: What was taken of an episode: ``"final"``, ``"mean"``, …; ``"value"`` of an instant.
@@ -48,8 +50,8 @@ class Column:
     variable: str
     component: int | None = None
     unit: str = "1"
-    kind: str = "exogenous"
-    role: str = "parameter"
+    kind: str = "unknown"
+    role: str = "unknown"
     dtype: str = "real"
     lag: int = 0
     how: str = "value"

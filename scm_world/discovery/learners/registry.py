@@ -17,6 +17,7 @@ from scm_world.discovery.data.dataset import Dataset, Level, block
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.graph.ancestral import CIRCLE
+from scm_world.tasks.factories import load_named
 from scm_world.variables import Noise
 
 Source = Literal["observational", "interventional", "paired"]
@@ -109,24 +110,25 @@ def baselines() -> tuple[str, ...]:
 
 
 def learner(name: str) -> Learner:
-    """Find a learner by its name, or by ``"module:attribute"`` of a ``Learner`` or a function.
+    """Find a learner by its name, or by where a ``Learner`` or a function is.
 
     A function is taken for one that uses observational and interventional data.
 
+    Args:
+        name: Of a known one, ``"module:attribute"``, or ``"path/file.py:attribute"``.
+
     Raises:
         UnknownOption: There is none.
+        ModelError: The module raised an error.
     """
+    if not isinstance(name, str):
+        raise UnknownOption("learner", name, ("the name of a learner", "a Learner"))
     if ":" not in name:
         known = learners()
         if name not in known:
-            raise UnknownOption("learner", name, (*known, "module:attribute"))
+            raise UnknownOption("learner", name, (*known, "module:attribute", "file.py:attribute"))
         return known[name]
-    module, _, attribute = name.partition(":")
-    try:
-        found = getattr(import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        allowed = (f"module:attribute of a module that can be imported ({error})",)
-        raise UnknownOption("learner", name, allowed) from None
+    found = load_named(name, "learner")
     if isinstance(found, Learner):
         return found
     if not callable(found):
@@ -170,7 +172,7 @@ def learn(
         were in causal order.
     """
     whole_number("seed", seed, least=0)
-    chosen = learner(given) if isinstance(given, str) else given
+    chosen = given if isinstance(given, Learner) else learner(given)
     known = _settings_of(chosen)
     _check(chosen, known, settings, data)
     table = data

@@ -51,7 +51,7 @@ def roles(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
 def all_or_nothing(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
     """Let a cause act on every outcome if it is correlated with one of them, else on none."""
     possible = _sides(data)
-    strength = np.where(possible, _correlated(data), 0.0)
+    strength = np.where(possible, _correlated(data)[0], 0.0)
     acts = strength.max(axis=1, initial=0.0) > -np.log(LEVEL / max(possible.sum(), 1))
     return EstimatedGraph.of(
         data.names,
@@ -63,14 +63,21 @@ def all_or_nothing(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
 def correlation(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
     """Join what is correlated, in rows in which the cause was set if there are such.
 
-    An edge leads from cause to outcome, as in ``bipartite``; where all are both, from the column
-    whose own rows show it more clearly. It has no direction where these are the same rows.
+    An edge leads from cause to outcome, as in ``bipartite``. Where all are both, rows in which one
+    was set tell the direction: it acts on the other if they show the correlation. How many rows
+    there are decides whether an edge is seen, not where it points: it has no direction where the
+    rows of both show it, where neither was set, and where only other rows show it.
     """
-    possible, strength = _sides(data), _correlated(data)
-    if not _is_split(data):
-        possible = (strength >= strength.T) & ~np.eye(len(possible), dtype=bool)
+    possible, (strength, own) = _sides(data), _correlated(data)
+    is_split = _is_split(data)
+    if not is_split:
+        possible = ~np.eye(len(possible), dtype=bool)
     strength = np.where(possible, strength, 0.0)
     found = strength > -np.log(LEVEL / max(possible.sum(), 1))
+    if not is_split:
+        alone = own[:, None] & ~own  # only the first one was set
+        found = (found | (alone & found.T)) & ~(alone & found).T
+        strength = np.where(found & found.T, np.maximum(strength, strength.T), strength)
     return EstimatedGraph.of(data.names, found, edge_scores=strength)
 
 
@@ -128,11 +135,14 @@ def _sides(data: Dataset) -> Bools:
     return found
 
 
-def _correlated(data: Dataset) -> Floats:
-    """Give minus the logarithm of the p-value of each correlation, shape (p, p).
+def _correlated(data: Dataset) -> tuple[Floats, Bools]:
+    """Compute minus the logarithm of the p-value of each correlation, shape (p, p).
 
     Of cause i: over the rows in which i was set, with those in which nothing was if it was always
     set to one value; over all rows if there are too few of them.
+
+    Returns:
+        The logarithms, and which causes have enough rows of their own, shape (p,).
 
     Source:
         Fisher, *On the probable error of a coefficient of correlation*, Metron 1921.
@@ -141,12 +151,13 @@ def _correlated(data: Dataset) -> Floats:
 
     values, targeted = data.values, data.targeted
     free = ~data.intervened
-    strength = np.zeros((values.shape[1],) * 2)
+    strength, own = np.zeros((values.shape[1],) * 2), np.zeros(values.shape[1], dtype=bool)
     for i in range(values.shape[1]):
         mine = targeted[:, i]
         if mine.any() and not np.ptp(values[mine, i]) > 0.0:
             mine = mine | free
-        rows: Any = values[mine] if mine.sum() >= LEAST else values
+        own[i] = targeted[:, i].any() and mine.sum() >= LEAST
+        rows: Any = values[mine] if own[i] else values
         x = rows - rows.mean(axis=0)
         norm = np.sqrt(np.square(x).sum(axis=0))
         known = (norm > 1e-12) & (norm[i] > 1e-12)
@@ -155,4 +166,4 @@ def _correlated(data: Dataset) -> Floats:
             z = np.abs(np.arctanh(r)) * np.sqrt(len(rows) - 3)
             strength[i, known] = np.maximum(-log_ndtr(-z) - np.log(2.0), 0.0)
     np.fill_diagonal(strength, 0.0)
-    return strength
+    return strength, own
