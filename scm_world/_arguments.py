@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Collection, Container, Iterable
+import re
+import sys
+from collections import abc
+from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
+from contextlib import suppress
+from functools import cache, wraps
 from importlib import import_module
-from typing import Any
+from types import UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
@@ -31,6 +37,78 @@ def one_of(option: str, value: Any, allowed: Collection[Any]) -> None:
     """
     if value not in allowed:
         raise UnknownOption(option, value, [one for one in allowed if one is not None])
+
+
+F = TypeVar("F", bound=Callable[..., Any])
+NUMBERS = {float: (int, float, np.number), int: (int, np.integer), bool: (bool, np.bool_)}
+
+
+def typed(function: F) -> F:
+    """Make a function refuse arguments of another kind than annotated; of a class, its fields.
+
+    Numbers may be those of NumPy, and sequences arrays. Annotations that are no classes allow
+    everything. Whether a number or a name is in range is for the function to say.
+    """
+    if isinstance(function, type):
+        setattr(function, "__init__", typed(function.__init__))  # noqa: B010 # mypy knows no other
+        return function
+
+    @wraps(function)
+    def call(*given: Any, **named: Any) -> Any:
+        signature, hints = _annotations(function)
+        try:
+            bound = signature.bind(*given, **named).arguments
+        except TypeError:
+            return function(*given, **named)  # Python says which one is missing, or one too many
+        for name, value in bound.items():
+            hint = hints.get(name, Any)
+            if not _fits(value, hint):
+                plain = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
+                allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {plain}",)
+                raise UnknownOption(name, value if len(repr(value)) < 80 else type(value), allowed)
+        return function(*given, **named)
+
+    return call  # type: ignore[return-value] # it has the same arguments
+
+
+@cache
+def _annotations(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[str, Any]]:
+    """Return the signature of a function, and its annotations as objects."""
+    signature, hints = inspect.signature(function), dict[str, Any]()
+    names = {**vars(sys.modules[function.__module__]), **getattr(function, "__globals__", {})}
+    for name, parameter in signature.parameters.items():
+        text = parameter.annotation
+        if isinstance(text, str) and parameter.kind not in (2, 4):  # no *arguments, no **options
+            with suppress(NameError, TypeError):  # imported for types only, or an alias as a text
+                hints[name] = eval(text, names)  # noqa: S307 # it is our own text
+    return signature, hints
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Return whether a value is of an annotated kind."""
+    kind, parts = get_origin(hint) or hint, get_args(hint)
+    if kind in (Union, UnionType):
+        return any(_fits(value, part) for part in parts)
+    if kind is Literal:
+        return isinstance(value, str) and value in parts
+    if kind is None:
+        return value is None
+    if not isinstance(kind, type) or kind is type:
+        return True
+    if kind in NUMBERS:
+        return isinstance(value, NUMBERS[kind])
+    try:
+        known = isinstance(value, Collection if kind in (Sequence, tuple) else kind)
+    except TypeError:  # a protocol that says nothing when the program runs
+        return True
+    if not known or not parts or not isinstance(value, Collection) or kind is abc.Callable:
+        return known
+    if isinstance(value, Mapping):
+        return all(_fits(key, parts[0]) for key in value)
+    each = value.tolist() if isinstance(value, np.ndarray) else value
+    if kind is tuple and parts[-1] is not ...:
+        return len(each) == len(parts) and all(map(_fits, each, parts))
+    return all(_fits(one, parts[0]) for one in each)
 
 
 def load(module: str, library: str, extra: str = "") -> Any:

@@ -207,7 +207,8 @@ def triplets(
         if isinstance(plain, SCM):
             raise refused(task, "is no world, so there are no pictures of it", "'SYSTEM'")
         free = [name for name in plain.model if plain.model.declared(name).space("A") is not None]
-        names = [name for name in settable(plain, factor or ["*color"]) if name in free]
+        asked = settable(plain, factor or ["*color"])
+        names = [name for name in asked if name in free] or asked
         with (
             plain.given(parse_assignments(given, "'--do'")) as system,
             console.resumable(folder, "triplets-*.*", "files"),

@@ -19,6 +19,7 @@ from scm_world.cli.arguments import (
     load_system,
     load_task,
     open_system,
+    refuse_settings,
     split,
     tag,
 )
@@ -240,7 +241,7 @@ def _benchmark(
     out: Location | None,
 ) -> None:
     """Run learners over budgets and seeds; print a table per problem."""
-    from scm_world.discovery.benchmark_report import HEADS, MARKED, columns, summary
+    from scm_world.discovery.benchmark_report import HEADS, MARKED, columns, size, summary
     from scm_world.discovery.benchmarks import benchmark, slug
     from scm_world.discovery.learners.registry import baselines as trivial
     from scm_world.discovery.learners.registry import learner as find
@@ -284,7 +285,7 @@ def _benchmark(
             progress=tell,
         )
     for (name, both), oracles in product(summary(result).items(), (False, True)):
-        truth, rows = result.problems[name], [row for row in both if row.is_oracle == oracles]
+        rows = [row for row in both if row.is_oracle == oracles]
         most = max((row.run.budget for row in rows), default=0)
         rows = [row for row in rows if row.run.learner not in beside or row.run.budget == most]
         if not rows:
@@ -292,12 +293,11 @@ def _benchmark(
         there = columns(rows)
         brief = BRIEF_MARKS if any(column.key == "pag_distance" for column in there) else BRIEF
         shown = [column for column in there if column.key in (*brief, *MARKED)]
-        size = f"{len(truth.names)} variables, {len(truth.edges)} true edges"
-        size += f", {len(truth.confounded)} pairs with hidden causes" * bool(truth.confounded)
+        about = size(result, name)
         spreads = next((r.spreads for r in rows if "variance_sortability" in r.spreads), {})
         for key, title in (("variance", "varsortability"), ("r2", "R²-sortability")):
             if f"{key}_sortability" in spreads:
-                size += f", {title} {spreads[f'{key}_sortability'].mean:.2f}"
+                about += f", {title} {spreads[f'{key}_sortability'].mean:.2f}"
         console.table(
             (*HEADS[1:], *(column.title for column in shown)),
             [  # the means over seeds; the ranges are in report.html
@@ -310,7 +310,7 @@ def _benchmark(
                 )
                 for row in rows
             ],
-            title=f"{truth.name}: {size}" + "; oracles with access to the simulator" * oracles,
+            title=f"{name}: {about}" + "; oracles with access to the simulator" * oracles,
         )
     ended = Counter((r.learner, r.problem, r.message) for r in result.runs if r.status != "done")
     for (name, problem, reason), runs in ended.items():
@@ -364,7 +364,9 @@ def verify(
         system = loaded[name]
         settings: dict[str, Any] = {"probes": probes, "least": min(LEAST, probes), "seed": seed}
         settings["held_out"] = held_out
-        if not isinstance(system, SCM):
+        if isinstance(system, SCM):
+            refuse_settings(backend=backend, preset=preset, resolution=resolution)
+        else:
             settings |= {"preset": preset, "resolution": resolution}
             settings |= {} if both else {"backend": backend}
         one: Verification | Agreement

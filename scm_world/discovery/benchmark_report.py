@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, final
 
 import numpy as np
 
+from scm_world._arguments import typed
 from scm_world.discovery.benchmarks import BenchmarkResult, BenchmarkRun
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import baselines
@@ -213,6 +214,20 @@ def counted(result: BenchmarkResult) -> str:
     )
 
 
+def size(result: BenchmarkResult, name: str) -> str:
+    """Say how large the graph of a problem is; a range where seeds have graphs of their own."""
+    first = result.problems[name]
+    truths = [first, *(result.truth_of(run) for run in result.runs if run.problem == name)]
+
+    def many(counts: set[int]) -> str:
+        return f"{min(counts)} to {max(counts)}" if len(counts) > 1 else f"{min(counts)}"
+
+    text = f"{len(first.names)} variables, {many({len(t.edges) for t in truths})} true edges"
+    hidden = {len(t.confounded) for t in truths}
+    text += f", {many(hidden)} pairs with hidden causes" * any(hidden)
+    return text + f", {len(first.unscored)} pairs not scored" * bool(first.unscored)
+
+
 def write_files(result: BenchmarkResult, folder: Location) -> None:
     """Write ``results.csv``, ``budget.png`` and ``report.html``; a missing number is empty."""
     write_whole(_csv(result), folder / "results.csv")
@@ -341,6 +356,7 @@ class Link(NamedTuple):
         return f"{self.cause} {between} {self.effect}" + f", t−{self.lag}" * (self.lag > 0)
 
 
+@typed
 def compare(truth: GroundTruth, found: EstimatedGraph) -> list[Link]:
     """Compare an estimated graph with the true one: one link per edge, sorted.
 
@@ -418,7 +434,8 @@ def report(result: BenchmarkResult) -> str:
         for run in (run for run in result.runs if run.problem == name):
             key = (run.learner, run.data, run.standardised)
             groups[key] = max(groups.get(key, run), run, key=lambda r: (r.budget, -r.seed))
-        problems.append((truth, [_compared(result.truth_of(run), run) for run in groups.values()]))
+        compared = [_compared(result.truth_of(run), run) for run in groups.values()]
+        problems.append((truth, size(result, name), compared))
     rows = [row for found in summary(result).values() for row in found]
     return render(
         "discovery/benchmark_report.html",

@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, final
 import numpy as np
 from pydantic import FiniteFloat, PlainValidator, TypeAdapter
 
-from scm_world._arguments import load, whole_number
+from scm_world._arguments import load, typed, whole_number
 from scm_world.discovery.data import Dataset
 from scm_world.discovery.data.truth import Pair
 from scm_world.discovery.learners.found import EstimatedGraph
@@ -187,6 +187,7 @@ class BenchmarkResult:
         write_files(self, located(folder))
 
     @classmethod
+    @typed
     def read(cls, folder: Location | str) -> BenchmarkResult:
         """Read the folder of a benchmark.
 
@@ -218,6 +219,7 @@ def _as_json(plain: Any) -> str:
 # --- the benchmark --------------------------------------------------------------------------------
 
 
+@typed
 def benchmark(
     learners: Sequence[str],
     problems: Sequence[str | SCM],
@@ -595,8 +597,7 @@ class _Runner:
         table = None
         if job.run.data != "paired":
             whole = self._data[job.run.data]
-            each = len(whole) / len(np.unique(whole.episode))
-            part = whole.first(math.ceil(job.run.budget / each))
+            part = whole.rows(slice(job.run.budget))
             table = part.standardised() if job.run.standardised else part
         started = time.perf_counter()
         try:

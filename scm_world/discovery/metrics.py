@@ -8,6 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import typed
 from scm_world._types import Floats, Integers
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.data.truth import GroundTruth
@@ -20,8 +21,9 @@ from scm_world.discovery.distances import (
     shd_of_classes,
     sid_bounds,
 )
-from scm_world.discovery.learners.found import EstimatedGraph
+from scm_world.discovery.learners.found import EstimatedGraph, edge_keys
 from scm_world.errors import ModelError, UnknownVariable, raise_all
+from scm_world.graph import SCM
 from scm_world.graph.ancestral import HEAD, TAIL
 from scm_world.graph.equivalence import Bools, extension, is_acyclic, meets, topological_order
 from scm_world.queries.experiments.effects import EdgeKey
@@ -60,7 +62,7 @@ def score(found: Iterable[EdgeKey], declared: Iterable[EdgeKey]) -> GraphScore:
         >>> score([("a", "b", 0), ("c", "b", 1)], [("b", "a", 0), ("c", "b", 1)]).shd
         1
     """
-    found_set, declared_set = set(found), set(declared)
+    found_set, declared_set = set(edge_keys(found)), set(edge_keys(declared))
     common = found_set & declared_set
     undeclared, missed = found_set - declared_set, declared_set - found_set
     reversed_ = {
@@ -89,11 +91,14 @@ class Scores:
     Attributes:
         shd: Structural Hamming distance, over all lags. An edge without direction counts 1 where
             it is wrong and 1 where it is right.
-        shd_by_lag: The same for each lag, from 0 on. shd_classes: Between the two essential graphs.
-        Only without lags. precision: Estimated edges with a direction that are true, as a fraction;
-        1 if there are none. recall: True edges that were estimated with their direction, as a
-        fraction; 1 if there is none. f1: Harmonic mean of the two. false_discoveries: Estimated
-        edges with a direction that are not true, as a fraction; 0 if
+        shd_by_lag: The same for each lag, from 0 on.
+        shd_classes: Between the two essential graphs. Only without lags.
+        precision: Estimated edges with a direction that are true, as a fraction; 1 if there are
+            none.
+        recall: True edges that were estimated with their direction, as a fraction; 1 if there is
+            none.
+        f1: Harmonic mean of the two.
+        false_discoveries: Estimated edges with a direction that are not true, as a fraction; 0 if
             there are none.
         skeleton_precision: As above, without regard to directions within an instant.
         skeleton_recall: As above.
@@ -145,9 +150,10 @@ class Scores:
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
 
+@typed
 def evaluate(
     found: EstimatedGraph,
-    declared: Iterable[EdgeKey],
+    declared: Iterable[EdgeKey] | GroundTruth | SCM,
     *,
     names: Sequence[str] | None = None,
     pairs: Any = None,
@@ -160,14 +166,16 @@ def evaluate(
 
     Args:
         found: What a learner gave.
-        declared: The true edges: cause, effect, lag.
-        names: The variables to compare on; those of ``found`` if None. Variables that ``found``
-            does not have count as having no edge.
+        declared: The true edges: cause, effect, lag; or a ``GroundTruth`` or an ``SCM`` with them.
+        names: The variables to compare on; those of the ``GroundTruth``, otherwise those of
+            ``found`` if None. Variables that ``found`` does not have count as having no edge.
         pairs: Which pairs count, shape (p, p) or (lags + 1, p, p): not those that share a cause
-            nobody observes. All of them if None. A missing lag counts in full. Within an instant
-            a pair counts if it does so in both orders, and nothing acts on itself.
+            nobody observes. Those that the ``GroundTruth`` scores, otherwise all of them if None. A
+            missing lag counts in full. Within an instant a pair counts if it does so in both
+            orders, and nothing acts on itself.
 
     Raises:
+        UnknownOption: An argument is of another kind.
         UnknownVariable: A true edge is about a variable that is not compared on;
             SeveralProblems if there are more of them.
         ModelError: ``pairs`` has another shape.
@@ -182,7 +190,9 @@ def evaluate(
         >>> scores.shd, scores.sid, scores.precision, scores.skeleton_f1
         (1, 3, 0.5, 1.0)
     """
-    keys = list(declared)
+    keys = edge_keys(declared)
+    if isinstance(declared, GroundTruth) and names is None:
+        names, pairs = declared.names, declared.pairs if pairs is None else pairs
     kept = found if names is None else found.restricted(tuple(names))
     lags = max([len(kept.edges) - 1, *(lag for *_, lag in keys)])
     true = matrices(keys, kept.names, lags)
@@ -254,6 +264,7 @@ class MarkScores:
     pag_distance: int
 
 
+@typed
 def evaluate_marks(found: EstimatedGraph, truth: GroundTruth) -> MarkScores:
     """Compare the edge marks of an estimate with the ancestral graphs of a truth.
 
@@ -425,8 +436,11 @@ def auprc(edge_scores: Floats, present: Bools) -> float | None:
 
 CONSTANT = 1e-12
 """A column that varies less than this, relative to its mean, is constant."""
+EQUAL = 1e-9
+"""Variances, or R², that differ by less than this part are equal: those of two columns are."""
 
 
+@typed
 def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> float | None:
     """Predict the mean of every column under interventions that were not learned from.
 
@@ -515,17 +529,22 @@ def _over_columns(names: Sequence[str], dag: Bools, data: Dataset) -> tuple[Inte
     return where, dag[np.ix_(owner, owner)]
 
 
-def sortability(data: Dataset, edges: Iterable[EdgeKey]) -> dict[str, float]:
+@typed
+def sortability(data: Dataset, edges: Iterable[EdgeKey] | GroundTruth) -> dict[str, float]:
     """Return how well an order by variance, and one by R², agree with the true graph.
 
     Args:
         data: Rows in which nothing is done.
-        edges: True ones; lags count for nothing.
+        edges: True ones, or a ``GroundTruth``; lags count for nothing.
 
     Returns:
         ``"variance"``, and ``"r2"`` of each column given all others: the share of directed paths,
         by ends and length, along which the number grows; 0.5 by chance, NaN without paths. Near 1
-        or 0, an order that needs no causal reasoning tells directions.
+        or 0, an order that needs no causal reasoning tells directions. Constant columns have no R²:
+        paths that begin or end there do not count for it. Of fewer than two rows both are NaN.
+
+    Raises:
+        UnknownVariable: A true edge is about another column.
 
     Source:
         Reisach, Seiler and Weichwald, *Beware of the simulated DAG!*, NeurIPS 2021; Reisach, Tami,
@@ -538,21 +557,29 @@ def sortability(data: Dataset, edges: Iterable[EdgeKey]) -> dict[str, float]:
         >>> sortability(data, [("x", "y", 0)])["variance"]
         1.0
     """
-    at = {name: i for i, name in enumerate(data.names)}
-    step = np.zeros((len(at), len(at)), bool)
-    for cause, effect, _ in edges:
-        step[at[cause], at[effect]] = True
-    sums = np.cov(data.values, rowvar=False)
+    keys = edge_keys(edges)
+    step = matrices(keys, data.names, max((lag for *_, lag in keys), default=0)).any(axis=0)
+    if len(data) < 2:
+        return {"variance": float("nan"), "r2": float("nan")}
+    sums = np.atleast_2d(np.cov(data.values, rowvar=False))
     variance = np.diag(sums)
-    left = 1.0 / np.maximum(np.diag(np.linalg.pinv(sums)), np.finfo(float).tiny)
+    spread = np.sqrt(variance)
+    varies = spread > CONSTANT * (1.0 + np.abs(data.values.mean(axis=0)))
+    r2 = np.full(len(spread), np.nan)
+    scaled = (sums / np.where(varies, spread, 1.0) / np.where(varies, spread, 1.0)[:, None])[varies]
+    inverse = np.diag(np.linalg.pinv(scaled[:, varies]))
+    r2[varies] = 1.0 - 1.0 / np.maximum(inverse, np.finfo(float).tiny)
     found = {}
-    for name, order in (("variance", variance), ("r2", 1.0 - left / variance)):
-        grows = 0.5 * (1.0 + np.sign(order[None, :] - order[:, None]))
+    for name, order in (("variance", variance), ("r2", r2)):
+        more = order[None, :] - order[:, None]
+        tie = np.abs(more) <= EQUAL * np.maximum(np.abs(order), np.abs(order[:, None]))
+        grows = 0.5 * (1.0 + np.sign(np.where(tie, 0.0, more)))
+        known = np.isfinite(grows)
         paths, count, right = step, 0.0, 0.0
-        for _ in range(len(at) - 1):
+        for _ in range(len(step) - 1):
             if not paths.any():
                 break
-            count, right = count + paths.sum(), right + (paths * grows).sum()
+            count, right = count + (paths & known).sum(), right + grows[paths & known].sum()
             paths = meets(paths, step)
         found[name] = float(right / count) if count else float("nan")
     return found

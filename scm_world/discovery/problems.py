@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world import queries
+from scm_world._arguments import one_of, typed, whole_number
 from scm_world._types import Floats, Value
 from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
 from scm_world.discovery.data.recorded import first_name, settable
@@ -55,6 +56,7 @@ DONE = Normal(mean=2.0, std=1.0)
 """What interventions draw in random models by default: another mean, the same spread."""
 
 
+@typed
 def random_model(name: str, seed: int = 0) -> SCM:
     """Draw model number ``seed`` of a family, ``"er2:20"`` for 20 variables.
 
@@ -69,6 +71,7 @@ def random_model(name: str, seed: int = 0) -> SCM:
         >>> len(random_model("er2:20", seed=0))
         20
     """
+    whole_number("seed", seed, least=0)
     family, _, size = name.partition(":")
     if family not in FAMILIES or not re.fullmatch(r"[0-9]+", size) or not 2 <= int(size) <= MOST:
         shown = tuple(f"{known}:N" for known in FAMILIES)
@@ -384,6 +387,7 @@ THROWN = ((1.5, 1.8, 0.0), (2.6, -1.5, 0.0))
 MOST_STARTS = 3  # blocks that find room, each in a sector of its own
 
 
+@typed
 @final
 @dataclass(frozen=True)
 class TaskView:
@@ -417,9 +421,12 @@ class TaskView:
     arguments: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse other views."""
+        """Refuse other views and options."""
         if self.view not in VIEWS:
             raise UnknownOption("view", self.view, VIEWS)
+        known = [*inspect.signature(Simulation).parameters][1:]
+        for name in self.options:
+            one_of("option of a world", name, known)
 
 
 @final
@@ -609,6 +616,7 @@ def block_start(height: Any, number: int, count: int) -> Draw:
 # --- by name --------------------------------------------------------------------------------------
 
 
+@typed
 def problem(name: str | SCM, *, seed: int = 0, view: TaskView | None = None) -> Problem:
     """Return a benchmark problem.
 

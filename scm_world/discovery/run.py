@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, final
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world.discovery.metrics import GraphScore, score
 from scm_world.errors import DAMAGED, UnreadableFile
 from scm_world.graph import SCM
@@ -126,6 +126,7 @@ class DiscoveryReport:
         )
 
 
+@typed
 def discover(
     system: Simulation | SCM | str,
     *,

@@ -35,8 +35,8 @@ def located(given: Location | str) -> Location:
     Raises:
         MissingExtra: It is a URL of another place, and universal_pathlib or the package of the
             protocol is not installed.
-        UnknownOption: There is no such protocol, a password stands in the URL, or a URL was made
-            a ``Path``.
+        UnknownOption: It is no path, there is no such protocol, a password stands in the URL, or a
+            URL was made a ``Path``.
 
     Example:
         >>> located("runs/one").name, located("file:///runs/one%202").name
@@ -47,6 +47,8 @@ def located(given: Location | str) -> Location:
             raise UnknownOption("folder", str(given), ("a URL as a text: a Path spoils it",))
         return given
     if not isinstance(given, str):
+        if not hasattr(given, "iterdir"):
+            raise UnknownOption("path", given, ("a path, or a URL as a text",))
         return given
     protocol, slashes, rest = given.partition("://")
     if not slashes:

@@ -49,6 +49,8 @@ def load_named(reference: str, what: str) -> Any:
         ModelError: The module raised an error.
     """
     home, _, name = reference.rpartition(":")
+    if not home or not name:
+        raise UnknownOption(what, reference, ("module:name, or file.py:name",))
     if home.endswith(".py"):
         path = Path(home)
         if not path.is_file():

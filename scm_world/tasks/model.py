@@ -556,14 +556,16 @@ def model_task(source: Any, options: Mapping[str, Any], known: Callable[[], Iter
 
     if is_model(source):
         return ModelTask(source, **options)
+    made = None
     if ":" in source:
         factory = load_factory(source)
         with blamed(source):
             made = factory(**options)
         made = getattr(made, "task", made)  # of a world
-        if isinstance(made, SCM):
-            commands = "discover, verify, graph, variables, effect, counterfactual or collect"
-            allowed = ("a function that gives a task, a model or a world", commands)
-            raise UnknownOption("command for a causal model without a backend", source, allowed)
+    if isinstance(made, SCM) or source.endswith(".json"):
+        commands = "discover, verify, graph, variables, effect, counterfactual or collect"
+        allowed = ("a function that gives a task, a model or a world", commands)
+        raise UnknownOption("command for a causal model without a backend", source, allowed)
+    if ":" in source:
         return made if isinstance(made, Task) else ModelTask(made)
     raise UnknownOption("task", source, (*known(), "file.xml", "file.urdf", "module:function"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from typer.testing import CliRunner, Result
 
 from scm_world.cli import app
 from scm_world.cli.options import open_executor
+from scm_world.discovery import BenchmarkResult, problem
 from scm_world.errors import UnknownOption
 from scm_world.work.processes import cores
 
@@ -50,6 +52,36 @@ def test_failed_learners_are_printed_with_the_reason() -> None:
     assert "not done in 3 run(s): " in said
     assert "no idea at all" in said
     assert "er2:4: 4 variables" in said
+
+
+def test_the_command_of_the_guide_runs_its_learner() -> None:
+    """The guide's function in a file of the present folder is benchmarked beside do_order."""
+    text = (Path(__file__).parents[2] / "docs" / "guides" / "causality.md").read_text()
+    block = next(b for b in re.findall(r"```python\n(.*?)```", text, re.S) if "def moves" in b)
+    Path("mine.py").write_text("import numpy as np\n" + block.partition("\n\nfound =")[0])
+    command = re.search(r"`scm-world (discover [^`]*mine\.py:moves[^`]*)`", text)
+    assert command is not None
+    done = call(*command[1].split(), "--budget=30,40", "--seeds=1", "--no-baselines", "--out=out")
+    assert done.exit_code == 0, done.output
+    found = {run.learner: run for run in BenchmarkResult.read("out").runs}
+    assert {run.status for run in found.values()} == {"done"}
+    assert found["mine.py:moves"].found is not None
+    wrong = call("discover", "er2:4", "--learner=mine.py:moved")
+    assert wrong.exit_code == 2
+    assert "did you mean 'moves'" in " ".join(wrong.output.split())
+
+
+def test_the_header_of_a_benchmark_is_about_all_seeds() -> None:
+    """Each seed draws its own graph, so the title gives the fewest and the most edges."""
+    given = ("--learner=do_order", "--budget=40", "--seeds=3", "--no-baselines", "--out=out")
+    done = call("discover", "er2:6:1", *given)
+    assert done.exit_code == 0, done.output
+    truths = [problem("er2:6:1", seed=seed).truth for seed in range(3)]
+    edges, hidden = ([len(getattr(t, of)) for t in truths] for of in ("edges", "confounded"))
+    said = " ".join(done.output.split())
+    assert len({*edges}) > 1
+    assert f"6 variables, {min(edges)} to {max(edges)} true edges, {min(hidden)} to" in said
+    assert f"{min(edges)} to {max(edges)} true edges" in Path("out", "report.html").read_text()
 
 
 @pytest.mark.parametrize("command", COMMANDS)

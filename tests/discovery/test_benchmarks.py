@@ -140,6 +140,12 @@ def test_models_are_problems(tmp_path: Path) -> None:
     assert [run.key for run in again.runs] == [run.key for run in result.runs]
 
 
+def test_a_budget_is_not_exceeded() -> None:
+    """Where an episode has several rows, the last one is cut."""
+    result = benchmark(["empty"], ["tanh4:4"], [15, 36], seeds=1, standardised=False)
+    assert [run.experiments for run in result.runs] == [15, 36]
+
+
 def test_the_order_of_declaration_is_no_hint() -> None:
     """Of a model declared in causal order, each seed permutes the columns, for every learner."""
     line = [Derived(name="a", parents=(), mechanism=Linear(weights=()), noise=Normal())]

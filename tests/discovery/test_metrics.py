@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -13,7 +14,7 @@ from scm_world.discovery import distances
 from scm_world.discovery.data import Dataset, Regime
 from scm_world.discovery.distances import aid, shd, shd_of_classes, sid_bounds
 from scm_world.discovery.learners.found import EstimatedGraph
-from scm_world.discovery.metrics import auprc, auroc, effect_rmse, evaluate
+from scm_world.discovery.metrics import auprc, auroc, effect_rmse, evaluate, sortability
 from scm_world.errors import MissingExtra, ModelError, UnknownVariable
 from scm_world.graph.equivalence import Bools, cpdag, extension, topological_order
 from scm_world.queries.plans import Plan
@@ -308,3 +309,29 @@ def test_prediction_over_vectors_constants_and_undirected_edges() -> None:
     assert effect_rmse(both, train, test) == way
     alone = effect_rmse(EstimatedGraph.of_edges(("c",), []), train, test)
     assert alone is None
+
+
+def test_sortability_of_constants_and_of_one_row() -> None:
+    """A constant has no R², so its paths do not count; two columns explain one another equally."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=500)
+    values = np.c_[x, x + rng.normal(size=500), np.full(500, 2.0)]
+    table = Dataset.of(values, ["x", "y", "c"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = sortability(table, [("x", "y", 0), ("c", "y", 0)])
+        assert found == {"variance": 1.0, "r2": 0.5}
+        assert np.isnan(sortability(table, [("c", "y", 0)])["r2"])
+        for rows in (table.rows([0]), table.rows([])):
+            assert all(np.isnan(value) for value in sortability(rows, [("x", "y", 0)]).values())
+        alone = sortability(table.select(["x"]), [])
+        assert all(np.isnan(value) for value in alone.values())
+    with pytest.raises(UnknownVariable, match="'q'"):
+        sortability(table, [("q", "y", 0)])
+
+
+def test_sortability_by_r2_does_not_depend_on_units() -> None:
+    """Columns in other units explain one another as well."""
+    data, edges = chain_data().observational, [("x", "y", 0), ("y", "z", 0)]
+    other = replace(data, values=data.values * [1e-6, 1.0, 1e7])
+    assert sortability(other, edges)["r2"] == sortability(data, edges)["r2"]

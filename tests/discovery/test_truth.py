@@ -161,6 +161,14 @@ def test_dcdi_reads_what_is_written(tmp_path: Path) -> None:
     assert len(np.load(folder / "data3.npy")) == (regimes == 0).sum()
 
 
+def test_a_truth_has_the_name_of_its_system() -> None:
+    """Also where a variable that keeps its value over an episode is hidden."""
+    table = collect(memory("episode"), Design(), 2, seed=0, steps=3)
+    for shown in (table, table.hide(["k"])):
+        assert shown.truth is not None
+        assert shown.truth.name == "model"
+
+
 def test_dcdi_gets_hidden_targets_as_a_regime(tmp_path: Path) -> None:
     """Its observational file and regime 0 have no rows in which a hidden column was set."""
     whole = collect(line(), Design("single", ("a", "b"), 2.0, 0.4), 60)

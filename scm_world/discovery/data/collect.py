@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, TypedDict, Unpack
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.data.designs import Design
 from scm_world.discovery.data.folders import SHARD, Folder, Head, refusals, together
@@ -42,6 +42,7 @@ class Circumstances(TypedDict, total=False):
     pictures: Pictures | None
 
 
+@typed
 def collect(
     source: SCM | Simulation | Laboratory | DataSource,
     design: Design,

@@ -7,7 +7,7 @@ import io
 import json
 from typing import Any
 
-from scm_world._arguments import load
+from scm_world._arguments import load, typed
 from scm_world.errors import UnreadableFile
 from scm_world.output.durable import write_durably
 from scm_world.output.remote import Location, located
@@ -37,6 +37,7 @@ CONTEXT = {
 }
 
 
+@typed
 def as_huggingface(folder: Location | str, **about: Any) -> Location:
     """Describe a folder of ``triplets`` or ``collect``, as it can be uploaded to Hugging Face.
 

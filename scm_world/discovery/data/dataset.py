@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, final
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable
 from scm_world.queries.plans import Plan
@@ -155,6 +156,7 @@ class Dataset:
             raise ModelError(problems)
 
     @classmethod
+    @typed
     def of(
         cls,
         values: Any,
@@ -216,6 +218,7 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.values)
 
+    @typed
     def __getitem__(self, name: str) -> Floats:
         """Give a column, shape (n,), or all columns of a vector, shape (n, k)."""
         if name in self.names:
@@ -329,6 +332,7 @@ class Dataset:
         names = dict.fromkeys(column.variable for column in self.columns if not column.lag)
         return observed_part(str(self.about.get("system", "table")), written, tuple(names))
 
+    @typed
     def adjacency(self, lag: int = 0) -> Bools:
         """Give the true edges of a lag between columns, shape (p, p): row causes column.
 
@@ -338,6 +342,7 @@ class Dataset:
         found: Bools = self.weights(lag) != 0.0
         return found
 
+    @typed
     def weights(self, lag: int = 0) -> Floats:
         """Give the weights of true edges between columns, shape (p, p): row causes column.
 
@@ -356,6 +361,7 @@ class Dataset:
                 found[where] = truth.weights.get((cause, effect, steps), np.nan)
         return found
 
+    @typed
     def hide(self, names: Iterable[str]) -> Dataset:
         """Leave out columns or variables; ``truth`` then has them as hidden causes.
 
@@ -373,8 +379,16 @@ class Dataset:
     # --- other tables -------------------------------------------------------------------------
 
     def rows(self, chosen: Any) -> Dataset:
-        """Take some rows: a mask, numbers or a slice."""
-        taken = np.arange(len(self))[chosen]
+        """Take some rows: a mask, numbers or a slice.
+
+        Raises:
+            UnknownOption: It is none of these, or too long.
+        """
+        try:
+            taken = np.arange(len(self))[chosen].reshape(-1)
+        except IndexError:
+            allowed = (f"a mask of {len(self)} rows", "whole numbers of rows", "a slice")
+            raise UnknownOption("rows", chosen, allowed) from None
         return replace(
             self,
             values=self.values[taken],
@@ -383,6 +397,7 @@ class Dataset:
             step=self.step[taken],
         )
 
+    @typed
     def select(self, names: Iterable[str]) -> Dataset:
         """Take some columns or variables, in the order given."""
         where: list[int] = []
@@ -402,6 +417,7 @@ class Dataset:
         """The rows in which nothing was done, to columns or to variables that are in none."""
         return self.rows(~self.intervened)
 
+    @typed
     def first(self, episodes: int) -> Dataset:
         """Take the rows of the first episodes, in their order."""
         kept = np.unique(self.episode)[:episodes]
@@ -417,6 +433,7 @@ class Dataset:
         about = {**self.about, "standardised": True}
         return replace(self, values=(scaled - mean) / spread, about=about)
 
+    @typed
     def lagged(self, lags: int = 1) -> Dataset:
         """Put earlier control steps beside each row, as further columns ``name@-1``.
 
@@ -428,6 +445,7 @@ class Dataset:
             >>> table.lagged().names, table.lagged().values.tolist()
             (('x', 'x@-1'), [[2.0, 1.0]])
         """
+        whole_number("lags", lags, least=0)
         rows = np.arange(len(self))
         whole = rows[
             (rows >= lags)
@@ -448,6 +466,7 @@ class Dataset:
         )
 
     @classmethod
+    @typed
     def joined(cls, parts: Sequence[Dataset]) -> Dataset:
         """Put tables of one kind below one another.
 
@@ -455,7 +474,7 @@ class Dataset:
             ModelError: They differ in columns or in where they come from, two have the same
                 episodes, or there is none.
         """
-        if not parts:
+        if not len(parts):
             raise ModelError(["there is no table to join"])
         first = parts[0]
         for part in parts[1:]:
@@ -529,7 +548,7 @@ def numbers(values: Any, names: Sequence[str]) -> Floats:
             with suppress(ValueError):
                 array = np.array(column.tolist())
         if array.ndim != 1 or array.dtype.kind not in "biuf":
-            first = type(next(iter(array.tolist()), None)).__name__
+            first = type(next(iter(np.atleast_1d(array).tolist()), None)).__name__
             other = f"values of type {first}", "give one number in each row"
             what, advice = KINDS.get(array.dtype.kind, other)
             wrong.append(f"the column {name!r} holds {what}, not real numbers: {advice}")

@@ -10,6 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import typed
 from scm_world.discovery.data.dataset import SEEN, Bools, Ints, Regime
 from scm_world.errors import UnknownOption
 from scm_world.queries.plans import Plan
@@ -24,6 +25,7 @@ STREAM = "design"
 """The stream of what a design draws by lot."""
 
 
+@typed
 @final
 @dataclass(frozen=True)
 class Design:

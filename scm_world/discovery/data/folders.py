@@ -12,7 +12,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import load as load_library
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
 from scm_world.discovery.data.pictures import ENDINGS
 from scm_world.discovery.data.shards import (
@@ -286,6 +286,7 @@ def head_of(found: Mapping[str, Any]) -> Head:
 # --- whole datasets -------------------------------------------------------------------------------
 
 
+@typed
 def load(folder: Location | str, *, trusted: Sequence[str] = (), partial: bool = False) -> Dataset:
     """Read a dataset.
 
@@ -332,6 +333,7 @@ def refusals(parts: Sequence[SourceRows]) -> dict[str, str]:
     return {str(number): why for part in parts for number, why in part.refused}
 
 
+@typed
 def save(
     dataset: Dataset,
     folder: Location | str,

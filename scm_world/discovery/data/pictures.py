@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
-from scm_world._arguments import load, one_of, whole_number
+from scm_world._arguments import load, one_of, typed, whole_number
 from scm_world.backends.renderer import drawing_of, png, render, scene_camera
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Scene
@@ -21,6 +21,7 @@ Row = dict[str, Any]
 """Numbers, lists of numbers or of words, and pictures as the bytes of a PNG, by column."""
 
 
+@typed
 @final
 @dataclass(frozen=True)
 class Pictures:

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from fnmatch import fnmatchcase
 
+from scm_world._arguments import typed
 from scm_world.discovery.data.dataset import Column, columns_of
 from scm_world.errors import UnknownOption, UnknownVariable
 from scm_world.graph import SCM
@@ -21,6 +22,7 @@ NO_CAUSES = ("camera_*", "light_*", "*color", SENSOR_NOISE, ACTUATOR_NOISE, PRES
 """What looks, or disturbs the measurement, but moves nothing; patterns of names."""
 
 
+@typed
 def default_causes(world: System | SCM) -> tuple[str, ...]:
     """List the parameters that an experiment varies, if nothing else is asked for.
 
@@ -51,6 +53,7 @@ def default_causes(world: System | SCM) -> tuple[str, ...]:
     )
 
 
+@typed
 def default_outcomes(world: System, *, every_step: bool = False) -> tuple[Outcome, ...]:
     """List what is measured, if nothing else is asked for.
 

@@ -14,7 +14,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats
 from scm_world.discovery.data.collect import collect
 from scm_world.discovery.data.dataset import Column, Dataset, Ints
@@ -48,6 +48,7 @@ Point = Mapping[str, Any]
 """What is done: values as plain numbers or lists, by variable."""
 
 
+@typed
 @final
 @dataclass(frozen=True)
 class Levels:
@@ -270,6 +271,7 @@ def _mean(name: str, values: Floats, base: Floats) -> dict[str, float | None]:
 # --- the sweep ------------------------------------------------------------------------------------
 
 
+@typed
 def sweep(
     system: Simulation | SCM,
     over: Mapping[str, Any],

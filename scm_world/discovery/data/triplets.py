@@ -10,7 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world.discovery.data.pictures import ENDINGS, Pictures, Row
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.output.durable import made, write_durably
@@ -25,6 +25,7 @@ FORMAT = "scm_world/triplets/2"
 HEAD = "triplets.json"
 
 
+@typed
 def triplets(
     world: Simulation,
     factors: Iterable[str],
@@ -85,11 +86,12 @@ def triplets(
     """
     names = tuple(dict.fromkeys((factors,) if isinstance(factors, str) else factors))
     free = [name for name in world.model if world.model.declared(name).space("A") is not None]
+    allowed = (f"variables with a space A: {', '.join(free) or 'there are none'}",)
     for name in names:
         if world.model.declared(name).space("A") is None:
-            raise UnknownOption("factor", name, free)
+            raise UnknownOption("factor", name, allowed)
     if not names:
-        raise UnknownOption("factors", "none", free)
+        raise UnknownOption("factors", names, allowed)
     many = whole_number("targets", targets, least=1)
     if many > len(names):
         raise UnknownOption("targets", targets, (f"1 to {len(names)}, the number of factors",))

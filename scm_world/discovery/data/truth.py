@@ -10,6 +10,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._arguments import whole_number
 from scm_world.discovery.data.recorded import first_name, is_state
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import Marks, last_slice, mag, pag, window
@@ -107,7 +108,7 @@ class GroundTruth:
             for one, other, lag in pairs:
                 matrix[lag, at[one], at[other]] = True
         shared[0] |= shared[0].T
-        lags = most if lags is None else lags
+        lags = most if lags is None else whole_number("lags", lags, least=0)
         return mag(*window(edges, shared, lags)), lags
 
 
@@ -228,9 +229,9 @@ def observed_part(name: str, written: Mapping[str, Any], names: Sequence[str]) -
     known, after = set(names), dict[str, list[tuple[str, int]]]()
     for cause, effect, lag, _ in written["edges"]:
         after.setdefault(cause, []).append((effect, lag))
-    for name in written.get("held", ()):
-        if name not in known:
-            after.setdefault(name, []).append((name, 1))
+    for held in written.get("held", ()):
+        if held not in known:
+            after.setdefault(held, []).append((held, 1))
 
     def reached(start: str) -> list[tuple[str, int]]:
         found: dict[tuple[str, int], None] = {}

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scm_world._arguments import load
+from scm_world._arguments import load, typed
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import (
     Bools,
@@ -27,6 +27,7 @@ from scm_world.errors import ModelError, UnknownOption
 KEY = "scm_world"
 
 
+@typed
 def as_gies(dataset: Dataset) -> tuple[list[Floats], list[list[int]]]:
     """Give a dataset the way ``gies.fit_bic(data, I)`` takes it.
 
@@ -87,6 +88,7 @@ class Arrays(NamedTuple):
     observational: Bools
 
 
+@typed
 def as_numpy(dataset: Dataset) -> Arrays:
     """Give a dataset as copies of its arrays.
 
@@ -105,6 +107,7 @@ def as_numpy(dataset: Dataset) -> Arrays:
     )
 
 
+@typed
 def as_dcdi(dataset: Dataset, folder: Path | str, number: int = 1) -> Path:
     """Write a dataset the way DCDI reads it: ``--data-path folder --i-dataset number``.
 
@@ -146,6 +149,7 @@ def as_dcdi(dataset: Dataset, folder: Path | str, number: int = 1) -> Path:
 # --- pandas -----------------------------------------------------------------------------------
 
 
+@typed
 def as_frame(dataset: Dataset) -> Any:
     """Give a dataset as a ``pandas.DataFrame``.
 
@@ -182,6 +186,7 @@ def as_frame(dataset: Dataset) -> Any:
     return frame
 
 
+@typed
 def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
     """Read a frame that ``as_frame`` wrote, or any with a column ``intervention_targets``.
 
@@ -255,6 +260,7 @@ def _names_in(cell: Any) -> tuple[str, ...]:
 # --- tigramite --------------------------------------------------------------------------------
 
 
+@typed
 def as_tigramite(dataset: Dataset) -> Any:
     """Give time series as a ``tigramite.data_processing.DataFrame``.
 
@@ -303,6 +309,7 @@ class CausalLearn(NamedTuple):
     c_indx: Ints
 
 
+@typed
 def as_causal_learn(dataset: Dataset) -> CausalLearn:
     """Give a dataset the way causal-learn takes it: ``pc(data)``, ``cdnod(data, c_indx)``.
 

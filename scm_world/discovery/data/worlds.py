@@ -10,6 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import typed
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Column, Dataset, Regime, Row, columns_of
 from scm_world.discovery.data.designs import Design
@@ -56,6 +57,7 @@ STREAM = "sensor of"
 NORMAL = Normal()
 
 
+@typed
 @final
 class WorldSource:
     """Episodes of a world or of equations, under a design.

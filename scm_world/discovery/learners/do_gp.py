@@ -24,6 +24,7 @@ from typing import final
 
 import numpy as np
 
+from scm_world._arguments import typed
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Bools, Dataset
 from scm_world.discovery.learners.found import EstimatedGraph
@@ -45,6 +46,7 @@ EXACT = 1e-10  # variance of residuals, in that of the variable: below it, it is
 FEW = 10  # rows for each column below which a note warns
 
 
+@typed
 def do_gp(data: Dataset, *, seed: int = 0, interactions: bool = True) -> EstimatedGraph:
     """Find a graph of nonlinear mechanisms.
 

@@ -43,6 +43,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._arguments import typed
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Bools, Dataset
 from scm_world.discovery.learners.found import EstimatedGraph
@@ -255,6 +256,7 @@ SOME = 2000  # rows on which it is looked whether effects add up
 CURVED = 1e-4  # how improbable it has to be that they do
 
 
+@typed
 def do_order(
     data: Dataset,
     *,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, final
@@ -9,8 +10,9 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._arguments import typed
 from scm_world._types import Floats
-from scm_world.errors import ModelError
+from scm_world.errors import ModelError, UnknownOption, UnknownVariable
 from scm_world.graph.ancestral import CIRCLE, HEAD, TAIL, Marks, edge_words
 from scm_world.queries.experiments.effects import EdgeKey
 
@@ -66,6 +68,7 @@ class EstimatedGraph:
             raise ModelError([f"edges and marks have shapes {shapes}; they must have one"])
 
     @classmethod
+    @typed
     def of(
         cls,
         names: Sequence[str],
@@ -93,14 +96,13 @@ class EstimatedGraph:
             >>> found.directed, found.undirected
             ((('x', 'y', 0),), (('y', 'z'),))
         """
-        given = np.array(matrix)
-        given = given[None] if given.ndim == 2 else given
-        if given.ndim != 3 or given.shape[1:] != (len(names), len(names)):
-            what = f"a graph of {len(names)} variables has shape {given.shape}"
-            raise ModelError([what + f", not ({len(names)}, {len(names)})"])
-        weight = (
-            np.abs(given) if edge_scores is None else np.array(edge_scores).reshape(given.shape)
-        )
+        given = _matrix("matrix", matrix, len(names))
+        weight = np.abs(given)
+        if edge_scores is not None:
+            weight = _matrix("edge_scores", edge_scores, len(names))
+            if weight.shape != given.shape:
+                shapes = f"{given.shape} and {weight.shape}"
+                raise ModelError([f"matrix and edge_scores have shapes {shapes}"])
         if not np.isfinite(given).all() or not np.isfinite(weight).all():
             raise ModelError(["a graph has numbers that are not finite; put 0 where is no edge"])
         if (weight < 0).any():
@@ -109,6 +111,8 @@ class EstimatedGraph:
             )
         if lags is not None:
             at = list(lags)
+            if len({*at}) != len(given) or min(at) < 0:
+                raise UnknownOption("lags", at, (f"{len(given)} different whole numbers from 0",))
             wide = np.zeros((max(at) + 1, *given.shape[1:]))
             heavy = wide.copy()
             wide[at], heavy[at] = given, weight
@@ -118,18 +122,27 @@ class EstimatedGraph:
         return cls(tuple(names), edges, weight.astype(np.float64), **others)
 
     @classmethod
+    @typed
     def of_edges(
         cls, names: Sequence[str], edges: Iterable[EdgeKey], **others: Any
     ) -> EstimatedGraph:
-        """Make one from directed edges."""
-        keys = list(edges)
+        """Make one from directed edges: cause, effect and lag.
+
+        Raises:
+            UnknownOption: An edge is something else.
+            UnknownVariable: An edge is about another variable.
+        """
+        keys = edge_keys(edges)
         at = {name: i for i, name in enumerate(names)}
+        for name in dict.fromkeys(name for key in keys for name in key[:2] if name not in at):
+            raise UnknownVariable(name, names)
         matrix = np.zeros((1 + max((lag for *_, lag in keys), default=0), len(at), len(at)))
         for cause, effect, lag in keys:
             matrix[lag, at[cause], at[effect]] = 1.0
         return cls.of(names, matrix, **others)
 
     @classmethod
+    @typed
     def of_marks(cls, names: Sequence[str], marks: Any, **others: Any) -> EstimatedGraph:
         """Make one from edge marks, shape (p, p) or (lags + 1, p, p).
 
@@ -141,10 +154,10 @@ class EstimatedGraph:
             >>> found.words, found.directed
             (('x o-> y', 'y <-> z'), (('x', 'y', 0),))
         """
-        given = np.array(marks, dtype=np.int8)
-        given = given[None] if given.ndim == 2 else given
+        given = _matrix("marks", marks, len(names))
         if not np.isin(given, (0, HEAD, TAIL, CIRCLE)).all():
             raise ModelError([f"marks are {HEAD}, {TAIL}, {CIRCLE}, and 0 where is no edge"])
+        given = given.astype(np.int8)
         if ((given[0] == 0) != (given[0].T == 0)).any() or given[0].diagonal().any():
             raise ModelError(["an edge within an instant has a mark at both ends, and no loops"])
         others.setdefault("edge_scores", (given != 0).astype(np.float64))
@@ -182,11 +195,12 @@ class EstimatedGraph:
         both = np.triu(self.edges[0] & self.edges[0].T)
         return tuple((self.names[i], self.names[j]) for i, j in np.argwhere(both).tolist())
 
+    @typed
     def restricted(self, names: Sequence[str]) -> EstimatedGraph:
         """Return the part on some variables; those that it lacks have no edges."""
         at = {name: i for i, name in enumerate(self.names)}
         kept = [name for name in names if name in at]
-        new = [names.index(name) for name in kept]
+        new = [i for i, name in enumerate(names) if name in at]
         old = [at[name] for name in kept]
         shape = (len(self.edges), len(names), len(names))
 
@@ -261,3 +275,37 @@ class EstimatedGraph:
             )
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise ModelError([f"not a graph that a learner found: {error!r}"]) from None
+
+
+def edge_keys(edges: Any) -> list[EdgeKey]:
+    """Return edges as (cause, effect, lag).
+
+    Args:
+        edges: Such triples, a ``GroundTruth``, or an ``SCM``.
+
+    Raises:
+        UnknownOption: They are something else.
+    """
+    try:
+        keys = [getattr(edge, "key", edge) for edge in getattr(edges, "edges", edges)]
+        return [(str(cause), str(effect), operator.index(lag)) for cause, effect, lag in keys]
+    except (TypeError, ValueError):
+        allowed = ("a list of (cause, effect, lag)", "a GroundTruth", "an SCM")
+        raise UnknownOption("edges", edges, allowed) from None
+
+
+def _matrix(what: str, given: Any, p: int) -> NDArray[Any]:
+    """Read matrices of numbers over p variables, shape (lags + 1, p, p).
+
+    Raises:
+        ModelError: They are something else.
+    """
+    try:
+        found = np.array(given)
+    except ValueError:  # rows of several lengths
+        found = np.array(given, dtype=object)
+    found = found[None] if found.ndim == 2 else found
+    if found.dtype.kind not in "biuf" or found.ndim != 3 or found.shape[1:] != (p, p):
+        kind = f"shape {found.shape}, dtype {found.dtype}"
+        raise ModelError([f"{what} of {p} variables has {kind}; give real numbers, ({p}, {p})"])
+    return found

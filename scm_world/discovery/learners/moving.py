@@ -9,7 +9,7 @@ from dataclasses import replace
 import networkx as nx
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.simulators import SMALL, PairedSimulator, SCMSimulator
@@ -22,6 +22,7 @@ CONFIRMED = 6  # experiments in a row that have to come out as predicted; 3 err 
 ROUNDING = 1e-9  # of the size of the answers, in the size of the moves
 
 
+@typed
 def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> EstimatedGraph:
     """Find a graph by moving one variable at a time, in paired experiments.
 
@@ -56,6 +57,7 @@ def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> 
 # --- pooled -------------------------------------------------------------------------------------
 
 
+@typed
 def sparse_pooled(
     simulator: SCMSimulator, *, seed: int = 0, budget: int = 200, unit: int = 0
 ) -> EstimatedGraph:
@@ -208,6 +210,7 @@ def culprits(candidates: Sequence[str], moves: Callable[[Sequence[str]], bool]) 
     return found
 
 
+@typed
 def verified(
     simulator: SCMSimulator,
     *,

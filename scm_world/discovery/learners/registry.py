@@ -12,7 +12,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world.discovery.data.dataset import Dataset, Level, block
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
@@ -24,6 +24,7 @@ Source = Literal["observational", "interventional", "paired"]
 SOURCES: tuple[Source, ...] = ("observational", "interventional", "paired")
 
 
+@typed
 @final
 @dataclass(frozen=True)
 class Learner:
@@ -79,6 +80,7 @@ class Learner:
 _KNOWN: dict[str, Learner] = {}
 
 
+@typed
 def register(learner: Learner) -> Learner:
     """Make a learner known by its name.
 
@@ -109,6 +111,7 @@ def baselines() -> tuple[str, ...]:
     return tuple(name for name, known in learners().items() if known.baseline)
 
 
+@typed
 def learner(name: str) -> Learner:
     """Find a learner by its name, or by where a ``Learner`` or a function is.
 
@@ -136,6 +139,7 @@ def learner(name: str) -> Learner:
     return Learner(name, found)
 
 
+@typed
 def learn(
     given: Learner | str,
     data: Any,
@@ -189,9 +193,16 @@ def learn(
     seconds = time.perf_counter() - started
     if not isinstance(result, EstimatedGraph) and not isinstance(table, Dataset):
         raise ModelError([f"the learner {chosen.name!r} has to give an EstimatedGraph"])
-    found = result if isinstance(result, EstimatedGraph) else EstimatedGraph.of(table.names, result)
+    try:
+        found = result
+        if not isinstance(result, EstimatedGraph):
+            found = EstimatedGraph.of(table.names, result)
+        if isinstance(table, Dataset):
+            found = _folded(found, table, level)
+    except ModelError as error:
+        said = (f"the learner {chosen.name!r} returned no graph: {each}" for each in error.problems)
+        raise ModelError([*said]) from error
     if isinstance(table, Dataset):
-        found = _folded(found, table, level)
         place: dict[str, int] = {}
         for i, column in enumerate(data.columns):
             for name in (column.name, block(column), column.variable, column.name.split("@-")[0]):
