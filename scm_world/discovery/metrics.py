@@ -558,7 +558,8 @@ def sortability(data: Dataset, edges: Iterable[EdgeKey] | GroundTruth) -> dict[s
         1.0
     """
     keys = edge_keys(edges)
-    step = matrices(keys, data.names, max((lag for *_, lag in keys), default=0)).any(axis=0)
+    lags = max((lag for *_, lag in keys), default=0)
+    step: Bools = np.asarray(matrices(keys, data.names, lags).any(axis=0))
     if len(data) < 2:
         return {"variance": float("nan"), "r2": float("nan")}
     sums = np.atleast_2d(np.cov(data.values, rowvar=False))

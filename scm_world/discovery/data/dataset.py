@@ -156,7 +156,6 @@ class Dataset:
             raise ModelError(problems)
 
     @classmethod
-    @typed
     def of(
         cls,
         values: Any,
@@ -184,7 +183,9 @@ class Dataset:
         table = numbers(values, names)
         n = len(table)
         given = [()] * n if targets is None else targets
-        if any(not isinstance(t, Iterable | None) for t in given):
+        if not isinstance(given, Iterable) or not all(
+            isinstance(t, Iterable | None) for t in given
+        ):
             raise UnknownOption("targets", targets, ("for each row a list of names, or None",))
         rows = [tuple(sorted({t} if isinstance(t, str) else set(t or ()))) for t in given]
         unknown = sorted({name for row in rows for name in row} - set(names))

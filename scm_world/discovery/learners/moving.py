@@ -9,7 +9,7 @@ from dataclasses import replace
 import networkx as nx
 import numpy as np
 
-from scm_world._arguments import typed, whole_number
+from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.simulators import SMALL, PairedSimulator, SCMSimulator
@@ -22,7 +22,6 @@ CONFIRMED = 6  # experiments in a row that have to come out as predicted; 3 err 
 ROUNDING = 1e-9  # of the size of the answers, in the size of the moves
 
 
-@typed
 def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> EstimatedGraph:
     """Find a graph by moving one variable at a time, in paired experiments.
 
@@ -57,7 +56,6 @@ def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> 
 # --- pooled -------------------------------------------------------------------------------------
 
 
-@typed
 def sparse_pooled(
     simulator: SCMSimulator, *, seed: int = 0, budget: int = 200, unit: int = 0
 ) -> EstimatedGraph:
@@ -82,7 +80,7 @@ def sparse_pooled(
         *Optimally sparse representation in general dictionaries*, PNAS 2003.
     """
     n, q = len(simulator.causes), len(simulator.watched)
-    most = min(budget - 1, 4 * n)
+    most = min(whole_number("budget", budget, least=1) - 1, 4 * n)
     if most < 1:
         raise ModelError([f"pooled experiments need a budget of 2 or more, got {budget}"])
     signs = _signs(n, max(most, n.bit_length() + 1), np.random.default_rng(seed))[:most]
@@ -210,7 +208,6 @@ def culprits(candidates: Sequence[str], moves: Callable[[Sequence[str]], bool]) 
     return found
 
 
-@typed
 def verified(
     simulator: SCMSimulator,
     *,

@@ -194,7 +194,7 @@ def learn(
     if not isinstance(result, EstimatedGraph) and not isinstance(table, Dataset):
         raise ModelError([f"the learner {chosen.name!r} has to give an EstimatedGraph"])
     try:
-        found = result
+        found: EstimatedGraph = result
         if not isinstance(result, EstimatedGraph):
             found = EstimatedGraph.of(table.names, result)
         if isinstance(table, Dataset):
