@@ -51,7 +51,7 @@ def scored(name: str, learner: str, seeds: range, seen: int, each: int) -> dict[
     rows = []
     for seed in seeds:
         scm, data = table(name, seed, seen, each)
-        found = learn(learner, data)
+        found = learn(learner, data, seed=seed)
         s = evaluate(found, [edge.key for edge in scm.edges])
         rows.append((s.shd, s.false_discoveries, s.recall, s.sid, found.seconds))
     shd, false, recall, sid, seconds = map(list, zip(*rows, strict=True))
@@ -156,7 +156,7 @@ def case(name: str, kind: str, each: int, seed: int) -> tuple[list[Any], Dataset
     return truth, Dataset.of(data.values[np.ix_(rows, columns)], shown, targets=targets)
 
 
-def limited(learner: str, data: Dataset) -> Any:
+def limited(learner: str, data: Dataset, seed: int) -> Any:
     """Let a learner find a graph within the limit; return why there is none otherwise."""
 
     def stop(*_: Any) -> None:
@@ -165,16 +165,18 @@ def limited(learner: str, data: Dataset) -> Any:
     signal.signal(signal.SIGPROF, stop)
     signal.setitimer(signal.ITIMER_PROF, LIMIT)
     try:
-        return learn(learner, data)
+        return learn(learner, data, seed=seed)
     except (TimeoutError, ModelError) as error:
         return in_one_line(error)
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
 
 
-def tried(learner: str, data: Dataset, truth: list[Any], names: Any = None) -> dict[str, Any]:
+def tried(
+    learner: str, data: Dataset, truth: list[Any], seed: int, names: Any = None
+) -> dict[str, Any]:
     """Let a learner find a graph within the limit, and score it; or say why there is none."""
-    found = limited(learner, data)
+    found = limited(learner, data, seed)
     if isinstance(found, str):
         return {"failed": found}
     s = evaluate(found, truth, names=data.names if names is None else names)
@@ -196,7 +198,7 @@ def compared(name: str, kind: str, each: int, both: bool) -> list[dict[str, Any]
         if scaled and learner.startswith("gies"):
             continue  # its rows are standardised by the adapter; a test compares
         given = [(t, d.standardised()) for t, d in tables[:SCALED]] if scaled else tables
-        runs = [tried(learner, d, t) for t, d in given]
+        runs = [tried(learner, d, t, seed) for seed, (t, d) in zip(SEEDS, given, strict=False)]
         done = [run for run in runs if "failed" not in run]
         row: dict[str, Any] = {
             "model": name,
@@ -257,7 +259,7 @@ def physics() -> Any:
             slow = n > 20 or name.startswith("springs")
             for learner in (*baselines(), "do_order", *(() if slow else ("do_gp", "gies_shared"))):
                 given = [edge[:3] for edge in truth.edges]
-                runs.setdefault(learner, []).append(tried(learner, data, given, truth.names))
+                runs.setdefault(learner, []).append(tried(learner, data, given, seed, truth.names))
             if seed < CONFIRMED and n <= 20:
                 oracle = learn("paired", made.simulator(seed), budget=UNITS * n * n)
                 seen = set(oracle.restricted(truth.names).directed)
@@ -344,9 +346,9 @@ def series(kind: str, seed: int) -> Dataset:
     return data if kind == "none hidden" else data.hide(["h"])
 
 
-def marked(learner: str, data: Dataset, truth: Any) -> dict[str, Any]:
+def marked(learner: str, data: Dataset, truth: Any, seed: int) -> dict[str, Any]:
     """Let a learner find a graph within the limit, and score its edge marks; or say why not."""
-    found = limited(learner, data)
+    found = limited(learner, data, seed)
     if isinstance(found, str):
         return {"failed": found}
     scores: dict[str, Any] = asdict(evaluate_marks(found, truth))
@@ -369,13 +371,13 @@ def hidden() -> Any:
         for seed in SEEDS:
             made = problem(name, seed=seed)
             tables = {kind: made.data(kind, n, seed) for kind in dict(map(reversed, kinds))}
-            runs += [(w, kind, marked(w, tables[kind], made.truth)) for w, kind in kinds]
+            runs += [(w, kind, marked(w, tables[kind], made.truth, seed)) for w, kind in kinds]
         cases.append((name, n, runs))
     for kind in ("hidden series", "hidden context", "none hidden"):
         runs = []
         for seed in SEEDS:
             table = series(kind, seed)
-            runs += [(w, "observational", marked(w, table, table.truth)) for w in SERIES]
+            runs += [(w, "observational", marked(w, table, table.truth, seed)) for w in SERIES]
         cases.append((kind, EPISODES * LENGTH, runs))
     rows = []
     for name, n, runs in cases:
