@@ -87,7 +87,8 @@ def _annotations(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[
 
 def _fits(value: Any, hint: Any) -> bool:
     """Return whether a value is of an annotated kind."""
-    kind, parts = get_origin(hint) or hint, get_args(hint)
+    kind: Any = get_origin(hint) or hint
+    parts = get_args(hint)
     if kind in (Union, UnionType):
         return any(_fits(value, part) for part in parts)
     if kind is Literal:
