@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
-from hashlib import blake2b
-from inspect import getclosurevars
-from types import CodeType, FunctionType, MethodType, ModuleType
+from functools import cached_property
 from typing import Any, ClassVar, Literal, final
 
 import numpy as np
 
+from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Floats, Integers, Value
 from scm_world.backends.base import Backend, Capabilities, EngineBatch, InMemory
 from scm_world.errors import EngineFailure, ModelError, UnknownOption
@@ -97,9 +95,8 @@ class StepModel:
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the name and of what the function computes; see ``_content``."""
-        content = "\n".join(_content(self.function, set()))
-        return f"{self.name} {blake2b(content.encode(), digest_size=16).hexdigest()}"
+        """Hash of the function and the tables."""
+        return digest(fingerprint({"model": self}))
 
     @property
     def n_commands(self) -> int:
@@ -255,57 +252,6 @@ class StepModel:
 
     def __getstate__(self) -> dict[str, Any]:
         return {f: getattr(self, f) for f in self.__dataclass_fields__}
-
-
-def _content(part: Any, seen: set[int]) -> Iterator[str]:
-    """List what a function computes: its code, constants, and what it uses of its own package.
-
-    Lines and names of variables do not count. Of other objects, only the class does.
-    """
-    part = getattr(part, "py_func", part)  # compiled by numba
-    inner = _inside(part)
-    if not isinstance(part, tuple) and inner:
-        if id(part) in seen:
-            return
-        seen.add(id(part))
-    kind = part if isinstance(part, type) else type(part)
-    yield f"{kind.__module__}.{kind.__qualname__}"
-    if isinstance(part, bool | int | float | complex | str | bytes):
-        yield repr(part)
-    elif isinstance(part, set | frozenset):
-        yield str(sorted(map(repr, part)))
-    elif isinstance(part, np.ndarray | np.generic) and part.dtype != object:
-        yield f"{part.dtype} {part.shape} {part.tobytes().hex()}"
-    for each in inner:
-        yield from _content(each, seen)
-
-
-def _inside(part: Any) -> tuple[Any, ...]:
-    """Give what a function, a piece of code or a collection consists of."""
-    match part:
-        case list() | tuple():
-            return tuple(part)
-        case dict():
-            return tuple(part.items())
-        case partial():
-            return part.func, part.args, part.keywords
-        case MethodType():
-            return part.__func__, getattr(part.__self__, "__dict__", None)
-        case CodeType():
-            return part.co_code, part.co_names, part.co_consts
-        case FunctionType():
-            used, package = getclosurevars(part), part.__module__.partition(".")[0]
-            near = tuple(
-                item
-                for item in sorted(used.globals.items())
-                if not isinstance(item[1], ModuleType)
-                and str(getattr(item[1], "__module__", package)).partition(".")[0] == package
-            )
-            held = part.__defaults__, part.__kwdefaults__, tuple(sorted(used.nonlocals.items()))
-            return part.__code__, *held, near
-        case _ if isinstance(vars(type(part)).get("__call__"), FunctionType):
-            return type(part).__call__, getattr(part, "__dict__", None)
-    return ()
 
 
 @final

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
 import math
 import re
@@ -22,6 +21,7 @@ import numpy as np
 from pydantic import FiniteFloat, PlainValidator, TypeAdapter
 
 from scm_world._arguments import load, typed, whole_number
+from scm_world._fingerprint import changes, fingerprint
 from scm_world.discovery.data import Dataset
 from scm_world.discovery.data.truth import Pair
 from scm_world.discovery.learners.found import EstimatedGraph
@@ -40,7 +40,7 @@ from scm_world.errors import (
 )
 from scm_world.graph import SCM
 from scm_world.output.durable import is_draft, locked, made, write_whole
-from scm_world.output.reading import read_bytes, read_text
+from scm_world.output.reading import read_text
 from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.versions import versions
@@ -290,12 +290,14 @@ def benchmark(
     beside: list[Source] = [kind for kind in SOURCES if kind in of_others and kind != "paired"]
     if beside and not data:  # baselines use what they are compared on
         kinds |= {name: beside for name in learners if learner(name).baseline}
-    marks = {name: _learner_version(learner(name)) for name in learners}
+    known_by = {name: learner(name) for name in learners}
+    parts: dict[str, Any] = {f"learner {n!r}": (one, one.version) for n, one in known_by.items()}
     truths: dict[str, GroundTruth] = {}
     named = [label if isinstance(p, SCM) else p for p, label in zip(problems, shown, strict=True)]
     for given, name, label in zip(problems, named, shown, strict=True):
         with closing(problem(given, view=view)) as known:
-            truths[label], marks[name] = replace(known.truth, name=label), known.version
+            truths[label] = replace(known.truth, name=label)
+            parts |= {f"{part} in {name}": made for part, made in known.__fingerprint__().items()}
     asked = {
         "problems": named,
         "learners": learners,
@@ -306,7 +308,9 @@ def benchmark(
         "timeout": timeout,
         "standardised": standardised,
     }
-    settings = json.loads(json.dumps({**asked, "versions": versions(), "marks": marks}))
+    settings = json.loads(
+        json.dumps({**asked, "versions": versions(), "fingerprint": fingerprint(parts)})
+    )
     folder = None if out is None else located(out)
     chosen = map(learner, learners)
     marked = any(one.marked and not one.baseline for one in chosen)
@@ -370,31 +374,20 @@ def _kinds(chosen: Learner, problems: Sequence[str | SCM], wanted: Sequence[str]
     return given or [chosen.takes[-1]]
 
 
-def _learner_version(chosen: Learner) -> str:
-    """Return what changes with a learner: its code, or the version of its library."""
-    function = getattr(chosen.learn, "func", chosen.learn)
-    try:
-        file = inspect.getsourcefile(inspect.unwrap(function))
-    except TypeError:
-        file = None
-    if file is None or function.__module__.startswith("scm_world."):
-        return chosen.version or ""
-    return hashlib.sha256(read_bytes(file)).hexdigest()[:16]
-
-
 def _claim(folder: Location, settings: dict[str, Any]) -> None:
     """Write the settings into a new folder, or check that it is one of the same benchmark."""
     path = folder / "settings.json"
     if path.exists():
         try:
             there = json.loads(read_text(path))
-            different = [key for key in settings if there[key] != settings[key]]
+            different = changes({name: there[name] for name in settings}, settings)
         except DAMAGED as error:
             reason, advice = f"it describes no benchmark: {error}", "give another folder"
             raise UnreadableFile(str(path), reason, advice) from None
         if different:
             reason = f"it is one of another benchmark: {', '.join(different)} differ"
-            raise UnreadableFile(str(folder), reason, "give another folder")
+            advice = "give another folder, or bring back the systems and learners of this one"
+            raise UnreadableFile(str(folder), reason, advice)
         return
     if folder.exists():
         names = [there.name for there in folder.iterdir()] if folder.is_dir() else [folder.name]

@@ -8,7 +8,6 @@ control step, and the graph has lag 1.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import re
 from collections.abc import Mapping
@@ -196,8 +195,10 @@ class ServoProblem:
             "hidden": len(forces),
         }
         self.truth = replace(observed_part(name, self._written, self._arms), about=about)
-        mark = hashlib.sha256(repr((made.task.given, made.mechanisms)).encode()).hexdigest()[:16]
-        self.version = f"{backend.name} {backend.version} {mark}"
+
+    def __fingerprint__(self) -> dict[str, Any]:
+        nature = self._made.mechanisms
+        return {**self._world.__fingerprint__(), "nature": nature, "engine": self._world.engine}
 
     def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
         """Collect episodes; each arm is held in half as many as there are in which none is."""

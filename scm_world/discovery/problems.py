@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import inspect
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 
 from scm_world import queries
 from scm_world._arguments import one_of, typed, whole_number
+from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Floats, Value
 from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
 from scm_world.discovery.data.recorded import first_name, settable
@@ -35,8 +34,8 @@ from scm_world.discovery.learners.simulators import (
 )
 from scm_world.discovery.physics import PHYSICS, ServoProblem, Springs, numbers_of, servo
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
-from scm_world.graph import SCM, from_json, to_json
-from scm_world.output.reading import read_bytes, read_text
+from scm_world.graph import SCM, from_json
+from scm_world.output.reading import read_text
 from scm_world.policies.scripted import as_policy
 from scm_world.queries.outcomes import Outcome, as_outcome
 from scm_world.queries.samples import STEPS, Setting
@@ -276,11 +275,12 @@ class Problem(Protocol):
 
     Attributes:
         truth: The true graph.
-        version: Changes whenever results of the problem cannot be compared any more.
     """
 
     truth: GroundTruth
-    version: str
+
+    def __fingerprint__(self) -> dict[str, Any]:
+        """Return everything that decides its data and its true graph, by name."""
 
     def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
         """Collect ``"observational"`` or ``"interventional"`` rows.
@@ -320,11 +320,12 @@ class SCMProblem:
             about["hidden"] = len(hidden)
             projected = observed_part(name, truth_of_model(scm), names)
             self.truth = replace(projected, weights={}, about=about)
-        text = to_json(scm) + "".join(hidden)
-        self.version = hashlib.sha256(text.encode()).hexdigest()[:16]
         values = {v.name: _values_of(v) for v in scm.variables if v.settable}
         values = {name: act for name, act in values.items() if name in names}
         self._values = {name: act for name, act in values.items() if act is not None}
+
+    def __fingerprint__(self) -> dict[str, Any]:
+        return {**self._scm.__fingerprint__(), "hidden": self._hidden, "values": self._values}
 
     def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
         """Collect rows; each target gets half as many rows as are observational.
@@ -459,14 +460,10 @@ class WorldProblem:
         except BaseException:
             self._world.close()
             raise
-        backend = self._world.backend
-        file = None if name in TASKS or task else name
-        if file and ":" in name:
-            file = inspect.getsourcefile(load_factory(name))
-        text = b"" if file is None else read_bytes(file)
-        text = repr(task.given).encode() if task else text
-        mark = hashlib.sha256(text).hexdigest()[:16] if text else ""
-        self.version = f"{backend.name} {backend.version} {mark}".strip()
+
+    def __fingerprint__(self) -> dict[str, Any]:
+        world = self._world
+        return {**world.__fingerprint__(), "policy": self._policy, "engine": world.engine}
 
     def _chosen(self) -> tuple[str, ...]:
         """Choose what varies: with what is computed from it, since that can be set, too."""
@@ -690,7 +687,7 @@ def _partly_hidden(name: str, seed: int, seen: str, hidden: str) -> SCMProblem:
 def problem_label(name: str | SCM, view: TaskView) -> str:
     """Return the name of a problem as it is shown; of a model it tells models apart."""
     if isinstance(name, SCM):
-        return f"model {hashlib.sha256(to_json(name).encode()).hexdigest()[:8]}"
+        return f"model {digest(fingerprint(name))[:8]}"
     if name.partition(":")[0] in (*FAMILIES, *PHYSICS) or name.endswith(".json"):
         return Path(name).stem if name.endswith(".json") else name
     home, colon, function = name.rpartition(":")

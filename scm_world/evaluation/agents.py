@@ -7,18 +7,17 @@ draws. How long a control step is and the conventions are shared.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from hashlib import blake2b
 from typing import Any, final
 
 import gymnasium
 import numpy as np
 
+from scm_world._fingerprint import fingerprint
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption
-from scm_world.evaluation.players import Player, WorldPolicy, as_player
+from scm_world.evaluation.players import Player, as_player
 from scm_world.evaluation.protocols import named
 from scm_world.policies import PolicyAbout
 from scm_world.policies.cards import COMMON, FORM, FREE, contradiction, plain, usual
@@ -66,23 +65,20 @@ class AgentRun:
     def tried_out(self, env: ScmWorldEnv) -> AgentRun:
         """Call it a few times, and return it with what identifies a policy that has no file.
 
-        That are its actions and its source. One that gives two actions for one observation draws
-        from a noise of its own: what it does then says nothing.
+        That is its fingerprint, and whether it gives two actions for one observation.
 
         Raises:
             EvaluationError: It does not fit the environment; with its name.
         """
         is_known = "sha256" in self.about or self.about.get("kind") == "named"
         try:
+            policy = {} if is_known else {"policy": self.player.policy}
+            traits: dict[str, Any] = {"fingerprint": fingerprint(policy)}
             actions = _walked(self.player, env, 1 if is_known else _TRIES)
             if is_known:
                 return self
-            found = blake2b(source_of(self.player.policy), digest_size=8)
             if actions != _walked(self.player, env, _TRIES):
-                traits = {"traits": found.hexdigest(), "repeats": "no"}
-            else:
-                found.update(b"".join(actions))
-                traits = {"traits": found.hexdigest()}
+                traits = {**traits, "repeats": "no"}
             return replace(self, about={**self.about, **traits})
         except ScmWorldError as error:
             raise EvaluationError({"agent": self.agent, "run": self.run}, str(error)) from error
@@ -105,16 +101,6 @@ def _walked(player: Player, env: Any, steps: int) -> list[bytes]:
         if terminated or truncated:
             break
     return found
-
-
-def source_of(policy: Any) -> bytes:
-    """Return the source of a function or class, if there is one."""
-    inside = policy.policy if isinstance(policy, WorldPolicy) else policy
-    inside = inside if inspect.isroutine(inside) or isinstance(inside, type) else type(inside)
-    try:
-        return inspect.getsource(inside).encode()
-    except (OSError, TypeError):
-        return b""
 
 
 def what_it_is(about: Mapping[str, Any]) -> dict[str, Any]:

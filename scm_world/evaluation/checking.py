@@ -11,6 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import whole_number
+from scm_world._fingerprint import changes
 from scm_world.curricula import Do
 from scm_world.errors import (
     DAMAGED,
@@ -36,7 +37,7 @@ from scm_world.tasks.factories import refuse_untrusted
 from scm_world.tasks.model import is_model
 from scm_world.variables.mechanisms import check_trusted
 
-_TASK = ("task", "arguments", "class", "model")
+_TASK = ("task", "arguments", "fingerprint")
 """What says of an evaluation where it happened."""
 
 
@@ -131,26 +132,30 @@ def _place(
     if task is not None:
         place = EvaluationPlace(task, options)
         now = place.about()
-        if any(now.get(key) != about.get(key) for key in _TASK):
-            made = about.get("class", about["task"])
-            raise UnknownOption("task", task, (f"{made} with {about['arguments']}",))
+        _same_task(about, now)
         return place
     text = about["task"]
     refuse_untrusted(text, None if known else trusted)
     if text not in tasks() and not is_model(text) and ":" not in text:
         allowed = (*tasks(), "one of your own, if it is given: task=")
-        raise UnknownOption("task", about.get("class", about["task"]), allowed)
+        raise UnknownOption("task", about["task"], allowed)
     if about["arguments"]:
         options["task_options"] = about["arguments"]
     place = EvaluationPlace(about["task"], options)
-    if place.about().get("model") != about.get("model"):
-        content = f"the file that was evaluated, whose content has the sum {about.get('model')}"
-        raise UnknownOption("task", about["task"], (content,))
-    mine = place.about().get("class", place.name)
-    if mine != about.get("class", place.name):
-        made = about.get("class", place.name)
-        raise UnknownOption("task", mine, (f"{made}, if it is given: task=",))
+    _same_task(about, place.about())
     return place
+
+
+def _same_task(about: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Refuse a task that is not the one that was evaluated.
+
+    Raises:
+        UnknownOption: With the parts that differ.
+    """
+    parts = changes({key: about.get(key) for key in _TASK}, {key: now.get(key) for key in _TASK})
+    if parts:
+        allowed = (f"the one that was evaluated: {', '.join(parts)} differ",)
+        raise UnknownOption("task", now["task"], allowed)
 
 
 def _agent_runs(evaluation: Evaluation, policy: Any, trusted: Sequence[str]) -> Iterator[AgentRun]:

@@ -14,6 +14,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from scm_world._arguments import one_of, whole_number
+from scm_world._fingerprint import differing, fingerprint
 from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
 from scm_world.env.arguments import doubles, names_of
@@ -79,6 +80,7 @@ class Recording:
         episodes: The recorded episodes.
         versions: Of Python, the packages and the backend.
         policy: Description of the policy, if known.
+        fingerprint: Hashes of the parts of the system; a replay compares them, if there are any.
         trusted: Packages whose functions may be called to make the environment again; any if the
             recording was made in this process.
     """
@@ -87,6 +89,7 @@ class Recording:
     episodes: tuple[Recorded, ...]
     versions: Mapping[str, str] = field(default_factory=dict)
     policy: Mapping[str, Any] | None = None
+    fingerprint: Mapping[str, str] = field(default_factory=dict)
     trusted: Sequence[str] | None = field(default=None, compare=False, repr=False)
 
     def __len__(self) -> int:
@@ -161,6 +164,11 @@ class Recording:
         numbers = range(len(self)) if which is None else (range(len(self))[which],)
         env = ScmWorldEnv(**arguments)
         try:
+            now = fingerprint(env.world.structures, libraries=False)
+            changed = differing(self.fingerprint, now) if self.fingerprint else ()
+            if changed:
+                what = f"{', '.join(changed)} of the system differ"
+                raise SnapshotMismatch(f"the recording is one of another system: {what}")
             for number in numbers:
                 for difference in _differences(env, self.episodes[number]):
                     made = ", ".join(f"{name} {v}" for name, v in self.versions.items())
@@ -186,7 +194,8 @@ class Recording:
         target = located(path)
         if target.suffix != ".parquet":
             target = target.with_name(target.name + ".parquet")
-        header = header_of(self.environment, self.versions, self.policy, self.episodes)
+        about = self.environment, self.versions, self.policy, self.episodes, self.fingerprint
+        header = header_of(*about)
         write_durably(target, to_parquet(header, self.episodes))
         return target
 
@@ -210,7 +219,7 @@ class Recording:
             raise UnreadableFile(str(path), said(error), advice) from None
         header, episodes = from_parquet(data, str(path), trusted)
         about = header["environment"], tuple(episodes), header["versions"], header["policy"]
-        return cls(*about, tuple(trusted))
+        return cls(*about, header["fingerprint"], tuple(trusted))
 
     def to_minari(self, dataset_id: str, **about: Any) -> Any:
         """Write a dataset of Minari; its ``recover_environment`` returns the environment.
@@ -393,7 +402,8 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         present = self._recorded()
         episodes = (*self._made, *([present] if present else []))
         made_with = versions(self._inner.world.engine)
-        return Recording(self._inner.made_with, episodes, made_with, policy)
+        system = fingerprint(self._inner.world.structures, libraries=False)
+        return Recording(self._inner.made_with, episodes, made_with, policy, system)
 
     def _write(
         self,

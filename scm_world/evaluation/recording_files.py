@@ -33,12 +33,12 @@ from scm_world.tasks.factories import load_factory
 from scm_world.variables import Draw, Subset
 from scm_world.variables.kinds import SPACES
 
-FORMAT = "scm_world/recording/1"
+FORMAT = "scm_world/recording/2"
 KEY = "scm_world"
 ONLY = ""
 """Name of an observation that has no parts."""
 
-_KEYS = {"environment", "versions", "policy", "episodes"}
+_KEYS = {"environment", "fingerprint", "versions", "policy", "episodes"}
 _ADVICE = "give one that a Recording was saved to"
 _STEPS = {"reward": "rewards", "terminated": "terminations", "truncated": "truncations"}
 _TYPES = {"rewards": "f8", "states": "i8", "terminations": "?", "truncations": "?"}
@@ -153,6 +153,7 @@ def header_of(
     versions: Mapping[str, str],
     policy: Mapping[str, Any] | None,
     episodes: Sequence[Recorded],
+    fingerprint: Mapping[str, str],
 ) -> str:
     """Return everything of a recording but its numbers, as JSON.
 
@@ -162,6 +163,7 @@ def header_of(
     header = {
         "format": FORMAT,
         "environment": as_data(environment),
+        "fingerprint": dict(fingerprint),
         "versions": dict(versions),
         "policy": None if policy is None else dict(policy),
         "episodes": [

@@ -14,6 +14,7 @@ import gymnasium
 import numpy as np
 
 from scm_world._arguments import one_of, whole_number
+from scm_world._fingerprint import fingerprint
 from scm_world.backends import backends
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
@@ -22,16 +23,13 @@ from scm_world.evaluation.agents import (
     in_form,
     load_agents,
     shared_options,
-    source_of,
     task_for,
 )
 from scm_world.evaluation.episodes import EpisodeRunner, unrelated
 from scm_world.evaluation.protocols import Protocol, chosen, protocols_of
-from scm_world.models import Model
 from scm_world.policies.cards import FORM
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.plans import PACKAGE
-from scm_world.tasks import TASKS, Task, make_task, tasks
+from scm_world.tasks import Task, make_task, tasks
 
 SHARD = 25
 """Episodes that are played and written in one piece."""
@@ -84,23 +82,17 @@ class EvaluationPlace:
         Raises:
             ModelError: Something of it cannot be written down.
         """
-        arguments = {} if isinstance(self.task, str) else self.task.given
-        kind, own = type(self.made), dict[str, Any]()
-        is_ours = kind.__module__.partition(".")[0] == PACKAGE and isinstance(self.task, str)
-        if not (is_ours or kind is TASKS.get(self.name)):
-            own["class"] = _plain(kind)
-        system = getattr(self.made, "system", None)
-        if isinstance(system, Model):
-            arguments = {name: value for name, value in arguments.items() if name != "model"}
-            own["model"] = system.digest
+        given = {} if isinstance(self.task, str) else self.task.given
+        options = {name: value for name, value in self.options.items() if name != "task_options"}
+        parts = {f"option {name!r}": value for name, value in sorted(options.items())}
+        data = {
+            "task": self.name,
+            "arguments": {name: value for name, value in given.items() if name != "model"},
+            "fingerprint": fingerprint({**self.made.__fingerprint__(), **parts}),
+            "env": dict(self.options),
+        }
         try:
-            found: dict[str, Any] = json.loads(
-                json.dumps(
-                    {"task": self.name, "arguments": arguments, **own, "env": dict(self.options)},
-                    default=_plain,
-                    allow_nan=False,
-                )
-            )
+            found: dict[str, Any] = json.loads(json.dumps(data, default=_plain, allow_nan=False))
             return found
         except (TypeError, ValueError) as error:
             raise ModelError([f"the environment cannot be written down: {error}"]) from None
@@ -336,6 +328,5 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if callable(value):
-        text = blake2b(source_of(value), digest_size=8).hexdigest()
-        return f"{value.__module__}:{value.__qualname__} {text}"
+        return f"{value.__module__}:{value.__qualname__}"
     raise TypeError(f"{value!r} is no plain data")

@@ -9,12 +9,13 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from scm_world._fingerprint import differing, fingerprint
 from scm_world.errors import DAMAGED, InterventionError, ModelError
 from scm_world.graph.scm import SCM
 from scm_world.variables import AnyVariable, Function, Intervention, Mechanism, Variable
 from scm_world.variables.mechanisms import check_portable, check_trusted
 
-FORMAT = "scm_world/model/1"
+FORMAT = "scm_world/model/2"
 
 _VARIABLES: TypeAdapter[Any] = TypeAdapter(list[AnyVariable])
 _INTERVENTIONS: TypeAdapter[Any] = TypeAdapter(dict[str, Intervention])
@@ -41,6 +42,12 @@ def _functions(
     yield from (function for function in named if isinstance(function, Function))
 
 
+def _hashes(model: SCM) -> dict[str, str]:
+    """Return a hash of each function and intervention, by name; declarations are in the file."""
+    found = fingerprint(model, libraries=False)
+    return {n: each for n, each in found.items() if not n.startswith("declaration of ")}
+
+
 def to_dict(model: SCM) -> dict[str, Any]:
     """Return a model as plain data.
 
@@ -50,6 +57,7 @@ def to_dict(model: SCM) -> dict[str, Any]:
     check_portable(_functions(model.variables, model.interventions))
     return {
         "format": FORMAT,
+        "functions": _hashes(model),
         "variables": _plain(_VARIABLES.dump_python(list(model.variables), mode="json")),
         "interventions": _plain(_INTERVENTIONS.dump_python(dict(model.interventions), mode="json")),
     }
@@ -64,7 +72,8 @@ def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
             package that compute numbers.
 
     Raises:
-        ModelError: The data is no model, or names a function outside the trusted packages.
+        ModelError: The data is no model, names a function outside the trusted packages, or one that
+            was changed since.
     """
     found = data.get("format") if isinstance(data, dict) else data
     if found != FORMAT:
@@ -79,11 +88,16 @@ def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
     except DAMAGED as error:  # a field too many, or too few
         raise ModelError([f"not a model: {error}"]) from None
     check_trusted(_functions(variables, held), trusted)  # before anything of theirs is imported
-    model = SCM(variables)
     try:
-        return model.hold(held)
+        model = SCM(variables).hold(held)
     except InterventionError as error:
         raise ModelError([f"an intervention of the file does not fit: {error}"]) from None
+    other = differing(data.get("functions", {}), _hashes(model))
+    if other:
+        problem = f"what the file refers to is not the same here: {', '.join(other)} differ"
+        advice = "bring back these functions, or write the model again with to_json"
+        raise ModelError([f"{problem}; {advice}"])
+    return model
 
 
 def to_json(model: SCM) -> str:

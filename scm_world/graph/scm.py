@@ -31,6 +31,7 @@ from scm_world.variables import (
     Draw,
     Exogenous,
     Fixed,
+    Function,
     Hard,
     Intervention,
     Measured,
@@ -143,6 +144,20 @@ class SCM:
         self._temporal: frozenset[str] | None = None
         self._interventions: dict[str, Intervention] = {}
         self._acts: dict[str, AppliedIntervention] = {}
+
+    def __fingerprint__(self) -> dict[str, Any]:
+        """Return what decides its values: declarations by entity, functions, interventions."""
+        found: dict[str, Any] = {}
+        for variable in self._declared.values():
+            fields = {name: getattr(variable, name) for name in type(variable).model_fields}
+            functions = {name for name, value in fields.items() if isinstance(value, Function)}
+            found |= {f"{name} of {variable.name!r}": fields[name] for name in sorted(functions)}
+            entity = f"declaration of {variable.name.partition('.')[0]!r}"
+            found.setdefault(entity, []).append(variable.model_dump_json(exclude=functions))
+        for name, act in self._interventions.items():
+            function = getattr(act, "function", None)
+            found[f"intervention on {name!r}"] = act.model_dump_json(exclude={"function"}), function
+        return found
 
     # --- looking ------------------------------------------------------------------------------
 

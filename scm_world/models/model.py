@@ -158,6 +158,9 @@ class Model:
     def __hash__(self) -> int:
         return hash(self.digest)
 
+    def __fingerprint__(self) -> str:
+        return self.digest
+
     def __getstate__(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 

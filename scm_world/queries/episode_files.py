@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from scm_world._fingerprint import differing, fingerprint
 from scm_world.errors import (
     DAMAGED,
     ModelError,
@@ -33,9 +34,10 @@ from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.variables import Subset
 from scm_world.world import Simulation
 
-FORMAT = "scm_world/episode/1"
+FORMAT = "scm_world/episode/2"
 _ADVICE = "give a file that save_episode wrote"
 KEYS = {
+    "fingerprint",
     "task",
     "arguments",
     "options",
@@ -97,10 +99,11 @@ def _world(twins: Twins) -> dict[str, Any]:
         options["variables_space"] = options["variables_space"].model_dump(mode="json")
     with twins.twin() as world:
         engine = world.engine
+        system = fingerprint(world, libraries=False)
     return {
+        "fingerprint": system,
         "task": task.name,
         "arguments": _arguments(task),
-        "model": task.system.digest if isinstance(task, ModelTask) else None,
         "options": options,
         "versions": versions(engine),
     }
@@ -108,6 +111,7 @@ def _world(twins: Twins) -> dict[str, Any]:
 
 def _equations(twins: EquationTwins) -> dict[str, Any]:
     return {
+        "fingerprint": fingerprint(twins.layout.model, libraries=False),
         "task": None,
         "arguments": None,
         "equations": _written(twins.layout.model),
@@ -233,30 +237,31 @@ def _twins(
     Raises:
         SnapshotMismatch: The world or model that is given is another one.
     """
-    other = SnapshotMismatch(f"{file} happened in another model, or one that was changed since")
     if "equations" in about:
         written = about["equations"]
         if world is None and written is None:
             problem = f"{file} holds no model, since a function of it has no name"
             raise ModelError([f"{problem}; pass it: load_episode(path, world=model)"])
-        model = from_dict(written, trusted=trusted) if world is None else world
-        if not isinstance(model, SCM) or (world is not None and _written(model) != written):
-            raise other
-        return EquationTwins(model)
-    if isinstance(world, SCM):
-        raise other
-    twins = twins_of(world) if world is not None else Twins(_made(about))
-    digest = twins.task.system.digest if isinstance(twins.task, ModelTask) else None
-    if about.get("model") != digest:
-        raise other
-    return twins
+        system: Any = from_dict(written, trusted=trusted) if world is None else world
+        is_kind = isinstance(system, SCM)
+    else:
+        system = _made(about) if world is None else world
+        is_kind = isinstance(system, Simulation)
+    now = fingerprint(system, libraries=False) if is_kind else {}
+    changed = differing(about["fingerprint"], now) if is_kind else ["kinds of system"]
+    if changed:
+        problem = f"{file} happened in another system, or one that was changed since"
+        raise SnapshotMismatch(f"{problem}: {', '.join(changed)} differ")
+    if isinstance(system, SCM):
+        return EquationTwins(system)
+    return twins_of(world) if isinstance(world, Simulation) else Twins(system)
 
 
 def _made(about: dict[str, Any]) -> Simulation:
     given = about["arguments"] or {}
     if about["task"] in tasks():
         task = make_task(about["task"], **given)
-    elif about.get("model") is not None and "model" in given:
+    elif "model" in given:
         task = ModelTask(**given)
     else:
         raise UnknownOption("task", about["task"], (*tasks(), "any, with world=World(your task)"))

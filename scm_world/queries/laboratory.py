@@ -14,6 +14,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import whole_number
+from scm_world._fingerprint import changes, fingerprint
 from scm_world._types import Floats
 from scm_world.errors import (
     DAMAGED,
@@ -150,8 +151,8 @@ class Journal:
         whole = text[: text.rfind("\n") + 1]
         try:
             first, *lines = (json.loads(line) for line in whole.splitlines())
-            if first != head:
-                other = [key for key in head if first.get(key) != head[key]]
+            other = changes(first, head)
+            if other:
                 reason = f"it is the log of other experiments: {', '.join(other)} differ"
                 raise UnreadableFile(str(path), reason, "give the laboratory another log")
             for line in lines:
@@ -244,10 +245,16 @@ class Laboratory:
     def terms(self) -> dict[str, Any]:
         """Return what has to be the same for a log to be continued."""
         setting = self._setting
-        given = self._world.task.given
         return {
             "task": self._world.task.name,
-            "arguments": {name: str(value) for name, value in sorted(given.items())},
+            "fingerprint": fingerprint(
+                {
+                    **self._world.__fingerprint__(),
+                    "given": list(self._given.acts()),
+                    "policy": setting.policy,
+                    "nature": list(Plan(setting.nature).acts()),
+                }
+            ),
             "options": self._twins.options,
             "given": repr(self._given),
             "seed": setting.seed,

@@ -272,6 +272,13 @@ class Task(ABC):
         task.is_named = not args  # every argument has its name
         return task
 
+    def __fingerprint__(self) -> dict[str, Any]:
+        """Return what decides the task: its class, its arguments, and what an engine compiles."""
+        given = {f"argument {n!r}": v for n, v in sorted(self.given.items()) if n != "model"}
+        system = getattr(self, "system", None)
+        physics = {} if system is None else {"physics": system}
+        return {"class of the task": type(self), **given, **physics}
+
     @abstractmethod
     def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
         """Declare all variables, and say what they mean to an engine."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from scm_world._arguments import load, one_of, whole_number
+from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
@@ -29,7 +30,7 @@ from scm_world.policies.cards import OPTIONS
 from scm_world.policies.scripted import NAMED
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress, Tell
-from scm_world.tasks import TASKS
+from scm_world.tasks import TASKS, make_task
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.training.export import mean, scored, words
 from scm_world.training.loop import open_folder, torch_threads
@@ -635,7 +636,13 @@ def clone(
         digest = sha256(given.observations.tobytes() + given.actions.tobytes()).hexdigest()
     else:
         engines = [_checked(lesson, name, number) for name in backend.split(",")]
-    identity = {"lesson": lesson.about(), "seed": number, "backend": backend, "recording": digest}
+    identity = {
+        "fingerprint": fingerprint(make_task(lesson.task), libraries=False),
+        "lesson": lesson.about(),
+        "seed": number,
+        "backend": backend,
+        "recording": digest,
+    }
     policies: list[MlpPolicy] = []
     with locked(folder), torch_threads(1), opened(None, workers) as executor:
         open_folder(folder / "clone.json", "scm_world/clone/1", identity, identity, say)

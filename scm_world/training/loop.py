@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, final
 
 from scm_world._arguments import load, one_of, whole_number
+from scm_world._fingerprint import fingerprint
 from scm_world.backends import backends
 from scm_world.errors import DAMAGED, Diverged, UnknownOption, UnreadableFile
 from scm_world.evaluation.setups import EvaluationPlace
@@ -214,9 +215,13 @@ def identity_of(recipe: Recipe, start: Path | None, **more: Any) -> dict[str, An
             advice = "give a policy file to start from"
             raise UnreadableFile(str(start), str(error), advice) from None
     options = recipe.env.get("task_options")
-    about = EvaluationPlace(recipe.task, {"task_options": options}).about()
-    custom = {name: value for name, value in about.items() if name in ("class", "model")}
-    return {**custom, "recipe": recipe.as_dict(), **more, "start": digest}
+    made = EvaluationPlace(recipe.task, {"task_options": options}).made
+    return {
+        "fingerprint": fingerprint(made, libraries=False),
+        "recipe": recipe.as_dict(),
+        **more,
+        "start": digest,
+    }
 
 
 def open_folder(

@@ -196,6 +196,9 @@ class Function(Frozen):
         }
         return partial(function, **constants)
 
+    def __fingerprint__(self) -> tuple[Any, ...]:
+        return self.constants, self.resolve()
+
     def __eq__(self, other: object) -> bool:
         return (
             isinstance(other, Function)

@@ -152,6 +152,12 @@ class WorldAttributes:
         finer = () if self.resolution == self.task.resolutions[0] else (self.resolution,)
         return (self.task.name, *options, *numbers, *finer, self.structures.digest)
 
+    def __fingerprint__(self) -> dict[str, Any]:
+        """Return what decides what happens here, except versions: the task, and the options."""
+        world: Any = self
+        options = (world.backend.name, world.variables_space, self.identity[:-1])
+        return {**self.structures.__fingerprint__(), "options": options}
+
     def describe(self, values: Values, state: State) -> Scene:
         """Describe the scene that some values stand for."""
         return self.compiled.describe(values, state)

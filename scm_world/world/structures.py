@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property
-from hashlib import blake2b
 from os import PathLike
 from types import MappingProxyType
 from typing import Any, final
@@ -16,6 +15,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Values
 from scm_world.backends.base import EngineSnapshot
 from scm_world.errors import InterventionError, ModelError, UnknownOption, UnknownVariable
@@ -31,7 +31,7 @@ from scm_world.world.compiled_task import (
     StepBase,
     refuse_impossible,
 )
-from scm_world.world.snapshot import WorldSnapshot, reference
+from scm_world.world.snapshot import WorldSnapshot
 
 KEPT = 8
 """Compiled tasks that are kept for structures that come again."""
@@ -70,13 +70,18 @@ class StructureCache:
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the variables and of the model, not of the arguments of the task."""
-        natural = self.natural(None)
-        structure = natural.structure(natural.model.solve(only=natural.static_names))
-        found = blake2b(str(reference(structure)).encode(), digest_size=16)
-        for variable in natural.model.variables:
-            found.update(variable.model_dump_json().encode())
-        return found.hexdigest()
+        """Hash of the variables and of the model, not of the arguments of the task."""
+        return digest(fingerprint(self._system))
+
+    def __fingerprint__(self) -> dict[str, Any]:
+        """Return what decides the system: task and arguments, compiled model, variables."""
+        return {**self.task.__fingerprint__(), **self._system}
+
+    @property
+    def _system(self) -> dict[str, Any]:
+        physics = {"physics": getattr(self.task, "system", None)}
+        model = self.natural(None).model
+        return {**physics, **self.head.__fingerprint__(), **model.__fingerprint__()}
 
     def plan(self, values: Values) -> Plan:
         """Give the structure that values of the head decide."""

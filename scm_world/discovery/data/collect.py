@@ -16,7 +16,7 @@ from scm_world.discovery.data.folders import SHARD, Folder, Head, refusals, toge
 from scm_world.discovery.data.pictures import Pictures
 from scm_world.discovery.data.sources import DataSource, ModelSource, SourceRows, Tell
 from scm_world.discovery.data.worlds import Experiments, WorldSource
-from scm_world.errors import InterventionError, ModelError, UnknownOption
+from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.output.remote import Location
 from scm_world.queries.laboratory import Laboratory
@@ -115,8 +115,6 @@ def collect(
     elif isinstance(source, Laboratory):
         allowed = ("None with a laboratory: give it a log, and save the dataset",)
         raise UnknownOption("out", str(out), allowed)
-    elif about.get("model", "") is None:
-        raise ModelError(["a function of the model has no name: define it at the top of a module"])
     head = Head(about, made.columns, count, size, made.edges)
     if out is not None:
         folder = Folder(out, head, design.modules)

@@ -13,6 +13,7 @@ import numpy as np
 
 from scm_world._arguments import load as load_library
 from scm_world._arguments import typed, whole_number
+from scm_world._fingerprint import changes
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
 from scm_world.discovery.data.pictures import ENDINGS
 from scm_world.discovery.data.shards import (
@@ -208,12 +209,11 @@ class Folder:
     def _check_same(self, there: Mapping[str, Any]) -> None:
         mine = self.head.terms
         other = [f"{key}" for key in mine if key != "about" and there.get(key) != mine[key]]
-        abouts = there.get("about", {}), mine["about"]
-        keys = dict.fromkeys((*abouts[0], *abouts[1]))
-        other += [key for key in keys if abouts[0].get(key) != abouts[1].get(key)]
+        other += changes(there.get("about", {}), mine["about"])
         if other:
             reason = f"it holds another dataset: {', '.join(other)} differ"
-            raise UnreadableFile(str(self.path), reason, "give another folder")
+            advice = "give another folder, or bring back the system and the settings of this one"
+            raise UnreadableFile(str(self.path), reason, advice)
         if there["n"] > self.head.n:
             raise FewerEpisodes(self.head.n, there["n"], str(self.path))
         if there["n"] < self.head.n:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, final
 
 import numpy as np
 
+from scm_world._fingerprint import fingerprint
 from scm_world.discovery.data.dataset import Column, Dataset, columns_of
 from scm_world.discovery.data.designs import Design
 from scm_world.discovery.data.recorded import reached
 from scm_world.discovery.data.truth import truth_of_model
-from scm_world.errors import ModelError
-from scm_world.graph import SCM, to_json
+from scm_world.graph import SCM
 from scm_world.graph.structure import Edge
 from scm_world.queries.equations import Equations
 from scm_world.queries.experiments.versions import versions
@@ -66,14 +65,6 @@ class DataSource(Protocol):
         """Run some episodes."""
 
 
-def digest_of(model: SCM) -> str | None:
-    """Return the SHA-256 of a model as JSON; None if it has a function without a name."""
-    try:
-        return hashlib.sha256(to_json(model).encode()).hexdigest()
-    except ModelError:
-        return None
-
-
 # --- models ---------------------------------------------------------------------------------------
 
 
@@ -109,7 +100,7 @@ class ModelSource:
         self.about: dict[str, Any] = {
             "format": FORMAT,
             "system": "model",
-            "model": digest_of(model),
+            "fingerprint": fingerprint({**model.__fingerprint__(), "design": design.acts}),
             "seed": seed,
             "steps": 1 if steps is None else steps,
             "design": design.as_dict(),

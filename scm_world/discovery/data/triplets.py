@@ -11,6 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import typed, whole_number
+from scm_world._fingerprint import changes, fingerprint
 from scm_world.discovery.data.pictures import ENDINGS, Pictures, Row
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.output.durable import made, write_durably
@@ -101,6 +102,7 @@ def triplets(
     about = {
         "task": world.task.name,
         "backend": world.backend.name,
+        "fingerprint": fingerprint(world),
         "given": maker.given,
         "factors": list(names),
         **asdict(taken),
@@ -120,9 +122,11 @@ def triplets(
     }
     folder, said = located(out), {"format": FORMAT, **json.loads(json.dumps(about))}
     if (folder / HEAD).exists():
-        if json.loads((folder / HEAD).read_text()) != said:
-            advice = "give the same arguments and versions, or another folder"
-            raise UnreadableFile(str(folder / HEAD), "it is of another call", advice)
+        other = changes(json.loads((folder / HEAD).read_text()), said)
+        if other:
+            advice = "give the same system, arguments and versions, or another folder"
+            reason = f"it is of another call: {', '.join(other)} differ"
+            raise UnreadableFile(str(folder / HEAD), reason, advice)
     elif folder.exists() and any(True for _ in folder.iterdir()):
         raise UnreadableFile(str(folder), "it is not empty", "give a new folder")
     else:

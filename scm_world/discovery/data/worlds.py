@@ -11,6 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import typed
+from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Column, Dataset, Regime, Row, columns_of
 from scm_world.discovery.data.designs import Design
@@ -25,7 +26,7 @@ from scm_world.discovery.data.recorded import (
     reached,
     settable,
 )
-from scm_world.discovery.data.sources import FORMAT, SourceRows, Tell, digest_of
+from scm_world.discovery.data.sources import FORMAT, SourceRows, Tell
 from scm_world.discovery.data.truth import (
     truth_of_episodes,
     truth_of_model,
@@ -146,6 +147,15 @@ class WorldSource:
         self.about: dict[str, Any] = {
             "format": FORMAT,
             **_system(world, twins),
+            "fingerprint": fingerprint(
+                {
+                    **(world.model if isinstance(world, Equations) else world).__fingerprint__(),
+                    "policy": setting.policy,
+                    "given": list(self._given.acts()),
+                    "nature": list(Plan(setting.nature).acts()),
+                    "design": design.acts,
+                }
+            ),
             "given": self._given.as_dict()["do"],
             "seed": setting.seed,
             "steps": setting.steps,
@@ -277,12 +287,8 @@ class WorldSource:
 
 def _system(world: System, twins: AnyTwins) -> dict[str, Any]:
     if isinstance(twins, EquationTwins):
-        return {"system": "model", "model": digest_of(world.model)}
-    return {
-        "system": twins.task.name,
-        "arguments": {n: str(v) for n, v in sorted(twins.task.given.items())},
-        "options": plain_options(twins.options),
-    }
+        return {"system": "model"}
+    return {"system": twins.task.name, "options": plain_options(twins.options)}
 
 
 def half_range(world: Simulation, name: str) -> Floats:

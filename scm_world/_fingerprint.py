@@ -1,0 +1,369 @@
+"""Fingerprints: hashes of everything that decides the results of a system, by name.
+
+Results that come from one system must not be mixed with those of another. A file of results carries
+the fingerprint of its system, and whoever adds to it compares the two.
+"""
+
+from __future__ import annotations
+
+import dis
+import functools
+import inspect
+import site
+import sys
+import sysconfig
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from hashlib import blake2b
+from pathlib import PurePath
+from types import (
+    BuiltinFunctionType,
+    CodeType,
+    EllipsisType,
+    FunctionType,
+    MethodType,
+    ModuleType,
+    NoneType,
+)
+from typing import Any
+
+import numpy as np
+
+Fingerprint = dict[str, str]
+"""A hash for each part of a system, by its name, and the version of each library that it uses."""
+
+PACKAGE = __name__.partition(".")[0]
+UNREAD = "unread"
+"""Stands for the hash of a part of which something has no content that can be compared."""
+
+_PLAIN = (bool, int, float, complex, str, bytes, NoneType, EllipsisType, range, slice, PurePath)
+_AROUND: dict[type, tuple[str, ...]] = {
+    MethodType: ("__func__", "__self__"),
+    classmethod: ("__func__",),
+    functools.cached_property: ("func",),
+    functools.partial: ("func", "args", "keywords"),
+    property: ("fget", "fset"),
+    staticmethod: ("__func__",),
+}
+"""Attributes of objects that hold a function."""
+
+_NO_EFFECT = {"CACHE", "EXTENDED_ARG", "NOP", "PRECALL", "RESUME"}
+_OF_CLASSES = {
+    "__abstractmethods__",
+    "__annotations__",
+    "__dataclass_fields__",
+    "__dataclass_params__",
+    "__dict__",
+    "__doc__",
+    "__firstlineno__",
+    "__module__",
+    "__qualname__",
+    "__static_attributes__",
+    "__weakref__",
+    "_abc_impl",
+}
+"""Attributes of a class that say nothing about what it computes, or repeat others."""
+
+
+def fingerprint(parts: Any, *, libraries: bool = True) -> Fingerprint:
+    """Compute a hash of each part of a system.
+
+    The hash of a part is the same in any process in which it has the same values and its functions
+    compute the same. For a function of the user's project, its code with the constants, its
+    defaults, its closure and the globals that it uses count, with their contents in turn; lines,
+    comments and docstrings do not. Functions and classes of installed libraries, and of this
+    package, count by name and by the version of the library. An object with a method
+    ``__fingerprint__`` counts as what that returns; other objects count by their attributes.
+
+    Args:
+        parts: The parts by name, or an object whose ``__fingerprint__`` returns them.
+        libraries: Whether versions of libraries count: not where results are compared bit for bit
+            anyhow.
+
+    Returns:
+        The hashes by name, in this order; then ``"version of …"`` for each library that is used.
+        Where something in a part cannot be compared, such as an open file, ``"unread: …"`` follows
+        the hash.
+
+    Example:
+        >>> def law(x, gain=2.0):
+        ...     return gain * x
+        >>> before = fingerprint({"law": law})
+        >>> law.__defaults__ = (3.0,)
+        >>> differing(before, fingerprint({"law": law}))
+        ['law']
+    """
+    found: Fingerprint = {}
+    versions: dict[str, str] = {}
+    named = parts.__fingerprint__() if hasattr(parts, "__fingerprint__") else parts
+    for name, part in named.items():
+        reader = _Reader(versions)
+        reader.read(part)
+        unread = "".join(f" {UNREAD}: {what}" for what in dict.fromkeys(reader.unread))
+        found[name] = reader.hash.hexdigest() + unread
+    met = sorted(versions) if libraries else ()
+    return found | {f"version of {name}": versions[name] for name in met}
+
+
+def differing(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:
+    """Name the parts in which two fingerprints differ; of libraries with both versions."""
+    found = []
+    for name in dict.fromkeys((*one, *other)):
+        here, there = one.get(name), other.get(name)
+        if here != there:
+            both = f" ({here or 'none'}, {there or 'none'})" * name.startswith("version of ")
+            found.append(name + both)
+    return found
+
+
+def changes(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
+    """Name the settings in which two runs differ, and of their ``"fingerprint"`` the parts.
+
+    Args:
+        there: Settings of the run that is in a file, as plain data.
+        here: Settings of the present run.
+    """
+    found = []
+    for name in dict.fromkeys((*there, *here)):
+        before, now = there.get(name), here.get(name)
+        if name == "fingerprint" and isinstance(before, dict) and isinstance(now, dict):
+            found += differing(before, now)
+        elif before != now:
+            found.append(name)
+    return found
+
+
+def digest(parts: Mapping[str, str]) -> str:
+    """Return one hash for a fingerprint."""
+    text = "\n".join(f"{name}\0{part}" for name, part in parts.items())
+    return blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+class _Reader:
+    """Feeds a hash with the content of objects.
+
+    Args:
+        libraries: Where the versions of libraries are noted.
+    """
+
+    def __init__(self, libraries: dict[str, str]) -> None:
+        self.hash = blake2b(digest_size=12)
+        self.unread: list[str] = []
+        self._libraries = libraries
+        # Each with the object, which keeps its id its own while it is here.
+        self._open: dict[int, tuple[int, Any]] = {}  # those that are being read, by their depth
+        self._done: dict[int, tuple[str, Any]] = {}  # digests of those that were read
+
+    def read(self, value: Any) -> None:
+        """Feed the hash with an object; whether it is one with another object does not count."""
+        self._note(self._text(value))
+
+    def _text(self, value: Any) -> str:
+        """Return a text for an object: itself if it is plain, else a hash of its content."""
+        if isinstance(value, _PLAIN):
+            return f"{type(value).__name__} {value!r}"
+        if id(value) in self._open:
+            return f"above {self._open[id(value)][0]}"
+        if id(value) not in self._done:
+            around, self.hash = self.hash, blake2b(digest_size=12)
+            self._open[id(value)] = len(self._open), value
+            self._read_new(value)
+            del self._open[id(value)]
+            self._done[id(value)] = self.hash.hexdigest(), value
+            self.hash = around
+        return self._done[id(value)][0]
+
+    def _note(self, *words: str) -> None:
+        for word in words:
+            data = word.encode("utf-8", "surrogatepass")
+            self.hash.update(len(data).to_bytes(8, "little") + data)
+
+    def _read_all(self, kind: str, values: Iterable[Any]) -> None:
+        listed = list(values)
+        self._note(kind, str(len(listed)))
+        for value in listed:
+            self.read(value)
+
+    def _read_new(self, value: Any) -> None:
+        cached = isinstance(value, functools._lru_cache_wrapper)
+        inner = value.__wrapped__ if cached else getattr(value, "py_func", None)  # of numba
+        match value:
+            case _ if isinstance(inner, FunctionType):
+                self.read(inner)
+            case list() | tuple() if type(value) in (list, tuple):
+                self._read_all(type(value).__name__, value)
+            case set() | frozenset():  # which each process has in an order of its own
+                self._note("set", *sorted(map(self._text, value)))
+            case np.ndarray() | np.generic() if not value.dtype.hasobject:
+                self._note("array", value.dtype.str, str(value.shape))
+                self.hash.update(np.ascontiguousarray(value).tobytes())
+            case dict() if type(value) is dict:
+                self._read_all("dict", [part for item in value.items() for part in item])
+            case ModuleType():
+                self._name(value.__name__, "")
+            case CodeType():
+                self._read_code(value)
+            case FunctionType():
+                self._read_function(value)
+            case _ if type(value) in _AROUND:
+                inside = [getattr(value, name) for name in _AROUND[type(value)]]
+                self._read_all(type(value).__name__, inside)
+            case Enum():
+                self._read_all("enum", (type(value), value.name))
+            case type():
+                self._read_class(value)
+            case BuiltinFunctionType() | np.ufunc():
+                self._name(getattr(value, "__module__", None) or "builtins", value.__name__)
+            case _:
+                self._read_object(value)
+
+    def _name(self, module: str, name: str) -> None:
+        """Feed the hash with the name of a thing of a library, and note the library's version."""
+        top = module.partition(".")[0]
+        if top not in sys.stdlib_module_names and top not in ("builtins", "__main__"):
+            version = getattr(sys.modules.get(top), "__version__", "unknown")
+            self._libraries.setdefault(top, str(version))
+        self._note("named", module, name)
+
+    def _read_function(self, function: FunctionType) -> None:
+        if not _is_project(function.__module__, function.__code__.co_filename):
+            self._name(function.__module__, function.__qualname__)
+            # What a library makes of the user's functions, such as a decorator, holds them here.
+            self._read_all("closure", _cells(function))
+            return
+        self._read_code(function.__code__)
+        self._read_all("held", (function.__defaults__, function.__kwdefaults__, *_cells(function)))
+        names = sorted(_names_in(function.__code__))
+        for name in names:
+            if name not in function.__globals__:
+                continue
+            there = function.__globals__[name]
+            self._note("global", name)
+            if isinstance(there, ModuleType) and _is_project(there.__name__):
+                self._read_all("module", [vars(there)[n] for n in names if n in vars(there)])
+            else:
+                self.read(there)
+
+    def _read_code(self, code: CodeType) -> None:
+        """Feed the hash with what code does; where it stands and what it is called do not count."""
+        counts = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount
+        flags = code.co_flags & (inspect.CO_VARARGS | inspect.CO_VARKEYWORDS)
+        arguments = code.co_varnames[: sum(counts)]
+        self._read_all("code", (counts, flags, arguments, code.co_exceptiontable))
+        for step in dis.get_instructions(code):
+            if step.opname not in _NO_EFFECT:
+                self._note(step.opname)
+                if step.opname != "MAKE_CELL":
+                    self.read(step.argval)
+
+    def _read_class(self, kind: type) -> None:
+        if not _is_project(kind.__module__):
+            self._name(kind.__module__, kind.__qualname__)
+            return
+        self._note("class", kind.__qualname__)
+        self._read_all("bases", kind.__bases__)
+        for name in sorted(vars(kind)):
+            hidden = name in _OF_CLASSES or name.startswith(("__pydantic", "__slotnames"))
+            value = vars(kind)[name]
+            if hidden or inspect.ismemberdescriptor(value) or inspect.isgetsetdescriptor(value):
+                continue
+            self._note(name)
+            self.read(value)
+
+    def _read_object(self, value: Any) -> None:
+        kind = type(value)
+        self.read(kind)
+        own = getattr(kind, "__fingerprint__", None)
+        if own is not None:
+            self.read(own(value))
+            return
+        if isinstance(value, list | tuple):  # such as a named tuple
+            self._read_all("items", iter(value))
+        elif isinstance(value, Mapping):
+            self._read_all("items", [part for item in value.items() for part in item])
+        if is_dataclass(value):
+            names = [one.name for one in fields(value)]
+        elif hasattr(value, "__dict__") and (_is_project(kind.__module__) or _is_ours(kind)):
+            slots = [name for each in kind.__mro__ for name in _slots(each)]
+            names = sorted({*vars(value), *slots} - _lazy(kind))
+        else:
+            try:  # what it would be pickled as, except tensors of torch, whose pickles differ
+                tensor = hasattr(value, "detach") and hasattr(value, "numpy")
+                state = value.detach().cpu().numpy() if tensor else value.__reduce_ex__(4)
+            except Exception:  # whatever the class raises
+                self.unread.append(f"{kind.__module__}.{kind.__qualname__}")
+                return
+            inside = isinstance(state, tuple)
+            self._read_all("state", [_listed(part) for part in state] if inside else [state])
+            return
+        for name in names:
+            if hasattr(value, name):
+                self._note(name)
+                self.read(getattr(value, name))
+
+
+def _listed(part: Any) -> Any:
+    """Return the elements of an iterator, as a class may give for its items, as a list."""
+    return list(part) if isinstance(part, Iterator) else part
+
+
+def _cells(function: FunctionType) -> list[Any]:
+    """List what a function's closure holds; a cell that is still empty counts as None."""
+    found = []
+    for cell in function.__closure__ or ():
+        try:
+            found.append(cell.cell_contents)
+        except ValueError:
+            found.append(None)
+    return found
+
+
+def _names_in(code: CodeType) -> set[str]:
+    """Return the names that code and the code inside of it look up."""
+    inner = [_names_in(part) for part in code.co_consts if isinstance(part, CodeType)]
+    return set(code.co_names).union(*inner)
+
+
+def _slots(kind: type) -> Iterable[str]:
+    slots = vars(kind).get("__slots__", ())
+    return (slots,) if isinstance(slots, str) else slots
+
+
+@functools.cache
+def _lazy(kind: Any) -> frozenset[str]:
+    """Return the attributes of a class that are computed when they are first asked for."""
+    every = {name: value for each in reversed(kind.__mro__) for name, value in vars(each).items()}
+    lazy = functools.cached_property
+    return frozenset(name for name, value in every.items() if isinstance(value, lazy))
+
+
+def _is_ours(kind: type) -> bool:
+    return kind.__module__.partition(".")[0] == PACKAGE
+
+
+@functools.cache
+def _library_folders() -> tuple[str, ...]:
+    paths = sysconfig.get_paths()
+    found = [paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
+    return tuple({*found, *site.getsitepackages(), site.getusersitepackages()})
+
+
+@functools.cache
+def _is_project(module: str | None, file: str | None = None) -> bool:
+    """Tell whether a module is neither of this package, nor of Python, nor installed.
+
+    Args:
+        module: Its name.
+        file: Where the code stands; the file of the module if None.
+    """
+    top = (module or "").partition(".")[0]
+    if top in ("__main__", "__mp_main__"):
+        return True
+    if top == PACKAGE or top in sys.builtin_module_names:
+        return False
+    found = sys.modules.get(module or "")
+    place = getattr(found, "__file__", None) or file
+    if place is None or place.startswith("<"):
+        return top not in sys.stdlib_module_names
+    return not any(place.startswith(folder) for folder in _library_folders())
