@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world._fingerprint import changes
+from scm_world._fingerprint import differing, fingerprint
 from scm_world.curricula import Do
 from scm_world.errors import (
     DAMAGED,
@@ -36,9 +36,6 @@ from scm_world.tasks import Task, tasks
 from scm_world.tasks.factories import refuse_untrusted
 from scm_world.tasks.model import is_model
 from scm_world.variables.mechanisms import check_trusted
-
-_TASK = ("task", "arguments", "fingerprint")
-"""What says of an evaluation where it happened."""
 
 
 @final
@@ -131,8 +128,7 @@ def _place(
     options = _acts(about["env"], trusted)
     if task is not None:
         place = EvaluationPlace(task, options)
-        now = place.about()
-        _same_task(about, now)
+        _same_task(about, place)
         return place
     text = about["task"]
     refuse_untrusted(text, None if known else trusted)
@@ -142,20 +138,22 @@ def _place(
     if about["arguments"]:
         options["task_options"] = about["arguments"]
     place = EvaluationPlace(about["task"], options)
-    _same_task(about, place.about())
+    _same_task(about, place)
     return place
 
 
-def _same_task(about: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+def _same_task(about: Mapping[str, Any], place: EvaluationPlace) -> None:
     """Refuse a task that is not the one that was evaluated.
 
     Raises:
         UnknownOption: With the parts that differ.
     """
-    parts = changes({key: about.get(key) for key in _TASK}, {key: now.get(key) for key in _TASK})
+    now = place.made.__fingerprint__()
+    there = {name: part for name, part in about["fingerprint"].items() if name in now}
+    parts = differing(there, fingerprint(now, libraries=False))
     if parts:
         allowed = (f"the one that was evaluated: {', '.join(parts)} differ",)
-        raise UnknownOption("task", now["task"], allowed)
+        raise UnknownOption("task", place.name, allowed)
 
 
 def _agent_runs(evaluation: Evaluation, policy: Any, trusted: Sequence[str]) -> Iterator[AgentRun]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -149,19 +150,28 @@ def test_a_log_that_is_no_file_is_refused(tmp_path: Path) -> None:
         lab(log=tmp_path / "missing" / "log.jsonl")
 
 
-def test_a_killed_process_loses_no_finished_experiment(tmp_path: Path) -> None:
+def test_a_killed_process_loses_no_finished_experiment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It is killed in the middle of the third."""
     log = tmp_path / "log.jsonl"
-    script = f"""
+    (tmp_path / "killed_policy.py").write_text(
+        """
 import os
-from scm_world.queries import Laboratory, World
-calls = 0
+
 def policy(world):
-    global calls
-    calls += 1
+    calls = int(os.environ.get("CALLS", "0")) + 1
+    os.environ["CALLS"] = str(calls)
     if calls > 10:
         os.kill(os.getpid(), 9)
     return world["joint_positions"]
+"""
+    )
+    script = f"""
+import sys
+sys.path.insert(0, {str(tmp_path)!r})
+from killed_policy import policy
+from scm_world.queries import Laboratory, World
 lab = Laboratory(World("pushing", backend="fake"), outcomes=["reward"], steps=2, log={str(log)!r},
                  policy=policy)
 for _ in range(9):
@@ -169,9 +179,13 @@ for _ in range(9):
 """
     killed = subprocess.run([sys.executable, "-c", script], check=False)  # noqa: S603 # our own
     assert killed.returncode == -9
+    monkeypatch.syspath_prepend(tmp_path)
+    policy = importlib.import_module("killed_policy").policy
     world = World("pushing", backend="fake")
-    again = Laboratory(world, outcomes=["reward"], steps=2, log=log, policy=lambda w: w["action"])
+    again = Laboratory(world, outcomes=["reward"], steps=2, log=log, policy=policy)
     assert again.spent == 4
+    with pytest.raises(UnreadableFile, match="policy differ"):
+        Laboratory(world, outcomes=["reward"], steps=2, log=log, policy=lambda w: w["action"])
 
 
 def test_a_protocol_is_a_table(tmp_path: Path) -> None:

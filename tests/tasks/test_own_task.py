@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from scm_world._fingerprint import differing
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.evaluation import evaluate, protocols_of
 from scm_world.evaluation.checking import check
@@ -38,10 +39,10 @@ def test_what_is_registered_is_known_by_its_name(registry: dict[str, type[Task]]
     assert isinstance(Simulation("mine", backend="fake").task, Mine)
     assert [protocol.name for protocol in protocols_of("mine")] == ["P0"]
     found = evaluate("still", task="mine", n=1, backend="fake", env={"max_episode_length": 2})
-    assert "Mine" in found.about["class"]
+    assert "class of the task" in found.about["fingerprint"]
     assert check(found, episodes=1)
     registry["mine"] = type("Changed", (Mine,), {})
-    with pytest.raises(UnknownOption, match="Changed"):
+    with pytest.raises(UnknownOption, match="class of the task differ"):
         check(found, episodes=1)
 
 
@@ -53,8 +54,10 @@ def test_a_recipe_takes_it(registry: dict[str, type[Task]]) -> None:
     made = recipe("mine", worlds=2, n_steps=8, batch_size=8, steps=16)
     assert made.trials.protocols == ("P0",)
     assert Recipe.from_dict(made.as_dict()) == made
-    assert "Mine" in identity_of(made, None)["class"]
-    assert "class" not in identity_of(recipe("reaching"), None)
+    before = identity_of(made, None)["fingerprint"]
+    registry["mine"] = type("Changed", (Mine,), {})
+    assert differing(before, identity_of(made, None)["fingerprint"]) == ["class of the task"]
+    registry["mine"] = Mine
     with pytest.raises(UnknownOption, match="P5"):
         recipe("mine", trials={"protocols": ["P5"]})
 
