@@ -272,7 +272,7 @@ class _Reader:
             self.read(value)
 
     def _read_object(self, value: Any) -> None:
-        kind = type(value)
+        kind: Any = type(value)
         self.read(kind)
         own = getattr(kind, "__fingerprint__", None)
         if own is not None:

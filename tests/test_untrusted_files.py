@@ -78,7 +78,7 @@ def _read_curriculum(reference: str) -> None:
 def _model(reference: str) -> dict[str, Any]:
     function = {"kind": "function", "reference": reference}
     return {
-        "format": "scm_world/model/1",
+        "format": "scm_world/model/2",
         "variables": [
             {"kind": "exogenous", "name": "size", "default": 1.0},
             {

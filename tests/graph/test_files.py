@@ -164,14 +164,14 @@ def test_a_lambda_cannot_be_written() -> None:
         "not json",
         "[]",
         "{}",
-        '{"format": "scm_world/model/1"}',
-        '{"format": "scm_world/model/1", "variables": [{"kind": "exogenous"}]}',
-        '{"format": "scm_world/model/1", "variables": [{"kind": "alien", "name": "x"}]}',
-        '{"format": "scm_world/model/1", "variables": [{"kind": "exogenous", "name": "x", '
+        '{"format": "scm_world/model/2"}',
+        '{"format": "scm_world/model/2", "variables": [{"kind": "exogenous"}]}',
+        '{"format": "scm_world/model/2", "variables": [{"kind": "alien", "name": "x"}]}',
+        '{"format": "scm_world/model/2", "variables": [{"kind": "exogenous", "name": "x", '
         '"a": {"kind": "box", "low": 0}}]}',
-        '{"format": "scm_world/model/1", "variables": [], '
+        '{"format": "scm_world/model/2", "variables": [], '
         '"interventions": {"x": {"kind": "hard", "value": 1}}}',
-        '{"format": "scm_world/model/1", "variables": [{"kind": "derived", "name": "x", '
+        '{"format": "scm_world/model/2", "variables": [{"kind": "derived", "name": "x", '
         '"parents": [{"name": "y", "bogus": 1}], '
         '"mechanism": {"kind": "linear", "weights": [1]}}]}',
     ],

@@ -121,7 +121,7 @@ def test_functions_that_are_no_mechanisms_are_not_trusted() -> None:
     )
     for reference in ("scm_world.cli.app:main", "scm_world.tasks.factories:load_factory"):
         data: dict[str, Any] = {
-            "format": "scm_world/model/1",
+            "format": "scm_world/model/2",
             "variables": [
                 {"kind": variable["kind"], **variable} for variable in _plain(model, reference)
             ],
@@ -173,7 +173,7 @@ def test_an_episode_that_says_something_else_is_refused(
         load_episode(tmp_path / "other.npz")
 
 
-@pytest.mark.parametrize("written", [3, [], {}, {"format": "scm_world/model/1"}, "x"])
+@pytest.mark.parametrize("written", [3, [], {}, {"format": "scm_world/model/2"}, "x"])
 def test_an_episode_of_other_equations_is_refused(tmp_path: Path, written: Any) -> None:
     """The error says that there is no model."""
     episode = SCM([Exogenous(name="size", default=1.0)]).rollout()
