@@ -131,7 +131,7 @@ def changes(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
             found += differing(before, now)
         elif before != now:
             found.append(name)
-    return found
+    return list(dict.fromkeys(found))
 
 
 def digest(parts: Mapping[str, str]) -> str:

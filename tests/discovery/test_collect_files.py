@@ -106,14 +106,14 @@ def test_files_are_tables_for_others(written: tuple[Path, Dataset]) -> None:
 
 
 def test_a_model_goes_into_a_folder(tmp_path: Path) -> None:
-    """If it can be written; a model with nameless functions could not be told from another."""
+    """Also one with a function without a name, which its content tells from others."""
     named = SCM([Exogenous(name="x", distribution=Box(0.0, 1.0))])
     found = collect(named, Design(), 7, out=tmp_path / "a", shard=3)
     assert load(tmp_path / "a") == found == collect(named, Design(), 7)
     nameless = named.do({"x": Mechanism(lambda: 1.0)})
-    assert len(collect(nameless, Design(), 2)) == 2
-    with pytest.raises(ModelError, match="has no name"):
-        collect(nameless, Design(), 2, out=tmp_path / "b")
+    assert len(collect(nameless, Design(), 2, out=tmp_path / "b")) == 2
+    with pytest.raises(UnreadableFile, match="intervention on 'x' differ"):
+        collect(named.do({"x": Mechanism(lambda: 2.0)}), Design(), 2, out=tmp_path / "b")
 
 
 def test_mechanisms_are_read_back_where_they_are_trusted(tmp_path: Path) -> None:
