@@ -14,6 +14,7 @@ from scm_world.discovery.learners import EstimatedGraph, learn, libraries
 from scm_world.discovery.learners.known import OTHERS
 from scm_world.discovery.problems import problem
 from scm_world.errors import ModelError
+from scm_world.graph.ancestral import TAIL
 
 MODULES = {"causal-learn": "causallearn"}
 NEEDS = {each.name: MODULES.get(each.package, each.package) for each in OTHERS}
@@ -256,6 +257,23 @@ def test_pc_knows_the_past() -> None:
     values = np.stack([x, x + draw.normal(size=len(x))], axis=1)
     data = Dataset.of(values, ["x", "y"], episode=[0] * len(x), step=range(len(x)))
     assert learn("pc", data).directed == (("x", "y", 0), ("x", "x", 1))
+
+
+@pytest.mark.parametrize("name", ["fci", "lpcmci"])
+def test_the_order_of_time_makes_no_tail(name: str) -> None:
+    """A hidden cause of x now and y later: o->, and <-> where an instrument of x tells so."""
+    pytest.importorskip("causallearn" if name == "fci" else "tigramite")
+    u, x, y, z = np.random.default_rng(4).normal(size=(4, 4001))
+    x, y = x + u, y + np.roll(u, 1)
+    for columns, word in (((x, y), "x@-1 o-> y"), ((x, y, z), "x@-1 <-> y")):
+        if len(columns) == 3:
+            columns = (x + 1.5 * z, y, z)
+        rows = np.stack(columns, axis=1)[1:]
+        table = Dataset.of(rows, list("xyz")[: len(columns)], episode=[0] * 4000, step=range(4000))
+        found = learn(name, table, alpha=0.001)
+        assert word in found.words
+        assert found.marks is not None
+        assert not (found.marks == TAIL).any()
 
 
 # --- reading their graphs ------------------------------------------------------------------------

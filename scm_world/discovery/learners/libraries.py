@@ -197,11 +197,12 @@ def fci(
     }
 
     def search(table: Dataset) -> tuple[Any, str]:
-        graph, _ = import_module("causallearn.search.ConstraintBased.FCI").fci(
-            table.values, "fisherz", alpha, -1 if depth is None else depth,
-            -1 if longest is None else longest, background_knowledge=_past_first(table),
-            show_progress=False,
-        )  # fmt: skip
+        library = import_module("causallearn.search.ConstraintBased.FCI")
+        with _later_ends_are_heads(library, table):
+            graph, _ = library.fci(
+                table.values, "fisherz", alpha, -1 if depth is None else depth,
+                -1 if longest is None else longest, show_progress=False,
+            )  # fmt: skip
         return np.array(graph.graph), ""
 
     return _static("fci", search, data, seed, settings, marked=True)
@@ -352,6 +353,33 @@ def _past_first(data: Dataset) -> Any:
     for i, lag in enumerate(lags):
         knowledge.add_node_to_tier(node(f"X{i + 1}"), max(lags) - lag)  # the names PC gives
     return knowledge
+
+
+@contextmanager
+def _later_ends_are_heads(library: Any, data: Dataset) -> Iterator[None]:
+    """Tell FCI that later columns do not act on earlier ones, and nothing else.
+
+    Its ``BackgroundKnowledge`` would make the earlier end of such an edge a tail, and refuse a head
+    there (https://github.com/py-why/causal-learn/issues/266): both are false where a hidden cause
+    acts on both. Instead, whenever it makes all marks circles, the later ends become heads.
+    """
+    lags, edge_of = [column.lag for column in data.columns], import_module("causallearn.graph.Edge")
+    reset, head = library.reorientAllWith, library.Endpoint.ARROW
+
+    def reset_all_but_heads(graph: Any, endpoint: Any) -> None:
+        reset(graph, endpoint)
+        lag_of = {node: lags[number] for node, number in graph.get_node_map().items()}
+        for edge in graph.get_graph_edges():
+            late, early = sorted((edge.get_node1(), edge.get_node2()), key=lag_of.__getitem__)
+            if lag_of[late] < lag_of[early]:
+                graph.remove_edge(edge)
+                graph.add_edge(edge_of.Edge(early, late, endpoint, head))
+
+    library.reorientAllWith = reset_all_but_heads
+    try:
+        yield
+    finally:
+        library.reorientAllWith = reset
 
 
 def environments(data: Dataset) -> tuple[list[Floats], list[list[int]]]:
