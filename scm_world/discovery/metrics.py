@@ -293,7 +293,9 @@ def evaluate_marks(found: EstimatedGraph, truth: GroundTruth) -> MarkScores:
     lags = len(made) - 1 or None
     real, known = truth.mag(lags), truth.pag(lags)
     made = np.concatenate([made, np.zeros_like(real)[len(made) :]])
-    made, real, known = (np.where(truth.pairs, each, 0) for each in (made, real, known))
+    pairs = truth.pairs[: len(real)] if truth.unseen else np.broadcast_to(truth.pairs, real.shape)
+    counts = _counting(pairs, real.shape)
+    made, real, known = (np.where(counts, each, 0) for each in (made, real, known))
     once = np.ones(real.shape, dtype=bool)  # a pair within the instant counts once
     once[0] = np.triu(once[0])
     rates: dict[str, Any] = {}

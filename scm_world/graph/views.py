@@ -24,7 +24,7 @@ def unrolled(model: SCM, steps: int) -> nx.DiGraph:
 
 
 def episode_outcome(
-    model: SCM, outcomes: Iterable[str], *, starts: Iterable[str] = ()
+    model: SCM, outcomes: Iterable[str], *, starts: Iterable[str] = (), contact: bool = True
 ) -> nx.DiGraph:
     """Return the static graph of one episode: parameters, starting states, and what it ends with.
 
@@ -35,6 +35,7 @@ def episode_outcome(
         model: With or without interventions.
         outcomes: States or readouts, at the end.
         starts: States that vary at the beginning; their nodes are named ``"<name>@0"``.
+        contact: Whether bodies may touch; edges by contact are left out if not.
 
     Example:
         >>> from scm_world.variables import Exogenous, Measured, Parent
@@ -46,13 +47,14 @@ def episode_outcome(
         [('mass', 'speed'), ('speed@0', 'speed')]
     """
     parameters = [name for name in model if model.declared(name).role == "parameter"]
-    follow = nx.DiGraph((edge.cause, edge.effect) for edge in model.edges)
+    edges = [edge for edge in model.edges if contact or edge.when != "contact"]
+    follow = nx.DiGraph((edge.cause, edge.effect) for edge in edges)
     follow.add_nodes_from(model)
     graph = nx.DiGraph()
     graph.add_nodes_from(parameters)
     graph.add_edges_from(
         (edge.cause, edge.effect)
-        for edge in model.edges
+        for edge in edges
         if edge.cause in graph and edge.effect in graph and edge.when != "set"
     )
     still = set(parameters)

@@ -43,7 +43,11 @@ class Identification:
 
 
 def nature_graph(
-    model: SCM, nature: Mapping[str, Any] | None, outcomes: Iterable[str]
+    model: SCM,
+    nature: Mapping[str, Any] | None,
+    outcomes: Iterable[str],
+    *,
+    contact: bool = True,
 ) -> nx.DiGraph:
     """Give the static graph of an episode in which nature does something at the beginning.
 
@@ -52,6 +56,7 @@ def nature_graph(
         nature: What varies by itself; a ``Mechanism`` adds its edges, and so does a ``Draw`` from
             a space that follows other variables.
         outcomes: What the episode ends with.
+        contact: Whether bodies may touch; edges by contact are left out if not.
 
     Raises:
         ModelError: Nature does something later than at the beginning.
@@ -68,7 +73,7 @@ def nature_graph(
     moved = [name for name in acts if model.declared(model.target(name)).role == "state"]
     states = [target for name in moved for target in model.targets(name)]
     held = model.do({name: act for name, act in acts.items() if name not in moved})
-    graph = episode_outcome(held, outcomes, starts=states)
+    graph = episode_outcome(held, outcomes, starts=states, contact=contact)
     for name in moved:
         followed = sorted(_followed(model, name, acts[name]))
         causes = [n if n in graph else f"{n}@0" for n in followed]

@@ -9,7 +9,7 @@ to Y in the order of time: what reaches a body only after it has let go of Y doe
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, final
 
 import networkx as nx
@@ -60,7 +60,7 @@ def local_graph(world: Simulation, action: ArrayLike | None = None) -> nx.DiGrap
     steps: Touching = (world.backend.contacts(),)
     if action is not None:
         try:
-            steps = _contacts_of(world, action)
+            steps = contacts_of(world, action)
         finally:
             world.restore(before)
     pressing = [[contact for contact in step if contact.force > 0.0] for step in steps]
@@ -107,6 +107,91 @@ def _body_of(name: str, bodies: Iterable[str]) -> str:
     return next((body for body in bodies if name.startswith(f"{body}_link_")), name)
 
 
+# --- conditions of edges --------------------------------------------------------------------------
+
+
+def contact_terms(world: Simulation) -> dict[str, Any]:
+    """Say between which bodies the edges hold that are declared ``when="contact"``.
+
+    A variable stands for the bodies of the states that it acts on in every step, or follows from;
+    a parameter of a body or shape also for that body; one of which nothing is known for any.
+
+    Returns:
+        Plain data. ``"together"``: groups of bodies that are coupled in every step. ``"still"``:
+        bodies that never move. ``"of"``: the bodies of each variable, one of each group.
+    """
+    model, touched, shaped = world.model, world.composition.touched(), world.composition.shaped()
+    states = {v.name for v in model.variables if v.role == "state"}
+    after, before = dict[str, list[str]](), dict[str, list[str]]()
+    coupled = nx.Graph()
+    coupled.add_nodes_from((name, "state") for name in states)
+    coupled.add_edges_from(((body, "body"), (n, "state")) for body, n in _pairs(touched))
+    for edge in model.edges:
+        if edge.when != "contact":
+            after.setdefault(edge.cause, []).append(edge.effect)
+            before.setdefault(edge.effect, []).append(edge.cause)
+            if edge.cause in states and edge.effect in states:
+                coupled.add_edge((edge.cause, "state"), (edge.effect, "state"))
+    together, groups = list[list[str]](), dict[str, list[str]]()  # by state: the first of them
+    for part in nx.connected_components(coupled):
+        bodies = sorted(name for name, kind in part if kind == "body")
+        together += [bodies] if bodies else []
+        groups.update((name, bodies[:1]) for name, kind in part if kind == "state")
+    of = {}
+    for name in model:
+        found = {shaped[name]} if name in shaped else set()
+        for way in (after, before):
+            ahead, seen = [name], {name}
+            while ahead:
+                here = ahead.pop()
+                found.update(groups.get(here, ()))
+                new = set(way.get(here, ())) - seen if here not in states else set()
+                seen |= new
+                ahead += new
+        of[name] = sorted(found)
+    still = sorted(body for body, moved in touched.items() if not moved)
+    return {"of": of, "together": sorted(together), "still": still}
+
+
+def _pairs(touched: Mapping[str, Iterable[str]]) -> Iterator[tuple[str, str]]:
+    return ((body, state) for body, moved in touched.items() for state in moved)
+
+
+def holds(
+    terms: Mapping[str, Any], touching: Iterable[Iterable[str]]
+) -> Callable[[str, str], bool]:
+    """Return what tells of cause and effect whether an edge by contact holds.
+
+    It does if a chain of contacts between bodies that move joins one of the cause to one of the
+    effect. A body that ``terms`` do not know joins all.
+
+    Args:
+        terms: Of ``contact_terms``.
+        touching: Pairs of bodies.
+    """
+    still, together = set(terms["still"]), [set(group) for group in terms["together"]]
+    group = {body: bodies for bodies in together for body in bodies}
+    everything = set[str]().union(*together)
+    islands: list[set[str]] = []
+    for pair in touching:
+        members = set(pair).union(
+            *(group.get(body, everything) for body in pair if body not in still)
+        )
+        joined = [island for island in islands if island & members - still]
+        islands = [island for island in islands if not island & members - still]
+        islands.append(members.union(*joined))
+    bodies = {name: set(found) for name, found in terms["of"].items()}
+
+    def found(cause: str, effect: str) -> bool:
+        ends = bodies.get(cause), bodies.get(effect)
+        return any(all(island & end for end in ends if end) for island in islands)
+
+    return found
+
+
+# --- physics steps --------------------------------------------------------------------------------
+
+
 @final
 class _Listener:
     """Stands in for a backend: takes physics steps one by one, and notes what touches in each.
@@ -128,7 +213,7 @@ class _Listener:
             self.contacts.append(self._backend.contacts())
 
 
-def _contacts_of(world: Simulation, action: ArrayLike) -> Touching:
+def contacts_of(world: Simulation, action: ArrayLike) -> Touching:
     """Take a control step, and return the contacts of each of its physics steps."""
     engine: Any = world.backend
     listener: Any = _Listener(engine)

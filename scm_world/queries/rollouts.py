@@ -14,6 +14,7 @@ from scm_world._types import Floats, Integers, Value
 from scm_world.errors import ActionError
 from scm_world.policies.scripted import Policy, as_policy
 from scm_world.queries.equations import Equations, System
+from scm_world.queries.local import Touching, contacts_of
 from scm_world.queries.plans import GroupedSchedules, Key, Layer, Schedule
 from scm_world.world import Audit, Simulation
 from scm_world.world.batch import Batch, StateTable
@@ -39,7 +40,8 @@ class Trace:
         fired: When events happened.
         audits: What interventions did, by control step.
         values: Of the variables that were asked for, at each instant.
-        touching: Pairs of bodies that touch at each instant, where asked for.
+        touching: Pairs of bodies that touched in the control step before each instant, where asked
+            for; at the first instant those of the last physics step.
     """
 
     vectors: list[Floats] = field(default_factory=list)
@@ -186,6 +188,8 @@ class Running:
         self.trace = unit.past.until(unit.first)
         self.trace.values = {name: list(values) for name, values in unit.past.values.items()}
         self._version = -1
+        self._listens = unit.contacts and isinstance(world, Simulation)
+        self._touched: Touching = ()
 
     @cached_property
     def schedule(self) -> Schedule | GroupedSchedules:
@@ -231,15 +235,19 @@ class Running:
             found = world.values() if names == (ALL,) else world.evaluate(there)
             for name in found if names == (ALL,) else there:
                 trace.values.setdefault(name, []).append(np.array(found[name]))
-        if self.unit.contacts and isinstance(world, Simulation):
-            pairs = (tuple(sorted(c.bodies)) for c in world.backend.contacts() if c.force > 0.0)
+        if self._listens:
+            touched = self._touched or (self.world.backend.contacts(),)
+            pairs = {tuple(sorted(c.bodies)) for contacts in touched for c in contacts}
             trace.touching.append(frozenset((one, other) for one, other in pairs))
 
     def act(self, step: int, action: Any = None) -> None:
         """Take a control step, with the action of the policy if none is given."""
         policy = self.policy if action is None else lambda _: action
         chosen = _chosen(policy, self.world)
-        self.world.step(chosen)
+        if self._listens:
+            self._touched = contacts_of(self.world, chosen)
+        else:
+            self.world.step(chosen)
         self.trace.actions.append(chosen)
 
     def forget(self) -> None:

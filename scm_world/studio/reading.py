@@ -16,6 +16,7 @@ from scm_world.errors import UnknownOption
 from scm_world.graph import scm as graph
 from scm_world.policies.zoo import zoo
 from scm_world.queries import SCM, Plan, World
+from scm_world.queries.local import contact_terms, holds
 from scm_world.tasks import make_task
 from scm_world.tasks.factories import load_factory
 from scm_world.variables.spaces import Box, Categories, Either, Integers
@@ -217,35 +218,10 @@ def period(live: Any) -> float:
     return float(live.control_period) if isinstance(live, Simulation) else 1.0
 
 
-def lit_edges(model: Any, pairs: frozenset[tuple[str, str]]) -> list[int]:
-    """Number the edges by contact that join what touches.
-
-    The states of a body are those named after it, and those on which a parameter of it acts
-    in every step. A parameter of what has no states, such as a floor, counts wherever bodies touch.
-    """
-    edges, moves, acts = list(model.edges), dict[str, set[str]](), dict[str, set[str]]()
-    for name in model:
-        if model.declared(name).role == "state":
-            moves.setdefault(name.rpartition(".")[0], set()).add(name)
-    for edge in edges:
-        if edge.lag and edge.when is None:
-            acts.setdefault(edge.cause, set()).add(edge.effect)
-            if model.declared(edge.cause).role == "parameter":
-                moves.setdefault(edge.cause.rpartition(".")[0], set()).add(edge.effect)
-    moves.pop("", None)
-    islands: list[set[str]] = []
-    for pair in pairs:
-        moved = set[str]().union(*(moves.get(body, set()) for body in pair))
-        joined = [island for island in islands if island & moved]
-        islands = [island for island in islands if not island & moved]
-        islands.append(moved.union(*joined))
-    found = []
-    for number, edge in enumerate(edges):
-        island = next((one for one in islands if edge.effect in one), None)
-        if edge.when == "contact" and island is not None:
-            is_state = model.declared(edge.cause).role == "state"
-            mine = {edge.cause} if is_state else acts.get(edge.cause, set())
-            mine = mine or moves.get(edge.cause.rpartition(".")[0], set())
-            if not mine or mine & island:
-                found.append(number)
-    return found
+def lit_edges(world: Simulation, pairs: frozenset[tuple[str, str]]) -> list[int]:
+    """Number the edges by contact that hold while these bodies touch."""
+    if not pairs:
+        return []
+    acts = holds(contact_terms(world), pairs)
+    edges = enumerate(world.model.edges)
+    return [n for n, edge in edges if edge.when == "contact" and acts(edge.cause, edge.effect)]

@@ -317,7 +317,7 @@ class Session:
         """Number the edges by contact along which bodies act on one another at an instant."""
         pairs = self._lanes[FACTUAL].contacts[step][1]
         if pairs not in self._lit:
-            self._lit[pairs] = lit_edges(self._lanes[FACTUAL].live.world.model, pairs)
+            self._lit[pairs] = lit_edges(self._lanes[FACTUAL].live.world, pairs)
         return self._lit[pairs]
 
     # --- Python ---------------------------------------------------------------------------------

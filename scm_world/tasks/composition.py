@@ -266,6 +266,14 @@ class Composition(ABC):
         """Name the bodies between which local graphs are; none if it has no such bodies."""
         return ()
 
+    def touched(self) -> Mapping[str, tuple[str, ...]]:
+        """Map each body, as contacts name it, to the states that move it; none if it is fixed."""
+        return {}
+
+    def shaped(self) -> Mapping[str, str]:
+        """Map parameters to the body whose contacts they shape, as far as that is known."""
+        return {}
+
     def goals(self, values: Values) -> tuple[GoalRegion, ...]:
         """Describe all goals."""
         return ()

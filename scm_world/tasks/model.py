@@ -78,6 +78,33 @@ class ModelComposition(Composition):
         """Give a state to read into."""
         return self._model.empty_state()
 
+    def touched(self) -> Mapping[str, tuple[str, ...]]:
+        """Map each body to the states of its tree; none if the model describes no bodies."""
+        model, states = self._model, dict[str, list[str]]()
+        if model.describe is None:
+            return {}
+        for row in model.states:
+            states.setdefault(model.trees[row.tree], []).append(row.name)
+        found, top = dict[str, tuple[str, ...]](), [""]
+        for number, body in enumerate(model.bodies.bodies):  # parents come before children
+            if number:
+                top.append(top[body.parent] or body.name)
+            moves = model.bodies.roots[number] > 0
+            found[body.name] = (*states.get(top[number], ()),) if moves else ()
+        return found
+
+    def shaped(self) -> Mapping[str, str]:
+        """Map the parameters of bodies and shapes to the body."""
+        model = self._model
+        bodies = None if model.describe is None else model.bodies
+        found = {}
+        for row in model.parameters if bodies else ():
+            place = bodies.places.get(row.key)
+            if place and place.table in ("bodies", "geoms"):
+                number = bodies.geoms[place.row].body if place.table == "geoms" else place.row
+                found[row.name] = bodies.bodies[number].name
+        return found
+
 
 class DeclaredTask(Task):
     """What tasks of any model and of any step function have in common: what counts in them.

@@ -265,9 +265,7 @@ def test_the_order_of_time_makes_no_tail(name: str) -> None:
     pytest.importorskip("causallearn" if name == "fci" else "tigramite")
     u, x, y, z = np.random.default_rng(4).normal(size=(4, 4001))
     x, y = x + u, y + np.roll(u, 1)
-    for columns, word in (((x, y), "x@-1 o-> y"), ((x, y, z), "x@-1 <-> y")):
-        if len(columns) == 3:
-            columns = (x + 1.5 * z, y, z)
+    for columns, word in (((x, y), "x@-1 o-> y"), ((x + 1.5 * z, y, z), "x@-1 <-> y")):
         rows = np.stack(columns, axis=1)[1:]
         table = Dataset.of(rows, list("xyz")[: len(columns)], episode=[0] * 4000, step=range(4000))
         found = learn(name, table, alpha=0.001)

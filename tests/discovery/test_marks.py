@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -110,12 +110,11 @@ def test_marks_go_with_their_variables() -> None:
 
 def test_columns_of_a_vector_agree_on_a_mark_or_have_a_circle() -> None:
     """And an edge from an earlier control step keeps the mark at its earlier end."""
-    columns = (
-        Column("v[0]", "v", 0), Column("v[1]", "v", 1), Column("x", "x"), Column("x@-1", "x", lag=1)
-    )  # fmt: skip
-    table = Dataset.of(np.zeros((2, 4)), [c.name for c in columns])
-    table = Dataset(table.values, columns, table.regimes, table.regime, table.episode, table.step)
-    found = graph("v[0] o-> x", "v[1] <-> x", "x@-1 <-> x", "v[0] <-- x@-1", names=table.names)
+    columns = (Column("v[0]", "v", 0), Column("v[1]", "v", 1), Column("x", "x"))
+    table = Dataset.of(np.zeros((2, 3)), ["v[0]", "v[1]", "x"], episode=[0, 0], step=[0, 1])
+    table = replace(table, columns=columns)
+    names = (*table.names, "x@-1")
+    found = graph("v[0] o-> x", "v[1] <-> x", "x@-1 <-> x", "v[0] <-- x@-1", names=names)
     learned = learn(Learner("given", lambda data, *, seed=0: found, marked=True), table)
     assert learned.words == ("v o-> x", "x@-1 --> v", "x@-1 <-> x")
     assert learned.directed == (("v", "x", 0), ("x", "v", 1))

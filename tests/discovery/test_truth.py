@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +16,23 @@ from scm_world import SCM, World
 from scm_world.discovery.data import (
     Dataset,
     Design,
+    Regime,
     as_dcdi,
     as_frame,
+    as_gies,
     as_numpy,
     collect,
     from_frame,
     load,
     save,
 )
+from scm_world.discovery.learners import EstimatedGraph, learn
+from scm_world.discovery.metrics import evaluate, evaluate_marks
 from scm_world.discovery.problems import random_model
 from scm_world.errors import ModelError, UnknownVariable
 from scm_world.graph import d_separated
 from scm_world.graph.ancestral import edge_words
+from scm_world.queries import verify
 from scm_world.variables import Derived, Exogenous, Linear, Normal, Parent, Scale
 
 ONE = Linear(weights=(1.0,))
@@ -110,7 +117,6 @@ def test_the_graph_survives_files_and_frames(tmp_path: Path) -> None:
     hidden = steps.hide(["k"]).truth
     assert hidden is not None
     assert (hidden.edges, hidden.confounded) == ((("s", "s", 1),), ())
-    assert steps.lagged().truth == steps.truth
 
 
 def test_worlds_have_the_graph_of_their_rows() -> None:
@@ -236,3 +242,287 @@ def test_the_past_before_a_window_is_hidden() -> None:
     assert edge_words(truth.names, truth.mag()) == ("x@-1 --> x", "x@-2 --> y")
     through = ("x@-1 --> x", "x@-1 <-> y", "y@-1 <-> y")
     assert edge_words(truth.names, truth.mag(1)) == through
+
+
+# --- weights --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("direct", [1.0, -6.0])
+def test_the_weight_of_an_edge_counts_the_paths_through_hidden_variables(direct: float) -> None:
+    """It is the slope of a regression, 0 where direct and hidden effects cancel; an edge stays."""
+    both = Linear(weights=(direct, 3.0))
+    model = SCM(
+        [
+            Exogenous(name="x", distribution=Normal()),
+            Derived(name="m", parents=("x",), mechanism=Linear(weights=(2.0,)), noise=Normal()),
+            Derived(name="y", parents=("x", "m"), mechanism=both, noise=Normal()),
+        ]
+    )
+    table = collect(model, Design(), 4000).hide(["m"])
+    assert table.weights()[0, 1] == direct + 6.0
+    assert np.polyfit(table["x"], table["y"], 1)[0] == pytest.approx(direct + 6.0, abs=0.2)
+    assert table.adjacency().tolist() == [[False, True], [False, False]]
+
+
+def test_weights_of_paths_that_are_bent_or_confounded() -> None:
+    """NaN where one mechanism on the way is not linear; of a confounded pair the causal weight."""
+    table = collect(line(), Design(), 5)
+    part = table.hide(["u", "m"])
+    assert part.truth is not None
+    assert part.weights()[0, 1] == 2.0  # a → m → b, beside u
+    assert part.truth.confounded == (("a", "b", 0),)
+    ends = table.select(["a", "c"])
+    assert np.isnan(ends.weights()[0, 1])
+    assert ends.truth is not None
+    assert (ends.truth.edges, ends.truth.weights) == ((("a", "c", 0),), {})
+
+
+def test_weights_of_hidden_paths_through_time() -> None:
+    """A hidden series with memory passes on less and less, lag by lag."""
+    half = Linear(weights=(1.0, 0.5))
+    model = SCM(
+        [
+            Exogenous(name="x", distribution=Normal(), per="step"),
+            Derived(name="h", parents=("x", Parent("h", 1)), mechanism=half),
+            Derived(name="y", parents=(Parent("h", 1),), mechanism=Linear(weights=(2.0,))),
+        ]
+    )
+    table = collect(model, Design(), 2, steps=5).hide(["h"])
+    assert [table.weights(lag)[0, 1] for lag in (1, 2, 3)] == [2.0, 1.0, 0.5]
+
+
+def test_an_edge_of_weight_zero_is_an_edge() -> None:
+    """In edges, in adjacency, and in what other libraries get; its weight is 0."""
+    model = SCM(
+        [
+            Exogenous(name="x", distribution=Normal()),
+            Derived(name="y", parents=("x",), mechanism=Linear(weights=(0.0,)), noise=Normal()),
+        ]
+    )
+    table = collect(model, Design(), 3)
+    assert table.truth is not None
+    assert (table.adjacency() == table.truth.adjacency()).all()
+    assert table.adjacency().sum() == len(table.truth.edges) == 1
+    assert as_numpy(table).adjacency is not None
+    assert table.weights().tolist() == [[0.0, 0.0], [0.0, 0.0]]
+
+
+def test_vectors_of_one_size_act_number_by_number() -> None:
+    """The edge is between the variables; the weights of other numbers are zero."""
+    model = SCM(
+        [
+            Exogenous(name="v", shape=(2,), default=(0.0, 0.0), distribution=Normal()),
+            Derived(name="w", shape=(2,), parents=("v",), mechanism=Linear(weights=(3.0,))),
+        ]
+    )
+    table = collect(model, Design(), 4)
+    assert table.adjacency()[:2, 2:].all()
+    assert table.weights()[:2, 2:].tolist() == [[3.0, 0.0], [0.0, 3.0]]
+    assert np.allclose(table.values[:, :2] @ table.weights()[:2, 2:], table.values[:, 2:])
+
+
+# --- earlier control steps as columns -------------------------------------------------------------
+
+
+def two() -> SCM:
+    """Make a series a that moves itself by 0.5 and b by 1, one step later."""
+    back = (Parent("a", 1),)
+    return SCM(
+        [
+            Derived(name="a", parents=back, mechanism=Linear(weights=(0.5,)), noise=Normal()),
+            Derived(name="b", parents=back, mechanism=ONE, noise=Normal()),
+        ]
+    )
+
+
+def test_a_lagged_table_has_the_graph_among_its_columns() -> None:
+    """Names, edges, matrices and views are about the same columns, all within the row."""
+    table = collect(two(), Design(), 3, steps=8).lagged(2)
+    truth = table.truth
+    assert truth is not None
+    assert truth.names == table.names == ("a", "b", "a@-1", "b@-1", "a@-2", "b@-2")
+    assert set(truth.edges) == {
+        ("a@-1", "a", 0), ("a@-1", "b", 0), ("a@-2", "a@-1", 0), ("a@-2", "b@-1", 0)
+    }  # fmt: skip
+    assert truth.confounded == (("a@-2", "b@-2", 0),)  # by a, three steps before
+    assert table.adjacency().sum() == 4
+    assert not table.adjacency(1).any()
+    at = {name: i for i, name in enumerate(table.names)}
+    weights = table.weights()
+    assert (weights[at["a@-2"], at["b@-1"]], weights[at["a@-1"], at["a"]]) == (1.0, 0.5)
+    assert (as_numpy(table).adjacency == truth.adjacency()).all()
+    ends = table.select(["b", "a@-2"])
+    assert ends.truth is not None
+    assert ends.truth.edges == (("a@-2", "b", 0),)
+    assert ends.weights().tolist() == [[0.0, 0.0], [0.5, 0.0]]
+    with pytest.raises(ModelError, match=r"take lagged\(2\) at once"):
+        table.lagged()
+
+
+def test_the_past_columns_of_a_lagged_table_are_known_to_be_earlier() -> None:
+    """The later ends of edges between control steps are heads, as in the graph through time."""
+    table = collect(two(), Design(), 3, steps=8)
+    assert table.truth is not None
+    lagged = table.lagged().truth
+    assert lagged is not None
+    assert edge_words(table.truth.names, table.truth.pag()) == ("a@-1 o-> a", "a@-1 o-> b")
+    words = ("a <-o a@-1", "b <-o a@-1", "a@-1 o-o b@-1")
+    assert edge_words(lagged.names, lagged.pag()) == words
+
+
+def test_what_was_set_before_is_a_target_of_the_earlier_column(tmp_path: Path) -> None:
+    """A start that is set is a target at that step; rows with it are not observational."""
+    table = collect(two(), Design("single", ("b",), 5.0, 0.5), 8, steps=3)
+    first = tuple(
+        Regime(regime.plan, regime.targets if step == 0 else ())
+        for regime, step in zip((table.regimes[i] for i in table.regime), table.step, strict=True)
+    )
+    table = replace(table, regimes=first, regime=np.arange(len(table)))
+    assert (table.targeted[:, 1] == (table["b"] == 5.0) & (table.step == 0)).all()
+    lagged = table.lagged()
+    done = lagged["b@-1"] == 5.0
+    assert set(lagged.targets) == {(), ("b@-1",)}
+    assert (lagged.targeted[:, lagged.names.index("b@-1")] == done & (lagged.step == 1)).all()
+    assert not lagged.targeted[:, :3].any()
+    assert len(lagged.observational) == (~lagged.targeted.any(axis=1)).sum() == 12
+    save(lagged, tmp_path / "lagged")
+    for again in (load(tmp_path / "lagged"), from_frame(as_frame(lagged))):
+        assert (again.targets, again.truth) == (lagged.targets, lagged.truth)
+    assert as_gies(lagged)[1] == [[], [3]] or as_gies(lagged)[1] == [[3], []]
+
+
+def test_a_learner_of_a_lagged_table_speaks_of_its_columns() -> None:
+    """So that it can be compared with the truth of the table; given the series, of lags."""
+    table = collect(two(), Design(), 60, steps=40)
+    lagged = table.lagged()
+    assert lagged.truth is not None
+    found = learn("do_order", lagged)
+    assert found.names == lagged.names
+    assert evaluate(found, lagged.truth.edges).declared == 2
+    assert learn("correlation", table).names == ("a", "b")
+    assert learn("complete", lagged).edges.shape == (1, 4, 4)
+
+
+# --- conditions of edges --------------------------------------------------------------------------
+
+ENGINES = [
+    "mujoco",
+    pytest.param("bullet", marks=pytest.mark.skipif(find_spec("pybullet") is None, reason="none")),
+]
+
+
+def boxes(engine: str, place: str = "1 0 .05") -> World:
+    """Make a box on the floor, and another one elsewhere."""
+    shape = 'type="box" size=".05 .05 .05" mass="1"'
+    return World(
+        '<mujoco><option timestep="0.005"/><worldbody>'
+        '<geom name="floor" type="plane" size="5 5 1"/>'
+        f'<body name="a" pos="0 0 .05"><freejoint/><geom name="a_shape" {shape}/></body>'
+        f'<body name="b" pos="{place}"><freejoint/><geom name="b_shape" {shape}/></body>'
+        "</worldbody></mujoco>",
+        backend=engine,
+    )
+
+
+def between(truth: Any, one: str = "a", other: str = "b") -> list[Any]:
+    """List the edges from one body to the other."""
+    return [e for e in truth.edges if (e[0].split(".")[0], e[1].split(".")[0]) == (one, other)]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_what_never_touched_has_no_edges_in_its_rows(engine: str) -> None:
+    """Two boxes that stay one metre apart: what is left is each for itself, on the floor."""
+    with boxes(engine) as world:
+        table = collect(world, Design(), 2, steps=6, every_step=True, contacts=True)
+    truth = table.truth
+    assert truth is not None
+    assert len(truth.when["contact"]) == len(between(truth)) * 2 == 32
+    acting = table.acting()
+    assert acting.truth is not None
+    assert acting.truth == truth.for_rows(table)
+    assert not between(acting.truth)
+    assert len(acting.truth.edges) == len(truth.edges) - 32 == 32
+    assert table.contacts == {("a", "world"): 1.0, ("b", "world"): 1.0}
+    arrays = as_numpy(acting.lagged())
+    assert arrays.adjacency is not None
+    blocks = acting.lagged().blocks
+    assert arrays.adjacency[blocks["a.linear_velocity@-1"][0], blocks["a.linear_velocity"][0]]
+    assert not arrays.adjacency[
+        blocks["a.linear_velocity@-1"][0], blocks["b.linear_velocity"]
+    ].any()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_rows_before_and_after_a_box_falls_on_the_other(engine: str, tmp_path: Path) -> None:
+    """Edges hold from the contact on: in memory, files, frames, parts, and lagged tables."""
+    with boxes(engine, "0.02 0 .3") as world:
+        how: dict[str, Any] = {"steps": 20, "every_step": True, "causes": ["*.mass", "*friction"]}
+        table = collect(world, Design(), 2, contacts=True, **how)
+        plain = collect(world, Design(), 2, **how)
+        folder = collect(world, Design(), 2, contacts=True, shard=1, out=tmp_path / "c", **how)
+    assert table.values.tobytes() == plain.values.tobytes()
+    with pytest.raises(ModelError, match="contacts=True"):
+        plain.acting()
+    save(table, tmp_path / "saved", format="csv")
+    read = load(tmp_path / "c"), load(tmp_path / "saved"), from_frame(as_frame(table)), folder
+    assert all(each.about["touching"] == table.about["touching"] for each in read)
+    assert 0.3 < table.contacts["a", "b"] < 0.7
+    falls = table.rows(table.step < 5)
+    for each in (falls, *(t.rows(t.step < 5) for t in read), falls.lagged()):
+        truth = each.acting().truth
+        assert truth is not None
+        names = {(c.split("@")[0], e) for c, e, _ in truth.edges}
+        assert ("floor.friction", "a.linear_velocity") in names
+        assert ("b_shape.friction", "b.linear_velocity") not in names
+        assert not between(truth)
+        assert not between(truth, "b", "a")
+    whole = table.acting().truth
+    assert whole is not None
+    assert between(whole)
+    assert ("floor.friction", "b.linear_velocity", 1) in whole.edges  # through a
+    after = table.rows(table.step == 19).hide(["a.mass", "a.orientation"]).acting().truth
+    assert after is not None
+    assert ("a.linear_velocity", "b.linear_velocity", 1) in after.edges
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_episodes_have_the_edges_of_their_contacts(engine: str) -> None:
+    """A row that is an episode: what touched in any of its control steps."""
+    for place, expected in (("1 0 .05", False), ("0.02 0 .3", True)):
+        with boxes(engine, place) as world:
+            table = collect(world, Design(), 2, steps=20, causes=["*.mass"], contacts=True)
+        truth = table.acting().truth
+        assert truth is not None
+        assert bool(between(truth)) is expected
+        assert ("b.mass", "b.linear_velocity", 0) in truth.edges
+        assert (("a", "b") in table.contacts) is expected
+
+
+def test_hidden_variables_confound_only_what_they_touched() -> None:
+    """A hidden box is a common cause of two others where it touched them."""
+    with boxes("mujoco") as world:
+        table = collect(world, Design(), 2, steps=4, every_step=True, contacts=True)
+    names = ("a.orientation", "b.orientation")
+    part = table.select(names)
+    assert part.truth is not None
+    acting = part.acting().truth
+    assert acting is not None
+    assert any(one[0] != other[0] for one, other, _ in part.truth.confounded)
+    assert not any(one[0] != other[0] for one, other, _ in acting.confounded)
+
+
+def test_what_a_verification_never_saw_can_be_left_out_of_a_score() -> None:
+    """Marked, it is an edge still, and counts neither as missed nor as found."""
+    with boxes("mujoco") as world:
+        checked = verify(world, probes=2)
+        table = collect(world, Design(), 1, steps=4, every_step=True)
+    assert table.truth is not None
+    truth = table.truth.marked(checked)
+    assert 0 < len(truth.unseen) == len(set(truth.edges) & set(checked.never_fired))
+    assert truth.edges == table.truth.edges
+    rest = [edge for edge in truth.edges if edge not in truth.unseen]
+    found = EstimatedGraph.of_edges(truth.names, rest)
+    assert evaluate(found, truth.edges).recall < 1.0
+    scores = evaluate(found, truth.edges, pairs=truth.pairs)
+    assert (scores.recall, scores.declared) == (1.0, len(rest))
+    assert evaluate_marks(found, truth).adjacency_recall == 1.0

@@ -199,14 +199,14 @@ def test_edges_by_contact_join_what_touches() -> None:
     with World("pushing", backend="fake") as world:
         edges = list(world.model.edges)
         pairs = frozenset({("floor", "tool_block")})
-        found = {(edges[i].cause, edges[i].effect) for i in lit_edges(world.model, pairs)}
+        found = {(edges[i].cause, edges[i].effect) for i in lit_edges(world, pairs)}
         assert ("floor_friction", "tool_block.linear_velocity") in found
         assert ("tool_block.friction", "tool_block.linear_velocity") in found
         assert not any("joint" in name for edge in found for name in edge)
         both = pairs | {("robot_finger_60_link_3", "tool_block")}
-        found = {(edges[i].cause, edges[i].effect) for i in lit_edges(world.model, both)}
+        found = {(edges[i].cause, edges[i].effect) for i in lit_edges(world, both)}
         assert ("joint_positions", "tool_block.linear_velocity") in found
-        assert lit_edges(world.model, frozenset()) == []
+        assert lit_edges(world, frozenset()) == []
 
 
 def test_every_task_has_shapes() -> None:

@@ -40,6 +40,7 @@ class Circumstances(TypedDict, total=False):
     outcomes: Iterable[Any] | None
     every_step: bool
     pictures: Pictures | None
+    contacts: bool
 
 
 @typed
@@ -79,8 +80,10 @@ def collect(
             ``engine_of``. A laboratory, which keeps a log, has the first one only.
         circumstances: ``steps`` of an episode, 25 in a world. Of a world also ``policy`` and
             ``nature`` (see ``Setting``), ``causes`` (patterns of parameters), ``outcomes`` (names
-            or ``Outcome``), ``every_step``: a row for each control step, with the action, and
-            ``pictures`` to write beside the rows, in files of their own in ``out``.
+            or ``Outcome``), ``every_step``: a row for each control step, with the action,
+            ``pictures`` to write beside the rows, in files of their own in ``out``, and
+            ``contacts``: whether to look at every physics step for bodies that touch, for
+            ``Dataset.acting`` and ``Dataset.contacts``; the rows are the same.
 
     Returns:
         The table. Episodes that were refused are left out, and listed in ``about["refused"]``.
@@ -164,6 +167,7 @@ def source_of(
                 every_step=given.get("every_step", False),
                 setting=setting,
                 pictures=given.get("pictures"),
+                contacts=given.get("contacts", False),
             )
     if not hasattr(source, "part"):
         raise UnknownOption("source", source, ("an SCM", "a World", "a Laboratory", "a Source"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -271,8 +272,7 @@ class Dataset:
     def targeted(self) -> Bools:
         """Which numbers were set from outside, shape (n, p)."""
         kinds = np.array(
-            [[c.lag == 0 and c.variable in r.targets for c in self.columns] for r in self.regimes],
-            dtype=bool,
+            [[block(c) in r.targets for c in self.columns] for r in self.regimes], dtype=bool
         ).reshape(len(self.regimes), len(self.columns))
         return kinds[self.regime]
 
@@ -296,12 +296,10 @@ class Dataset:
     @cached_property
     def target_names(self) -> tuple[tuple[str, ...], ...]:
         """Names of the columns set in each regime, then of the variables that are in no column."""
-        shown = [column for column in self.columns if not column.lag]
-        there = {column.variable for column in shown}
         return tuple(
             (
-                *(column.name for column in shown if column.variable in regime.targets),
-                *(name for name in regime.targets if name not in there),
+                *(column.name for column in self.columns if block(column) in regime.targets),
+                *(name for name in regime.targets if name not in self.variables),
             )
             for regime in self.regimes
         )
@@ -314,7 +312,7 @@ class Dataset:
     @cached_property
     def hidden_targets(self) -> Bools:
         """The rows in which a variable that is in no column was set, shape (n,)."""
-        there = {column.variable for column in self.columns if not column.lag}
+        there = set(self.variables)
         return np.array([not there.issuperset(r.targets) for r in self.regimes], bool)[self.regime]
 
     @cached_property
@@ -323,15 +321,38 @@ class Dataset:
 
         What is not in the table is hidden: it confounds, and effects through it are direct ones.
         Of rows that are episodes of a world, it is the graph from what they begin with to what they
-        end with.
+        end with. Of a table with ``lagged`` columns it is the graph among these.
         """
-        from scm_world.discovery.data.truth import observed_part
+        from scm_world.discovery.data.truth import truth_of
 
-        written = self.about.get("truth")
-        if written is None:
-            return None
-        names = dict.fromkeys(column.variable for column in self.columns if not column.lag)
-        return observed_part(str(self.about.get("system", "table")), written, tuple(names))
+        return truth_of(self)
+
+    def acting(self) -> Dataset:
+        """Leave out of ``truth`` the edges whose condition held in none of the rows.
+
+        Edges by contact stay where their bodies touched, directly or through others, in a control
+        step that led to a row; edges of what is set where a row can be one in which it was.
+
+        Raises:
+            ModelError: The graph is not known, or the table does not say what touched.
+        """
+        from scm_world.discovery.data.truth import acting_edges
+
+        written = {**self.about.get("truth", {}), "edges": acting_edges(self)}
+        return replace(self, about={**self.about, "truth": written})
+
+    @property
+    def contacts(self) -> dict[tuple[str, str], float]:
+        """In which share of the control steps behind the rows each pair of bodies touched.
+
+        Raises:
+            ModelError: The table does not say what touched: it was collected without contacts.
+        """
+        from scm_world.discovery.data.truth import steps_of
+
+        steps = [touch for part in steps_of(self) for touch in part.values()]
+        counts = Counter(pair for touch in steps for pair in touch)
+        return {pair: counts[pair] / len(steps) for pair in sorted(counts)}
 
     @typed
     def adjacency(self, lag: int = 0) -> Bools:
@@ -340,27 +361,36 @@ class Dataset:
         Raises:
             ModelError: The graph is not known.
         """
-        found: Bools = self.weights(lag) != 0.0
-        return found
+        at = [self._known.names.index(block(column)) for column in self.columns]
+        return self._known.adjacency(lag)[np.ix_(at, at)]
 
     @typed
     def weights(self, lag: int = 0) -> Floats:
         """Give the weights of true edges between columns, shape (p, p): row causes column.
 
-        Zero where there is no edge, NaN where the mechanism is not linear.
+        Zero where there is no edge (an edge can have weight zero, too: see ``adjacency``), NaN
+        where a mechanism on the way is not linear. Vectors of one size act number by number.
+        What is hidden between the two counts; what is hidden and acts on both does not, so that
+        a regression gives another number for a confounded pair.
 
         Raises:
             ModelError: The graph is not known.
         """
-        truth = self.truth
-        if truth is None:
-            raise ModelError(["the table does not know its graph: it was not collected here"])
         found = np.zeros((len(self.columns), len(self.columns)))
-        for cause, effect, steps in truth.edges:
-            if steps == lag:
-                where = np.ix_(self.blocks[cause], self.blocks[effect])
-                found[where] = truth.weights.get((cause, effect, steps), np.nan)
+        for edge in self._known.edges:
+            if edge[2] == lag:
+                causes, effects = self.blocks[edge[0]], self.blocks[edge[1]]
+                weight = self._known.weights.get(edge, np.nan)
+                by_number = len(causes) == len(effects) and not np.isnan(weight)
+                where = (causes, effects) if by_number else np.ix_(causes, effects)
+                found[where] = weight
         return found
+
+    @property
+    def _known(self) -> GroundTruth:
+        if self.truth is None:
+            raise ModelError(["the table does not know its graph: it was not collected here"])
+        return self.truth
 
     @typed
     def hide(self, names: Iterable[str]) -> Dataset:
@@ -438,8 +468,12 @@ class Dataset:
     def lagged(self, lags: int = 1) -> Dataset:
         """Put earlier control steps beside each row, as further columns ``name@-1``.
 
-        Rows without enough past are left out; nothing is carried from one episode to the next. A
-        row counts as intervened on where it was at its own instant.
+        Rows without enough past are left out; nothing is carried from one episode to the next.
+        What was set at an earlier step is a target at that step: ``x@-1``. The graph of the table
+        is that among its columns, all of them at lag 0.
+
+        Raises:
+            ModelError: It has such columns already.
 
         Example:
             >>> table = Dataset.of([[1.0], [2.0], [3.0]], ["x"], episode=[0, 0, 1], step=[0, 1, 0])
@@ -447,6 +481,10 @@ class Dataset:
             (('x', 'x@-1'), [[2.0, 1.0]])
         """
         whole_number("lags", lags, least=0)
+        if any(column.lag for column in self.columns):
+            raise ModelError(
+                ["the table has earlier control steps already: take lagged(2) at once"]
+            )
         rows = np.arange(len(self))
         whole = rows[
             (rows >= lags)
@@ -459,10 +497,29 @@ class Dataset:
             for column in self.columns
         ]
         parts = [self.values[whole - lag] for lag in range(lags + 1)]
+        kinds, number = np.unique(
+            np.stack([self.regime[whole - lag] for lag in range(lags + 1)]),
+            axis=1,
+            return_inverse=True,
+        )
+        names = (
+            {
+                f"{name}@-{lag}" if lag else name
+                for lag, k in enumerate(kind)
+                for name in self.regimes[k].targets
+            }
+            for kind in kinds.T.tolist()
+        )
+        regimes = (
+            replace(self.regimes[now], targets=tuple(sorted(targets)))
+            for now, targets in zip(kinds[0].tolist(), names, strict=True)
+        )
         return replace(
             self.rows(whole),
             values=np.concatenate(parts, axis=1),
             columns=(*self.columns, *earlier),
+            regimes=tuple(regimes),
+            regime=number.reshape(-1).astype(np.int64),
             about={**self.about, "lags": lags},
         )
 

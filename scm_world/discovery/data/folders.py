@@ -325,6 +325,9 @@ def together(head: Head, parts: Sequence[SourceRows]) -> Dataset:
     tables = [part.table for part in parts] or [head.empty]
     refused = refusals(parts)
     about = {**head.about, "refused": refused} if refused else dict(head.about)
+    if "contacts" in about and "touching" not in about:  # a saved table has it
+        episodes = {number: each for part in parts for number, each in part.touching.items()}
+        about["touching"] = {"whole": about["contacts"] == "episodes", "episodes": episodes}
     return replace(Dataset.joined(tables), about=about)
 
 

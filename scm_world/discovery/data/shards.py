@@ -56,6 +56,7 @@ def encoded(part: SourceRows, plan: str, numbers: range) -> bytes:
         "first": numbers.start,
         "stop": numbers.stop,
         "refused": [list(pair) for pair in part.refused],
+        **({"touching": part.touching} if part.touching else {}),
         **_regimes(part.table.regimes),
     }
     raw = raw_of(part.table, header)
@@ -113,7 +114,9 @@ def decoded(
     rows: dict[str, Any] = {"values": raw.values, "regimes": regimes, **raw.numbers}
     table = replace(empty, **rows)
     refused = tuple((int(number), str(why)) for number, why in header["refused"])
-    return range(header["first"], header["stop"]), SourceRows(table, refused)
+    return range(header["first"], header["stop"]), SourceRows(
+        table, refused, touching=header.get("touching", {})
+    )
 
 
 def checksum(raw: Raw) -> str:

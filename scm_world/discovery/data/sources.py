@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, final
 
 import numpy as np
@@ -36,11 +36,14 @@ class SourceRows:
         table: The rows.
         refused: Numbers of the episodes that could not be, and why.
         pictures: The file with the pictures beside the rows, if there are any.
+        touching: Which bodies touched, by number of the episode, where that is recorded: ``pairs``,
+            and ``runs`` of control steps: how many, and the numbers of the pairs that touch.
     """
 
     table: Dataset
     refused: tuple[tuple[int, str], ...] = ()
     pictures: bytes = b""
+    touching: dict[str, Any] = field(default_factory=dict)
 
 
 class DataSource(Protocol):

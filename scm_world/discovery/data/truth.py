@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, final
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import TYPE_CHECKING, Any, final
 
 import networkx as nx
 import numpy as np
@@ -12,13 +13,19 @@ from numpy.typing import NDArray
 
 from scm_world._arguments import whole_number
 from scm_world.discovery.data.recorded import first_name, is_state
+from scm_world.errors import ModelError
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import Marks, last_slice, mag, pag, window
 from scm_world.graph.ancestral import edge_words as edge_words
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.identification import nature_graph
+from scm_world.queries.local import holds
 from scm_world.queries.outcomes import Outcome
 from scm_world.variables import Derived, Exogenous, Linear
+
+if TYPE_CHECKING:
+    from scm_world.discovery.data.dataset import Dataset
+    from scm_world.queries.verification import Verification
 
 LONGEST = 3
 """Effects through hidden variables are listed up to this lag [control steps]."""
@@ -37,9 +44,14 @@ class GroundTruth:
         names: Of its variables, in order.
         edges: Cause, effect and lag [control steps].
         confounded: Pairs with a hidden common cause.
-        weights: Of the edges of linear mechanisms.
+        weights: Of edges whose mechanisms are linear: by how much the effect moves with the cause
+            while all else in the table is held. Of a confounded pair too, where no regression of
+            these rows would give it.
         unscored: Pairs that are not scored, in either direction and with any lag.
         about: What else a reader of the results should know.
+        when: The edges that do not always hold, by condition: ``"contact"`` while bodies touch,
+            ``"set"`` at the start of an episode and at the instant of an intervention.
+        unseen: Edges whose effect a verification never saw; they are not scored.
     """
 
     name: str
@@ -49,15 +61,45 @@ class GroundTruth:
     weights: Mapping[EdgeKey, float] = field(default_factory=dict)
     unscored: tuple[tuple[str, str], ...] = ()
     about: dict[str, Any] = field(default_factory=dict)
+    when: Mapping[str, tuple[EdgeKey, ...]] = field(default_factory=dict)
+    unseen: tuple[EdgeKey, ...] = ()
 
     @property
     def pairs(self) -> NDArray[np.bool_]:
-        """Which pairs are scored, shape (p, p)."""
+        """Which pairs are scored, shape (p, p); (lags + 1, p, p) where an edge is unseen."""
         at = {name: i for i, name in enumerate(self.names)}
-        mask = np.ones((len(at), len(at)), dtype=bool)
+        lags = max((lag for *_, lag in self.unseen), default=0)
+        mask = np.ones((lags + 1, len(at), len(at)), dtype=bool)
         for one, other in self.unscored:
-            mask[at[one], at[other]] = mask[at[other], at[one]] = False
-        return mask
+            mask[:, at[one], at[other]] = mask[:, at[other], at[one]] = False
+        for cause, effect, lag in self.unseen:
+            mask[lag, at[cause], at[effect]] = False
+        return mask if self.unseen else mask[0]
+
+    def marked(self, verification: Verification) -> GroundTruth:
+        """Mark the edges that a verification of the world never saw; ``pairs`` leaves them out."""
+        never = set(verification.never_fired)
+        return replace(self, unseen=tuple(edge for edge in self.edges if edge in never))
+
+    def for_rows(self, table: Dataset) -> GroundTruth:
+        """Leave out the edges whose condition held in no row of a table; see ``Dataset.acting``.
+
+        Raises:
+            ModelError: The table has other variables, or does not say what touched.
+        """
+        acting = table.acting().truth
+        if acting is None or set(acting.names) != set(self.names):
+            raise ModelError([f"the table has other variables than the graph of {self.name!r}"])
+        edges, pairs = set(acting.edges), set(acting.confounded)
+        kept = {k: tuple(e for e in found if e in edges) for k, found in self.when.items()}
+        return replace(
+            self,
+            edges=tuple(edge for edge in self.edges if edge in edges),
+            confounded=tuple(pair for pair in self.confounded if pair in pairs),
+            weights={edge: weight for edge, weight in self.weights.items() if edge in edges},
+            when={condition: found for condition, found in kept.items() if found},
+            unseen=tuple(edge for edge in self.unseen if edge in edges),
+        )
 
     def adjacency(self, lag: int = 0) -> NDArray[np.bool_]:
         """Give the edges of a lag, shape (p, p): row causes column."""
@@ -95,11 +137,18 @@ class GroundTruth:
             (('x --> y',), ('x o-o y',))
         """
         marks, lags = self._window(lags)
-        tiers = np.repeat(np.arange(lags + 1), len(self.names)).tolist()
+        before = [int(name.rpartition("@-")[2]) if "@-" in name else 0 for name in self.names]
+        tiers = [step - back for step, back in product(range(lags + 1), before)]
         return last_slice(pag(marks, tiers), lags)
 
     def _window(self, lags: int | None) -> tuple[Marks, int]:
         """Return the maximal ancestral graph of a window through time, and its lags."""
+        edges, shared = self._matrices()
+        lags = len(edges) - 1 if lags is None else whole_number("lags", lags, least=0)
+        return mag(*window(edges, shared, lags)), lags
+
+    def _matrices(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Write edges and confounded pairs by lag, shape (most + 1, p, p) each."""
         at = {name: i for i, name in enumerate(self.names)}
         most = max((lag for *_, lag in (*self.edges, *self.confounded)), default=0)
         edges = np.zeros((most + 1, len(at), len(at)), dtype=bool)
@@ -108,8 +157,7 @@ class GroundTruth:
             for one, other, lag in pairs:
                 matrix[lag, at[one], at[other]] = True
         shared[0] |= shared[0].T
-        lags = most if lags is None else whole_number("lags", lags, least=0)
-        return mag(*window(edges, shared, lags)), lags
+        return edges, shared
 
 
 def truth_of_model(model: SCM) -> dict[str, Any]:
@@ -121,7 +169,7 @@ def truth_of_model(model: SCM) -> dict[str, Any]:
         if isinstance(mechanism, Linear):
             weights = mechanism.weights
         edges += [
-            [parent.name, variable.name, parent.lag, weight]
+            [parent.name, variable.name, parent.lag, weight, parent.when]
             for parent, weight in zip(variable.all_parents, weights, strict=True)
         ]
     noisy = [
@@ -138,22 +186,39 @@ def truth_of_model(model: SCM) -> dict[str, Any]:
     return {"edges": edges, "noisy": noisy, "held": held}
 
 
-def truth_of_steps(model: SCM, names: Iterable[str], bundles: Mapping[str, Any]) -> dict[str, Any]:
+def truth_of_steps(
+    model: SCM, names: Iterable[str], bundles: Mapping[str, Any], terms: Mapping[str, Any] = {}
+) -> dict[str, Any]:
     """Write the graph of one control step of a world, over some of its variables.
 
     Args:
         model: Of the world.
         names: What is in a row.
         bundles: The parts of each bundle.
+        terms: Of ``contact_terms``, where contacts are recorded.
     """
     known = set(names)
     whole = {part: n for n, parts in bundles.items() if n in known for part in parts}
-    found = (edge.key for edge in model.edges)
-    named = ((whole.get(c, c), whole.get(e, e), lag) for c, e, lag in found)
-    edges = dict.fromkeys((c, e, lag) for c, e, lag in named if {c, e} <= known and (lag or c != e))
+    edges: dict[EdgeKey, str | None] = {}
+    for edge in model.edges:
+        cause, effect = whole.get(edge.cause, edge.cause), whole.get(edge.effect, edge.effect)
+        if {cause, effect} <= known and (edge.lag or cause != effect):
+            key = cause, effect, edge.lag
+            edges[key] = edge.when and edges.get(key, edge.when)
     held = [v.name for v in model.variables if v.name in known and v.role == "parameter"]
-    written = [[*edge, None] for edge in edges]
-    return {"edges": written, "noisy": sorted(known), "held": held}
+    written = [[*edge, None, when] for edge, when in edges.items()]
+    named = [(name, whole.get(name, name)) for name in model]
+    contact = _renamed(terms, [(old, new) for old, new in named if new in known])
+    return {"edges": written, "noisy": sorted(known), "held": held, **contact}
+
+
+def _renamed(terms: Mapping[str, Any], names: Iterable[tuple[str, str]]) -> dict[str, Any]:
+    """Write the terms of contacts for the names in a table."""
+    of: dict[str, set[str]] = {}
+    for old, new in names if terms else ():
+        of.setdefault(new, set()).update(terms["of"][old])
+    bodies = {name: sorted(found) for name, found in of.items() if found}
+    return {"contact": {**terms, "of": bodies}} if terms else {}
 
 
 def truth_of_episodes(
@@ -162,6 +227,7 @@ def truth_of_episodes(
     causes: Sequence[str],
     outcomes: Sequence[Outcome],
     labels: Mapping[Outcome, str],
+    terms: Mapping[str, Any] = {},
 ) -> dict[str, Any]:
     """Write the graph of whole episodes: what they begin with, and what they end with.
 
@@ -173,11 +239,13 @@ def truth_of_episodes(
         causes: What is in a row of the beginning.
         outcomes: What is in a row besides.
         labels: Name of each outcome in the table.
+        terms: Of ``contact_terms``, where contacts are recorded.
 
     Raises:
         ModelError: Nature does something later than at the beginning.
     """
-    graph = nature_graph(model, nature, [outcome.name for outcome in outcomes])
+    names = [outcome.name for outcome in outcomes]
+    graph, apart = (nature_graph(model, nature, names, contact=each) for each in (True, False))
     named = {name: first_name(model, name) for name in causes}
     node = {f"{model.target(n)}@0" if is_state(model, n) else n: f for n, f in named.items()}
     kept = {**node, **{outcome.name: outcome.name for outcome in outcomes}}
@@ -186,15 +254,18 @@ def truth_of_episodes(
         ends.setdefault(outcome.name, []).append(labels[outcome])
     final = {outcome.name: labels[outcome] for outcome in outcomes if outcome.how == "final"}
     source = {**final, **node}
+    always = set(projected(apart, kept))
     edges = [
-        [source[cause], label, 0, None]
+        [source[cause], label, 0, None, None if (cause, effect) in always else "contact"]
         for cause, effect in projected(graph, kept)
         if cause in source
         for label in ([node[effect]] if effect in node else ends[effect])
     ]
     shown = [label for each in ends.values() for label in each]
     pairs = [[a, b] for i, a in enumerate(shown) for b in shown[i + 1 :]]
-    return {"edges": edges, "noisy": [*node.values()], "unscored": pairs}
+    ended = ((outcome.name, labels[outcome]) for outcome in outcomes)
+    contact = _renamed(terms, (*named.items(), *ended))
+    return {"edges": edges, "noisy": [*node.values()], "unscored": pairs, **contact}
 
 
 def projected(graph: nx.DiGraph, kept: Collection[str]) -> list[tuple[str, str]]:
@@ -214,7 +285,8 @@ def projected(graph: nx.DiGraph, kept: Collection[str]) -> list[tuple[str, str]]
 def observed_part(name: str, written: Mapping[str, Any], names: Sequence[str]) -> GroundTruth:
     """Project a graph on the variables that are in a table (a latent projection).
 
-    A cause acts through hidden variables as if directly. A hidden variable with noise confounds all
+    A cause acts through hidden variables as if directly: the weight is the sum over the paths
+    through them, of the product of the weights on each. A hidden variable with noise confounds all
     pairs that it reaches through hidden ones only; one that keeps its value over an episode does so
     across control steps, a variable with itself among them.
 
@@ -224,50 +296,153 @@ def observed_part(name: str, written: Mapping[str, Any], names: Sequence[str]) -
         names: The variables of the table.
 
     Source:
-        Verma and Pearl, *Equivalence and synthesis of causal models*, UAI 1990.
+        Verma and Pearl, *Equivalence and synthesis of causal models*, UAI 1990. Wright, *The method
+        of path coefficients*, Annals of Mathematical Statistics 1934, for the weights.
     """
-    known, after = set(names), dict[str, list[tuple[str, int]]]()
-    for cause, effect, lag, _ in written["edges"]:
-        after.setdefault(cause, []).append((effect, lag))
+    known, after = set(names), dict[str, list[tuple[str, int, float, str | None]]]()
+    for cause, effect, lag, weight, *when in written["edges"]:
+        slope = np.nan if weight is None else float(weight)
+        after.setdefault(cause, []).append((effect, lag, slope, when[0] if when else None))
     for held in written.get("held", ()):
         if held not in known:
-            after.setdefault(held, []).append((held, 1))
+            after.setdefault(held, []).append((held, 1, 1.0, None))
 
-    def reached(start: str) -> list[tuple[str, int]]:
-        found: dict[tuple[str, int], None] = {}
-        ahead, seen = [(start, 0)], set[tuple[str, int]]()
-        while ahead:
-            node, steps = ahead.pop()
-            for effect, lag in after.get(node, ()):
-                place = (effect, steps + lag)
-                if effect in known:
-                    found[place] = None
-                elif place not in seen and place[1] <= LONGEST:
-                    seen.add(place)
-                    ahead.append(place)
-        return sorted(found)
+    def reached(start: str) -> dict[tuple[str, int], tuple[float, str | None]]:
+        """Return weight and condition of each effect and its lag, path length by path length."""
+        found: dict[tuple[str, int], tuple[float, str | None]] = {}
+        ahead: dict[tuple[str, int], tuple[float, str | None]] = {(start, 0): (1.0, None)}
+        for _ in range((LONGEST + 1) * len(after) + 1):
+            new: dict[tuple[str, int], tuple[float, str | None]] = {}
+            for (node, steps), (gain, condition) in ahead.items():
+                for effect, lag, slope, when in after.get(node, ()):
+                    place, into = (effect, steps + lag), found if effect in known else new
+                    if effect in known or place[1] <= LONGEST:
+                        sum_, either = into.get(place, (0.0, condition or when))
+                        into[place] = sum_ + gain * slope, either and (condition or when)
+            ahead = new
+        return dict(sorted(found.items()))
 
-    edges = [(cause, effect, lag) for cause in names for effect, lag in reached(cause)]
+    edges = {(c, e, lag): way for c in names for (e, lag), way in reached(c).items()}
     confounded: dict[Pair, None] = {}
     for source in written["noisy"]:
-        if source in known:
-            continue
-        children = reached(source)
+        children = [] if source in known else [*reached(source)]
         for i, (one, early) in enumerate(children):
             for other, late in children[i + 1 :]:
                 first, second = sorted([(early, one), (late, other)])
                 confounded[first[1], second[1], second[0] - first[0]] = None
-    weights = {
-        (cause, effect, lag): float(weight)
-        for cause, effect, lag, weight in written["edges"]
-        if weight is not None and {cause, effect} <= known
-    }
+    conditions = dict.fromkeys(when for _, when in edges.values() if when)
     unscored = (tuple(pair) for pair in written.get("unscored", ()))
     return GroundTruth(
         name=name,
         names=tuple(names),
         edges=tuple(edges),
         confounded=tuple(confounded),
-        weights=weights,
+        weights={edge: weight for edge, (weight, _) in edges.items() if not np.isnan(weight)},
         unscored=tuple((a, b) for a, b in unscored if {a, b} <= known),
+        when={k: tuple(e for e, (_, when) in edges.items() if when == k) for k in conditions},
     )
+
+
+# --- of tables ------------------------------------------------------------------------------------
+
+
+def truth_of(table: Dataset) -> GroundTruth | None:
+    """Project the graph that a table carries on its columns; None where it carries none."""
+    written, system = table.about.get("truth"), str(table.about.get("system", "table"))
+    if written is None:
+        return None
+    lags = max((column.lag for column in table.columns), default=0)
+    if lags:
+        now = tuple(dict.fromkeys(column.variable for column in table.columns))
+        written = _unrolled(observed_part(system, written, now), lags)
+    return observed_part(system, written, table.variables)
+
+
+def _unrolled(truth: GroundTruth, lags: int) -> dict[str, Any]:
+    """Write a graph through time as one of an instant, over columns of several control steps.
+
+    What was before the first of them is hidden, and confounds.
+    """
+
+    def at(name: str, lag: int) -> str:
+        return f"{name}@-{lag}" if lag else name
+
+    conditions = {edge: when for when, edges in truth.when.items() for edge in edges}
+    edges: list[list[Any]] = [
+        [
+            at(c, back + lag),
+            at(e, back),
+            0,
+            truth.weights.get((c, e, lag)),
+            conditions.get((c, e, lag)),
+        ]
+        for c, e, lag in truth.edges
+        for back in range(lags - lag + 1)
+    ]
+    nodes = [at(name, back) for back in range(lags, -1, -1) for name in truth.names]
+    _, shared = window(*truth._matrices(), lags)
+    hidden = []
+    for i, j in np.argwhere(np.triu(shared)).tolist():
+        hidden.append(f"before {nodes[i]} and {nodes[j]}")
+        edges += [[hidden[-1], nodes[end], 0, None, None] for end in (i, j)]
+    steps = range(lags + 1)
+    pairs = [[at(a, i), at(b, j)] for a, b in truth.unscored for i, j in product(steps, steps)]
+    return {"edges": edges, "noisy": [*nodes, *hidden], "unscored": pairs}
+
+
+Touch = frozenset[tuple[str, str]]
+"""Pairs of bodies that touch."""
+
+
+def steps_of(table: Dataset) -> Iterator[dict[int, Touch]]:
+    """Give what touched in the control steps that lie behind the rows of each episode.
+
+    Behind a row lies the control step that led to it; behind one of ``lagged`` columns that
+    many, and behind one that is an episode all.
+
+    Raises:
+        ModelError: The table does not say.
+    """
+    record = table.about.get("touching")
+    if record is None:
+        raise ModelError(["the table does not say what touched: collect it with contacts=True"])
+    lags = table.about.get("lags", 1)
+    for episode in np.unique(table.episode).tolist():
+        given = record["episodes"][str(episode)]
+        pairs = [(one, other) for one, other in given["pairs"]]
+        steps = [frozenset(pairs[i] for i in which) for n, which in given["runs"] for _ in range(n)]
+        rows = table.step[table.episode == episode].tolist()
+        behind = {i for row in rows for i in range(max(row - lags, 0), row)}
+        yield {i: steps[i] for i in (range(len(steps)) if record["whole"] else sorted(behind))}
+
+
+def acting_edges(table: Dataset) -> list[list[Any]]:
+    """List the edges whose condition held in a row at least, as they are written.
+
+    Raises:
+        ModelError: The table carries no graph, or does not say what touched.
+    """
+    written = table.about.get("truth")
+    if written is None:
+        raise ModelError(["the table does not know its graph: it was not collected here"])
+    places = {"contact": list[int](), "set": list[int]()}
+    for place, (*_, when) in enumerate(written["edges"]):
+        if when in places:
+            places[when].append(place)
+    missing = set(places["contact"])
+    if missing:
+        parts = [*steps_of(table)]
+        whole = table.about["touching"]["whole"]
+        seen = (
+            {frozenset[tuple[str, str]]().union(*part.values()) for part in parts}
+            if whole
+            else {touch for part in parts for touch in part.values()}
+        )
+        for touch in sorted(seen, key=sorted):
+            acts = holds(written["contact"], touch)
+            missing -= {i for i in missing if acts(*written["edges"][i][:2])}
+    first = int(table.step.min(initial=1)) - table.about.get("lags", 0)
+    later = any(len(regime.plan.at_first()) < len(regime.plan) for regime in table.regimes)
+    if first > 0 and not later:  # nothing is set in these rows
+        missing |= set(places["set"])
+    return [edge for i, edge in enumerate(written["edges"]) if i not in missing]

@@ -6,6 +6,7 @@ import hashlib
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import groupby
 from typing import Any, final
 
 import numpy as np
@@ -41,6 +42,7 @@ from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import Equations, Layout, System
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.laboratory import Laboratory
+from scm_world.queries.local import contact_terms
 from scm_world.queries.outcomes import Outcome, as_outcome
 from scm_world.queries.parallel import Result, run_units
 from scm_world.queries.plans import Plan
@@ -79,6 +81,7 @@ class WorldSource:
         every_step: One row for each control step in place of one for each episode.
         setting: Who acts, what varies by itself, how long, and the seed.
         pictures: To take at each control step, or at the beginning and at the end; none if None.
+        contacts: Whether to record which bodies touch.
 
     Raises:
         InterventionError: A target, or what varies, cannot be set to its values.
@@ -101,8 +104,9 @@ class WorldSource:
         every_step: bool,
         setting: Setting,
         pictures: Pictures | None = None,
+        contacts: bool = False,
     ) -> None:
-        self._pictures = pictures
+        self._pictures, self._contacts = pictures, contacts and isinstance(world, Simulation)
         if pictures is not None:
             with twins.twin() as twin:  # a camera that does not exist is refused now
                 seen: Any = twin
@@ -164,6 +168,7 @@ class WorldSource:
             "design": design.as_dict(),
             "engine": "equations" if isinstance(world, Equations) else world.backend.name,
             **({} if pictures is None else {"pictures": asdict(pictures)}),
+            **({"contacts": "steps" if every_step else "episodes"} if self._contacts else {}),
             "truth": self._truth(varied, measured),
             "versions": versions("" if isinstance(world, Equations) else world.engine),
         }
@@ -173,12 +178,16 @@ class WorldSource:
         world, model = self._world, self._world.model
         if isinstance(world, Equations) and (self._every_step or not model.is_temporal):
             return truth_of_model(model)
+        terms: Any = (
+            contact_terms(world) if self._contacts and isinstance(world, Simulation) else {}
+        )
         if self._every_step:
-            return truth_of_steps(model, self._watched, getattr(world.compiled, "bundles", {}))
+            bundles = getattr(world.compiled, "bundles", {})
+            return truth_of_steps(model, self._watched, bundles, terms)
         labels = {o: columns_of_outcome(model.declared(o.name), o)[0].variable for o in measured}
         nature = merged(model, self._given, Plan(self._setting.nature))
         try:
-            return truth_of_episodes(model, nature, varied, measured, labels)
+            return truth_of_episodes(model, nature, varied, measured, labels, terms)
         except ModelError:
             return None
 
@@ -194,14 +203,19 @@ class WorldSource:
         lock = threading.Lock()
 
         seen: dict[int, list[Picture]] = {}
+        touching: dict[int, Any] = {}
 
         def finish(place: int, result: Result) -> Floats | str:
             if isinstance(result, Exception) and not isinstance(result, InterventionError):
                 raise result
-            found: Floats | str = str(result)
-            if not isinstance(result, Exception):
+            found: Floats | str
+            if isinstance(result, Exception):
+                found = str(result)
+            else:
                 episode = Episode(self._twins, units[place], result)
                 found = self._row(episode)
+                if self._contacts:
+                    touching[numbers[place]] = _runs(result.touching[1:])
                 if self._pictures is not None:
                     seen[place] = self._look(self._pictures, episode)
             with lock:
@@ -214,7 +228,8 @@ class WorldSource:
         for number, done in zip(numbers, regimes, strict=True):
             given = Plan(merged(self._world.model, self._given, done.plan))
             plan = self._setting.plan(self._world, given)
-            units.append(self._setting.unit(self._world, plan, number, written))
+            unit = self._setting.unit(self._world, plan, number, written)
+            units.append(replace(unit, contacts=self._contacts))
         found = run_units(self._twins, units, finish, self._setting.workers)
         rows: list[Row] = []
         refused: list[tuple[int, str]] = []
@@ -226,11 +241,11 @@ class WorldSource:
                 named = replace(done, targets=self._targets(done.targets, step))
                 rows.append((number, step, named, row))
         table = Dataset.stacked(self.columns, rows, self.about)
-        if self._pictures is None:
-            return SourceRows(table, tuple(refused))
         shots = [shot for place in sorted(seen) for shot in seen[place]]
         keys = [f"{shot['episode']:08d}-{shot['step']:06d}" for shot in shots]
-        return SourceRows(table, tuple(refused), self._pictures.encoded(shots, keys))
+        pictures = b"" if self._pictures is None else self._pictures.encoded(shots, keys)
+        touched = {str(number): touching[number] for number in sorted(touching)}
+        return SourceRows(table, tuple(refused), pictures, touched)
 
     def _look(self, pictures: Pictures, episode: Episode) -> list[Picture]:
         """Take the pictures of an episode, one row of them for each of its rows."""
@@ -283,6 +298,20 @@ class WorldSource:
             drawn = noise.draw(NORMAL, stream, shape, {}, episode=episode.number, step=step)
             values[step] += float(strength[step]) * half.reshape(shape) * drawn[0]
         return values
+
+
+def _runs(steps: Sequence[frozenset[tuple[str, str]]]) -> dict[str, Any]:
+    """Write what touched in each control step.
+
+    Example:
+        >>> _runs([frozenset({("a", "b")}), frozenset({("a", "b")}), frozenset()])
+        {'pairs': [['a', 'b']], 'runs': [[2, [0]], [1, []]]}
+    """
+    pairs = sorted(frozenset[tuple[str, str]]().union(*steps))
+    runs = [
+        [len([*same]), [pairs.index(p) for p in sorted(which)]] for which, same in groupby(steps)
+    ]
+    return {"pairs": [list(pair) for pair in pairs], "runs": runs}
 
 
 def _system(world: System, twins: AnyTwins) -> dict[str, Any]:

@@ -63,11 +63,10 @@ def do_gp(data: Dataset, *, seed: int = 0, interactions: bool = True) -> Estimat
         ModelError: There are not more rows than columns that vary.
     """
     table, notes = usable("do_gp", data, done=True)
-    p = len(table.names)
+    p, past = len(table.names), np.array([column.lag > 0 for column in table.columns], dtype=bool)
     edges, scores = np.zeros((p, p), bool), np.zeros((p, p))
     if p > 1:
         measure = _Evidence(table, seed)
-        past = np.array([column.lag > 0 for column in table.columns])
         edges = _climbed(measure, edges, past)
         if interactions:
             measure.joint = True
@@ -75,7 +74,7 @@ def do_gp(data: Dataset, *, seed: int = 0, interactions: bool = True) -> Estimat
         for i, j in np.argwhere(edges).tolist():
             causes = frozenset(np.flatnonzero(edges[:, j]).tolist())
             scores[i, j] = measure.of(j, causes) - measure.of(j, causes - {i})
-    never = sum(c.lag == 0 for c in table.columns) - int(table.targeted.any(axis=0).sum())
+    never = int((~table.targeted.any(axis=0) & ~past).sum())
     if never:
         notes += (f"{never} columns were never set: what is curved alone tells their directions",)
     if len(table) < FEW * p:

@@ -159,7 +159,8 @@ def learn(
         given: A learner, or its name.
         data: A ``Dataset``, or a ``PairedSimulator`` for a learner that does its own experiments.
             Earlier control steps are put beside each row of a dataset with several rows per
-            episode, if the learner does not use time by itself.
+            episode, if the learner does not use time by itself. Where they stand there already
+            (``lagged``), the graph is one among these columns, as is the truth of such a table.
         seed: Of what the learner draws, and of the order of the columns.
         level: ``"variable"`` for one node per variable, its components taken together;
             ``"component"`` for one per column.
@@ -180,11 +181,14 @@ def learn(
     known = _settings_of(chosen)
     _check(chosen, known, settings, data)
     table = data
+    has_past = isinstance(data, Dataset) and any(column.lag for column in data.columns)
+    if has_past and chosen.temporal:
+        raise ModelError([f"{chosen.name} uses time by itself: give the table without lagged()"])
     if isinstance(data, Dataset):
         if shuffle:
             drawn = Noise(seed).uniforms("order of columns", n=len(data.names))[0]
             table = data.select([data.names[i] for i in np.argsort(drawn).tolist()])
-        if data.is_temporal and not chosen.temporal:
+        if data.is_temporal and not (chosen.temporal or has_past):
             table = table.lagged()
     if "blocks" in known:  # groups that are distinguished are tested separately
         settings = {"blocks": level == "variable", **settings}
@@ -198,7 +202,7 @@ def learn(
         if not isinstance(result, EstimatedGraph):
             found = EstimatedGraph.of(table.names, result)
         if isinstance(table, Dataset):
-            found = _folded(found, table, level)
+            found = _folded(found, table, level, past=not has_past)
     except ModelError as error:
         said = (f"the learner {chosen.name!r} returned no graph: {each}" for each in error.problems)
         raise ModelError([*said]) from error
@@ -247,8 +251,10 @@ def _settings_of(chosen: Learner) -> tuple[str, ...]:
     return tuple(parameter.name for parameter in parameters)[1:]
 
 
-def _folded(found: EstimatedGraph, table: Dataset, level: Level) -> EstimatedGraph:
-    """Take the columns of a variable together, and earlier columns as lags."""
+def _folded(
+    found: EstimatedGraph, table: Dataset, level: Level, *, past: bool = True
+) -> EstimatedGraph:
+    """Take the columns of a variable together, and with ``past`` earlier columns as lags."""
     columns = {column.name: column for column in table.columns}
     unknown = [name for name in found.names if name not in columns]
     if unknown and set(found.names) <= set(table.blocks):
@@ -256,8 +262,11 @@ def _folded(found: EstimatedGraph, table: Dataset, level: Level) -> EstimatedGra
     if unknown:
         what = f"a learner found a graph of {unknown[0]!r}, which is not in the data"
         raise ModelError([f"{what}; there are: {', '.join(table.names)}"])
-    base = [columns[n].variable if level == "variable" else n.split("@-")[0] for n in found.names]
-    lag_of = np.array([columns[n].lag for n in found.names])
+    base = [block(columns[n]) if level == "variable" else n for n in found.names]
+    if past:
+        lagless = zip(base, found.names, strict=True)
+        base = [name.removesuffix(f"@-{columns[n].lag}") for name, n in lagless]
+    lag_of = np.array([columns[n].lag if past else 0 for n in found.names])
     names = tuple(dict.fromkeys(base))
     at = np.array([names.index(name) for name in base])
     lags = max(int(lag_of.max(initial=0)), len(found.edges) - 1)
@@ -265,10 +274,12 @@ def _folded(found: EstimatedGraph, table: Dataset, level: Level) -> EstimatedGra
     edge_scores = np.zeros(edges.shape)
     now = np.flatnonzero(lag_of == 0)
     # Edges within the rows that would lead into the past are turned.
-    back = lag_of[:, None] < lag_of[None, :]
+    steps_back = np.array([columns[n].lag for n in found.names])
+    back = steps_back[:, None] < steps_back[None, :]
     given, sure = found.edges.copy(), found.edge_scores.copy()
     given[0] |= (given[0] & back).T
     sure[0] = np.maximum(sure[0], np.where(back, sure[0], 0.0).T)
+    given[0][back], sure[0][back] = False, 0.0
     for lag, row in ((k, i) for k in range(len(found.edges)) for i in range(len(at))):
         total = lag + int(lag_of[row])
         if total > lags:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, final
 
@@ -140,6 +140,17 @@ class BlockWorld(Composition):
     def movers(self) -> tuple[str, ...]:
         """Name the fingers, then the blocks. The bases of fingers are fixed."""
         return (*(f"robot_finger_{finger}" for finger in FINGERS), *self.blocks)
+
+    def touched(self) -> Mapping[str, tuple[str, ...]]:
+        """Map links and blocks to their states; floor, stage and obstacles are fixed."""
+        still = dict.fromkeys(("floor", "stage", *self.obstacles), ())
+        blocks = {e.name: (*e.slices(0),) for e in self.entities if e.is_block}
+        robot = (name for e in self.entities if not e.is_block for name in e.slices(-1))
+        return {**still, **blocks, **dict.fromkeys(LINK_NAMES, tuple(robot))}
+
+    def shaped(self) -> Mapping[str, str]:
+        """Map parameters to the body that they are a property of."""
+        return {name: key[0] for name, key in self.parameters().items() if key[0] in self.touched()}
 
     def goals(self, values: Values) -> tuple[GoalRegion, ...]:
         """Describe all goals."""
