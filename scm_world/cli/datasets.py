@@ -45,6 +45,7 @@ def collect(
     observational_fraction: Annotated[float, typer.Option(min=0.0, max=1.0)] = 0.3,
     nature: options.Nature = None,
     every_step: bool = False,
+    contacts: bool = False,
     steps: options.Steps = 25,
     policy: options.Policy = None,
     backend: options.Backend = None,
@@ -78,6 +79,8 @@ def collect(
         values: Support of interventions: A (training), B (held out) or 'A|B'.
         observational_fraction: Share of episodes without an intervention.
         every_step: A row for each control step.
+        contacts: Look in each physics step which bodies touch, so that the true graph can be one of
+            these rows. It takes about twice as long.
         picture: Camera of pictures beside the rows, or 'usual'; repeat it for more.
         picture_format: Format of the files with pictures: parquet or webdataset.
         goal_pictures: Pictures of the goals, too.
@@ -96,6 +99,7 @@ def collect(
         "causes": cause,
         "outcomes": [parse_outcome(text) for text in outcome or ()],
         "every_step": every_step,
+        "contacts": contacts,
     }
     if picture:
         size = picture_size, picture_size
@@ -148,6 +152,12 @@ def collect(
         rows.append(("refused", len(impossible), f"see {SIDECAR}"))
     title = f"Collected from {tag(task)} on {found.about.get('engine', used)}, seed {seed}"
     console.table(("", "episodes", "rows"), rows, title=title)
+    if contacts and found.truth is not None:
+        acting = len(found.truth.for_rows(found).edges)
+        console.say(f"{acting} of {len(found.truth.edges)} edges could act in these rows")
+        most = sorted(found.contacts.items(), key=lambda item: -item[1])[:SHOWN]
+        shares = [(f"{one}, {other}", f"{share:.1%}") for (one, other), share in most]
+        console.table(("bodies that touched", "steps"), shares)
     shards = list[Location](folder.glob("shard-*.*"))
     console.written(folder / SIDECAR, *sorted(shards, key=str)[:1], *described(folder, croissant))
 

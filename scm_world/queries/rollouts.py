@@ -188,7 +188,6 @@ class Running:
         self.trace = unit.past.until(unit.first)
         self.trace.values = {name: list(values) for name, values in unit.past.values.items()}
         self._version = -1
-        self._listens = unit.contacts and isinstance(world, Simulation)
         self._touched: Touching = ()
 
     @cached_property
@@ -235,8 +234,8 @@ class Running:
             found = world.values() if names == (ALL,) else world.evaluate(there)
             for name in found if names == (ALL,) else there:
                 trace.values.setdefault(name, []).append(np.array(found[name]))
-        if self._listens:
-            touched = self._touched or (self.world.backend.contacts(),)
+        if self.unit.contacts and isinstance(world, Simulation):
+            touched = self._touched or (world.backend.contacts(),)
             pairs = {tuple(sorted(c.bodies)) for contacts in touched for c in contacts}
             trace.touching.append(frozenset((one, other) for one, other in pairs))
 
@@ -244,7 +243,7 @@ class Running:
         """Take a control step, with the action of the policy if none is given."""
         policy = self.policy if action is None else lambda _: action
         chosen = _chosen(policy, self.world)
-        if self._listens:
+        if self.unit.contacts and isinstance(self.world, Simulation):
             self._touched = contacts_of(self.world, chosen)
         else:
             self.world.step(chosen)

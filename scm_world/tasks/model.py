@@ -95,14 +95,13 @@ class ModelComposition(Composition):
 
     def shaped(self) -> Mapping[str, str]:
         """Map the parameters of bodies and shapes to the body."""
-        model = self._model
-        bodies = None if model.describe is None else model.bodies
-        found = {}
-        for row in model.parameters if bodies else ():
-            place = bodies.places.get(row.key)
+        model, found = self._model, dict[str, str]()
+        for row in model.parameters if model.describe else ():
+            place = model.bodies.places.get(row.key)
             if place and place.table in ("bodies", "geoms"):
-                number = bodies.geoms[place.row].body if place.table == "geoms" else place.row
-                found[row.name] = bodies.bodies[number].name
+                geom = place.table == "geoms"
+                number = model.bodies.geoms[place.row].body if geom else place.row
+                found[row.name] = model.body_names[number]
         return found
 
 

@@ -11,7 +11,15 @@ import pytest
 
 from scm_world.backends.base import ContactPoint
 from scm_world.errors import NotReset
-from scm_world.queries.local import islands, local_graph, reached
+from scm_world.queries import World
+from scm_world.queries.local import (
+    contact_terms,
+    contacts_of,
+    holds,
+    islands,
+    local_graph,
+    reached,
+)
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import FINGERS as NAMES
 from scm_world.tasks.trifinger.kinematics import inverse
@@ -173,3 +181,79 @@ def test_what_cannot_be_asked() -> None:
     """There must be an episode."""
     with pytest.raises(NotReset):
         local_graph(Simulation("pushing"))
+
+
+# --- conditions of edges --------------------------------------------------------------------------
+
+SCENE = """<mujoco><option timestep="0.004"/><worldbody>
+  <geom name="floor" type="plane" size="5 5 1"/>
+  <body name="shelf" pos="2 0 .3"><geom name="top" type="box" size=".3 .3 .02"/></body>
+  <body name="box" pos="0 0 .05"><freejoint/><geom type="box" size=".05 .05 .05" mass="1"/></body>
+  <body name="ball" pos=".02 0 .18"><freejoint/><geom name="skin" size=".05" mass="1"/></body>
+  <body name="other" pos="2 0 .4"><freejoint/><geom type="box" size=".05 .05 .05" mass="1"/></body>
+  <body name="base" pos="-1 0 .5"><body name="arm"><joint name="hinge" axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 .3 0 -.2" size=".03" mass=".5"/></body></body>
+  <body name="cart" pos="-1 1 .5"><joint name="slide" type="slide" axis="1 0 0"/>
+    <geom size=".05" mass=".3"/></body></worldbody>{}
+  <actuator><motor name="motor" joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>"""
+SPRING = """<tendon><fixed stiffness="3"><joint joint="hinge" coef="1"/>
+  <joint joint="slide" coef="-1"/></fixed></tendon>"""
+
+
+def test_what_edges_by_contact_wait_for() -> None:
+    """Chains of bodies that move; not through what stands still; what is unknown joins all."""
+    with World(SCENE.format(SPRING)) as world:
+        terms = contact_terms(world)
+    assert terms["together"] == [["arm", "cart"], ["ball"], ["box"], ["other"]]
+    assert terms["still"] == ["base", "shelf", "world"]
+    assert (terms["of"]["skin.friction"], terms["of"]["top.friction"]) == (["ball"], ["shelf"])
+    assert terms["of"]["motor.control"] == ["arm"]
+    acts = holds(terms, [("box", "world"), ("ball", "box"), ("other", "world")])
+    assert acts("floor.friction", "ball.linear_velocity")  # through the box
+    assert acts("skin.friction", "box.linear_velocity")
+    assert not acts("ball.mass", "other.linear_velocity")  # the floor passes nothing on
+    assert not acts("top.friction", "other.linear_velocity")
+    assert not acts("hinge.velocity", "box.linear_velocity")
+    assert holds(terms, [("cart", "box")])("hinge.velocity", "box.linear_velocity")
+    assert holds(terms, [("cloth", "box")])("ball.mass", "other.linear_velocity")
+    assert not holds(terms, [])("skin.friction", "ball.linear_velocity")
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_no_effect_by_contact_is_without_its_contact(engine: str) -> None:
+    """Of each variable, varied a little, all effects in a control step are by edges that hold.
+
+    The ball falls on the box, the other box on a shelf, and an arm swings beside them.
+    """
+    with World(SCENE.format(SPRING if engine == "mujoco" else ""), backend=engine) as world:
+        terms, seen = contact_terms(world), set()
+        edges = {(edge.cause, edge.effect): edge.when for edge in world.model.edges if edge.lag}
+        states = [v.name for v in world.model.variables if v.role == "state" and v.dtype == "real"]
+        varied = [
+            v.name
+            for v in world.model.variables
+            if v.settable and v.dtype == "real" and v.role in ("state", "parameter")
+            if not v.name.endswith(("color", "orientation"))
+        ]
+        world.reset(seed=0)
+        for t in range(30):
+            before, action = world.snapshot(), np.array([np.sin(t)])
+            steps = contacts_of(world, action)
+            after = world.snapshot()
+            acts = holds(terms, {contact.bodies for step in steps for contact in step})
+            for name in varied if t % 6 == 5 else ():
+                ends = []
+                for by in (1e-6, 2e-6):
+                    world.restore(before)
+                    world.do({name: np.asarray(world[name]) * (1.0 + by) + by / 10.0})
+                    world.step(action)
+                    ends.append([world[state].copy() for state in states])
+                moved = [
+                    s for s, a, b in zip(states, *ends, strict=True) if abs(a - b).max() > 1e-11
+                ]
+                for key in ((name, state) for state in moved):
+                    seen.add((key, edges[key]))
+                    assert edges[key] is None or acts(*key), (t, key)
+            world.restore(after)
+    assert {when for _, when in seen} == {None, "contact"}
+    assert len(seen) > 100
