@@ -226,7 +226,8 @@ class Folder:
             refused: Why episodes could not be, by their number.
             complete: Whether all files are there.
         """
-        graph = None if self.head.edges is None else [list(e.key) for e in self.head.edges]
+        edges = self.head.edges
+        graph = edges and [[*e.key, e.when] if e.when else list(e.key) for e in edges]
         lines: dict[str, Any] = {
             "format": FORMAT,
             "n": self.head.n,
