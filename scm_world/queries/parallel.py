@@ -95,7 +95,7 @@ def _batch_size(twins: Twins, units: Sequence[Unit], threads: int) -> int:
 
     Each further world makes a step cheaper by less, and costs the same.
     """
-    if not twins.batches or len(units) < LEAST or not is_known(units[0]) or units[0].contacts:
+    if not twins.batches or len(units) < LEAST or not is_known(units[0]) or units[0].listens:
         return 0
     steps = len(units) * (units[0].steps - units[0].first)
     worth = math.isqrt(steps * threads // PRICE)

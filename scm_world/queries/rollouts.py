@@ -11,10 +11,11 @@ import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers, Value
+from scm_world.backends.base import ContactPoint
 from scm_world.errors import ActionError
 from scm_world.policies.scripted import Policy, as_policy
 from scm_world.queries.equations import Equations, System
-from scm_world.queries.local import Touching, contacts_of
+from scm_world.queries.local import contacts_of
 from scm_world.queries.plans import GroupedSchedules, Key, Layer, Schedule
 from scm_world.world import Audit, Simulation
 from scm_world.world.batch import Batch, StateTable
@@ -40,8 +41,8 @@ class Trace:
         fired: When events happened.
         audits: What interventions did, by control step.
         values: Of the variables that were asked for, at each instant.
-        touching: Pairs of bodies that touched in the control step before each instant, where asked
-            for; at the first instant those of the last physics step.
+        touching: Pairs of bodies that touch at each instant, where asked for.
+        touched: Pairs that touched in any physics step of each control step, where asked for.
     """
 
     vectors: list[Floats] = field(default_factory=list)
@@ -53,6 +54,7 @@ class Trace:
     audits: dict[int, Audit] = field(default_factory=dict)
     values: dict[str, list[Value]] = field(default_factory=dict)
     touching: list[frozenset[tuple[str, str]]] = field(default_factory=list)
+    touched: list[frozenset[tuple[str, str]]] = field(default_factory=list)
 
     def until(self, step: int) -> Trace:
         """Copy what was before an instant, for a run that differs from there on."""
@@ -88,6 +90,11 @@ def _chosen(policy: Policy, world: System) -> Floats:
         raise ActionError("an action is finite numbers", given) from None
 
 
+def _pairs(contacts: Iterable[ContactPoint]) -> frozenset[tuple[str, str]]:
+    found = (tuple(sorted(contact.bodies)) for contact in contacts)
+    return frozenset((one, other) for one, other in found)
+
+
 def length(system: System, steps: int | None) -> int:
     """Give the number of control steps of an episode; that of the task if None.
 
@@ -116,6 +123,7 @@ class Unit:
         past: What was before that.
         start: The world at that instant, before anything is done then; None for a new episode.
         contacts: Whether to record which bodies touch, where there are bodies.
+        listens: Whether to do so in each physics step, which is slower.
     """
 
     seed: int
@@ -128,6 +136,7 @@ class Unit:
     past: Trace = field(default_factory=Trace)
     start: Any = None
     contacts: bool = False
+    listens: bool = False
 
     def run(self, world: System, arrive: Callable[[System], None] | None = None) -> Trace:
         """Run it in one world.
@@ -188,7 +197,6 @@ class Running:
         self.trace = unit.past.until(unit.first)
         self.trace.values = {name: list(values) for name, values in unit.past.values.items()}
         self._version = -1
-        self._touched: Touching = ()
 
     @cached_property
     def schedule(self) -> Schedule | GroupedSchedules:
@@ -235,16 +243,15 @@ class Running:
             for name in found if names == (ALL,) else there:
                 trace.values.setdefault(name, []).append(np.array(found[name]))
         if self.unit.contacts and isinstance(world, Simulation):
-            touched = self._touched or (world.backend.contacts(),)
-            pairs = {tuple(sorted(c.bodies)) for contacts in touched for c in contacts}
-            trace.touching.append(frozenset((one, other) for one, other in pairs))
+            trace.touching.append(_pairs(c for c in world.backend.contacts() if c.force > 0.0))
 
     def act(self, step: int, action: Any = None) -> None:
         """Take a control step, with the action of the policy if none is given."""
         policy = self.policy if action is None else lambda _: action
         chosen = _chosen(policy, self.world)
-        if self.unit.contacts and isinstance(self.world, Simulation):
-            self._touched = contacts_of(self.world, chosen)
+        if self.unit.listens and isinstance(self.world, Simulation):
+            steps = contacts_of(self.world, chosen)
+            self.trace.touched.append(_pairs(contact for step in steps for contact in step))
         else:
             self.world.step(chosen)
         self.trace.actions.append(chosen)

@@ -215,7 +215,7 @@ class WorldSource:
                 episode = Episode(self._twins, units[place], result)
                 found = self._row(episode)
                 if self._contacts:
-                    touching[numbers[place]] = _runs(result.touching[1:])
+                    touching[numbers[place]] = _runs(result.touched)
                 if self._pictures is not None:
                     seen[place] = self._look(self._pictures, episode)
             with lock:
@@ -229,7 +229,7 @@ class WorldSource:
             given = Plan(merged(self._world.model, self._given, done.plan))
             plan = self._setting.plan(self._world, given)
             unit = self._setting.unit(self._world, plan, number, written)
-            units.append(replace(unit, contacts=self._contacts))
+            units.append(replace(unit, listens=self._contacts))
         found = run_units(self._twins, units, finish, self._setting.workers)
         rows: list[Row] = []
         refused: list[tuple[int, str]] = []
