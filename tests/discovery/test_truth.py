@@ -463,7 +463,7 @@ def test_rows_before_and_after_a_box_falls_on_the_other(engine: str, tmp_path: P
     assert table.values.tobytes() == plain.values.tobytes()
     with pytest.raises(ModelError, match="contacts=True"):
         plain.acting()
-    save(table, tmp_path / "saved", format="csv")
+    save(table, tmp_path / "saved")
     read = load(tmp_path / "c"), load(tmp_path / "saved"), from_frame(as_frame(table)), folder
     assert all(each.about["touching"] == table.about["touching"] for each in read)
     assert 0.3 < table.contacts["a", "b"] < 0.7
