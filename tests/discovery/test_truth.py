@@ -146,8 +146,10 @@ def test_arrays_tell_hard_from_soft() -> None:
     assert soft.adjacency.sum() == 5
     alone = Dataset.of([[1.0]], ["x"])
     assert alone.truth is None
-    with pytest.raises(ModelError, match="does not know its graph"):
-        alone.adjacency()
+    for unknown in (alone, replace(alone, about={"truth": None})):
+        for ask in (unknown.adjacency, unknown.acting):
+            with pytest.raises(ModelError, match="does not know its graph"):
+                ask()
 
 
 def test_dcdi_reads_what_is_written(tmp_path: Path) -> None:

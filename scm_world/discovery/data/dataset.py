@@ -338,8 +338,8 @@ class Dataset:
         """
         from scm_world.discovery.data.truth import acting_edges
 
-        written = {**self.about.get("truth", {}), "edges": acting_edges(self)}
-        return replace(self, about={**self.about, "truth": written})
+        edges = acting_edges(self)
+        return replace(self, about={**self.about, "truth": {**self.about["truth"], "edges": edges}})
 
     @property
     def contacts(self) -> dict[tuple[str, str], float]:
