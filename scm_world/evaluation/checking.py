@@ -152,7 +152,7 @@ def _same_task(about: Mapping[str, Any], place: EvaluationPlace) -> None:
     there = {name: part for name, part in about["fingerprint"].items() if name in now}
     parts = differing(there, fingerprint(now, libraries=False))
     if parts:
-        allowed = (f"the one that was evaluated: {', '.join(parts)} differ",)
+        allowed = (f"the one that was evaluated, given as task=: {', '.join(parts)} differ",)
         raise UnknownOption("task", place.name, allowed)
 
 

@@ -64,7 +64,7 @@ def test_a_task_of_ones_own_is_another_one(tmp_path: Path) -> None:
     with pytest.raises(UnknownOption, match="task="):
         check(own)
     assert check(own, task=Bigger())
-    with pytest.raises(UnknownOption, match="Bigger"):
+    with pytest.raises(UnknownOption, match="class of the task differ"):
         check(own, task=Pushing())
 
 
