@@ -47,7 +47,7 @@ SUCCESS, FRACTION = "is_success", "fractional_success"
 LINES = 10.0  # [s] between lines about the training
 
 SEEDS = 1_000_003
-"""Between the noises of two seeds; a seed has one for each world."""
+"""Between the noises of two seeds, which have one for each world; evaluations have those below."""
 
 SCALES: Mapping[str, float] = {
     "cartesian_position": 10.0,  # one for 0.1 m, the radius of where blocks and goals are
@@ -267,7 +267,7 @@ def make_learner(recipe: Recipe, worlds: Episodes, *, seed: int, device: str = "
         device=device,
         **settings,
     )
-    worlds.seed(seed * SEEDS)  # the algorithm has set other seeds
+    worlds.seed((seed + 1) * SEEDS)  # the algorithm has set other seeds
     return model
 
 

@@ -24,6 +24,7 @@ from scm_world.errors import (
     UnreadableFile,
     UnwritableFolder,
 )
+from scm_world.evaluation import evaluate
 from scm_world.policies import load_policy, save_policy
 from scm_world.training.loop import train
 from scm_world.training.recipe import Recipe, recipe
@@ -167,6 +168,21 @@ def test_the_policy_file_acts_as_the_model(name: str, scaled: bool, tmp_path: Pa
         target = model.actor_target.state_dict()
         for key, tensor in model.actor.state_dict().items():
             np.testing.assert_array_equal(tensor.numpy(), target[key].numpy())
+
+
+def test_an_evaluation_has_no_episode_of_a_training() -> None:
+    """The goals of P5 by seed 0 are none that the worlds of a training by seed 0 begin with."""
+    made = recipe("reaching", worlds=2, n_steps=8, batch_size=8, trials={"protocols": []})
+    worlds = agents.make_worlds(made, backend="fake")
+    agents.make_learner(made, worlds, seed=0)
+    assert made.env["observe"][-1] == "goal_300.cartesian_position"
+    met = worlds.reset()[0, -3:]
+    worlds.close()
+    short = {"max_episode_length": 1}
+    found = evaluate("still", "P5", task="reaching", n=1, backend="fake", env=short)
+    radius, angle, height = found.drawn()["goal_300.cylindrical_position"][0]
+    drawn = [radius * np.cos(angle), radius * np.sin(angle), height]
+    assert met != pytest.approx(drawn, abs=1e-3)
 
 
 def test_worlds_begin_at_different_steps_of_their_episodes() -> None:
