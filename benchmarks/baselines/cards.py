@@ -36,9 +36,11 @@ scm-world evaluate zoo:pushing --protocols P0,P5
 ```
 
 Scores are means over episodes with 95 % intervals; [Evaluation](evaluation.md) says what the
-protocols are and how scores are estimated. Columns of seeds have the same score of several seeds of
-the same training; a column with the name of a script says what one reaches that sees the whole
-world. The published overlap is the score of CausalWorld's actors, see
+protocols are and how scores are estimated. 4 × 40 are 40 episodes of each of four seeds of draws;
+a score without an interval is of one and the same episode. Intervals of cards with 20 episodes are
+of an earlier kind that is too narrow where failures are rare. Columns of seeds have the same score
+of several seeds of the same training; a column with the name of a script says what one reaches that
+sees the whole world. The published overlap is the score of CausalWorld's actors, see
 [metrics](evaluation.md). `scm-world list --zoo` lists the policies. This page is written by
 `python -m benchmarks.baselines.publish`.
 """
@@ -129,8 +131,9 @@ def _table(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
             for engine in engines
             for entry in more
         ]
-        counts = {row["n"] for row in listed if row["protocol"] == protocol}
-        episodes = ", ".join(map(str, sorted(counts)))
+        mine = [row for row in listed if row["protocol"] == protocol]
+        counts = {(row["n"], len(row.get("draws", "0"))) for row in mine}
+        episodes = ", ".join(f"{n}" if m == 1 else f"{m} × {n // m}" for n, m in sorted(counts))
         yield f"| {' | '.join((protocol, what.replace('|', chr(92) + '|'), *cells, episodes))} |"
 
 

@@ -5,7 +5,8 @@
     python -m benchmarks.baselines.publish RUN NAME --results EVALUATION …
 
 ``RUN`` is the folder of a training run, or a policy file; ``EVALUATION`` a folder that
-``scm-world evaluate`` wrote about this very file, on one engine or both. The policy without its
+``scm-world evaluate --seeds 0,1,2,3`` wrote about this very file, with four seeds of draws or more,
+on one engine or both. The policy without its
 value network becomes ``scm_world/policies/zoo/NAME.safetensors``, and ``docs/zoo.md`` is written
 anew. Other runs of the same agent in the evaluation are the seeds beside it; the scripted policy
 ``--ceiling``, an agent in it too, says what can be reached in a protocol.
@@ -30,6 +31,7 @@ from scm_world.training.imitation import lesson
 from scm_world.training.recipe import Recipe, recipe
 
 LARGEST = 1_000_000  # [bytes] of a file in the package
+DRAWS = 4  # seeds of draws, at least
 PAGE = Path(__file__).parents[2] / "docs" / "zoo.md"
 
 
@@ -45,6 +47,7 @@ def scores_of(
 
     Raises:
         UnreadableFile: An evaluation is damaged, or not of this file.
+        UnknownOption: An evaluation has fewer than four seeds of draws.
         ModelError: Two evaluations have the same protocol on the same engine.
     """
     content = sha256(path.read_bytes()).hexdigest()
@@ -62,6 +65,9 @@ def _rows(folder: Path, content: str, ceiling: str | None) -> Iterable[dict[str,
     if not agents:
         advice = "evaluate this very file: scm-world evaluate FILE --out FOLDER"
         raise UnreadableFile(str(folder), "it is no evaluation of this policy", advice)
+    if len(evaluation.about["seeds"]) < DRAWS:
+        advice = (f"{DRAWS} or more: scm-world evaluate --seeds 0,1,2,3",)
+        raise UnknownOption("seeds of draws", evaluation.about["seeds"], advice)
     agent, run = agents[0]["agent"], agents[0]["run"]
     mine = evaluation.only(agent=agent, run=run)
     varied = {one["name"]: one.get("doc", "") for one in evaluation.about["protocols"]}
@@ -74,6 +80,7 @@ def _rows(folder: Path, content: str, ceiling: str | None) -> Iterable[dict[str,
             }
             n = len(mine.only(engine=engine, protocol=protocol))
             where = {"engine": engine, "protocol": protocol, "varied": varied[protocol], "n": n}
+            where["draws"] = evaluation.about["seeds"]
             there = {"protocol": protocol, "engine": engine}
             if len(runs := evaluation.runs(agent)) > 1:
                 each = [evaluation.only(agent=agent, run=one, **there) for one in runs]

@@ -16,7 +16,6 @@ from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.episodes import FRACTIONS, METRICS, EpisodeRow
 from scm_world.evaluation.statistics import (
-    LEVEL,
     Causes,
     Interval,
     aggregate,
@@ -34,8 +33,12 @@ KEYS = ("agent", "run", "engine", "protocol", "seed", "episode")
 DRAWN = "drawn "
 """First word of the columns with the values that were drawn."""
 
-RATES = (*FRACTIONS, "success")
-"""The metrics that always lie in [0, 1]."""
+RATES: Mapping[str, bool | None] = {
+    **dict.fromkeys((*FRACTIONS, "success"), True),
+    "return": False,
+    "published_overlap": None,
+}
+"""Whether a metric always lies in [0, 1]; None: as far as its scores do."""
 
 NO_PATH = "no directed path leads from it to the score or the observation"
 
@@ -81,6 +84,12 @@ def means(columns: Columns, metric: str) -> dict[tuple[int, int], float]:
     return {unit: sum(scores) / len(scores) for unit, scores in found.items()}
 
 
+def is_settled(columns: Columns) -> bool:
+    """Whether nothing is random: each run played one and the same episode again and again."""
+    episodes = set(zip(columns["run"].tolist(), columns["hash"].tolist(), strict=True))
+    return len(episodes) == len(set(columns["run"].tolist())) < len(columns["run"])
+
+
 def paired(one: Columns, other: Columns, metric: str) -> Interval:
     """Estimate by how much the scores of a table are higher, episode by episode.
 
@@ -94,7 +103,13 @@ def paired(one: Columns, other: Columns, metric: str) -> Interval:
         raise UnknownOption("seed and episode of a pair", differ, allowed)
     units = sorted(mine)
     first, second = (np.array([scores[unit] for unit in units]) for scores in (mine, its))
-    return difference_interval(first, second, proportion=metric in RATES)
+    found = difference_interval(first, second, proportion=RATES[metric])
+    return _exact(found) if is_settled(one) and is_settled(other) else found
+
+
+def _exact(found: Interval) -> Interval:
+    """Return an estimate of what is not random."""
+    return replace(found, low=found.value, high=found.value)
 
 
 def digest_of(columns: Columns) -> str:
@@ -265,20 +280,18 @@ class Evaluation:
     ) -> Interval:
         """Estimate the mean score in a protocol, with its 95 % interval over episodes.
 
-        Several training runs are strata: the interval says how sure we are of these runs. Where
-        all episodes of a run are one and the same, bit for bit, the score is what it is.
+        Of several training runs the mean of each episode counts, since all met the same draws: the
+        interval says how sure we are of these runs. Where all episodes of a run are one and the
+        same, bit for bit, nothing is random and the score is what it is.
 
         Raises:
             UnknownOption: There is no such protocol, metric, agent or engine.
         """
         metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
-        mine = self.only(agent=agent, engine=engine, protocol=protocol)
-        values, runs = mine.columns[metric], mine.columns["run"]
-        if len(set(mine.columns["hash"].tolist())) == len(set(runs.tolist())) < len(values):
-            mean = float(values.mean())  # nothing is random here: one episode, again and again
-            return Interval(mean, mean, mean, LEVEL, len(values))
-        return mean_interval(values, runs, proportion=metric in RATES)
+        mine = self.only(agent=agent, engine=engine, protocol=protocol).columns
+        found = mean_interval([*means(mine, metric).values()], proportion=RATES[metric])
+        return _exact(found) if is_settled(mine) else found
 
     def difference(
         self,
@@ -291,8 +304,8 @@ class Evaluation:
     ) -> Interval:
         """Estimate by how much an agent is better than another one, episode by episode.
 
-        Both met the same draws, so this interval is mostly much smaller than those of the two
-        scores. Of several runs of an agent the mean counts.
+        Both met the same draws, so this interval is mostly smaller than with draws of their own.
+        Of several runs of an agent the mean counts.
 
         Raises:
             UnknownOption: They did not play the same episodes.
@@ -363,7 +376,7 @@ class Evaluation:
         scores = np.array([score_of[unit] for unit in units])
         silent = [n for n in self.about.get("unrelated", {}).get(agent, ()) if n in varied]
         tested = {name: values for name, values in varied.items() if name not in silent}
-        found = find_causes(tested, scores, proportion=metric in RATES)
+        found = find_causes(tested, scores, proportion=RATES[metric])
         return replace(found, left_out={**found.left_out, **dict.fromkeys(silent, NO_PATH)})
 
     def published(self, *, agent: str | None = None, engine: str | None = None) -> dict[str, Any]:

@@ -109,8 +109,10 @@ def test_episodes_without_noise_have_no_interval() -> None:
     """There is one episode, however often it was played; of several there is."""
     found = tiny(protocols="P0,P2", n=8)
     still, drawn = (found.score(protocol, "success") for protocol in ("P0", "P2"))
-    assert (still.low, still.high) == (still.value, still.value)
+    assert (still.low, still.high, str(still)) == (still.value, still.value, f"{still.value:.2f}")
     assert drawn.width > 0.0
+    both = tiny({"a": "still", "b": "sweep"}, protocols="P0,P2", n=8)
+    assert both.difference("a", "b", "P0").width == 0.0 < both.difference("a", "b", "P2").width
 
 
 def test_fractions_that_never_vary_have_an_interval() -> None:
@@ -118,7 +120,7 @@ def test_fractions_that_never_vary_have_an_interval() -> None:
     found = tiny(protocols="P2", n=8)
     score = found.score("P2", "last_fractional_success")
     assert (score.value, score.low) == (0.0, 0.0)
-    assert score.high == pytest.approx(3.8415 / (8 + 3.8415), abs=1e-4)  # Wilson
+    assert score.high == pytest.approx(0.1 + 2.2622 * 0.1, abs=1e-4)  # t of nine degrees
 
 
 def test_a_list_is_one_agent() -> None:

@@ -215,8 +215,8 @@ def test_a_protocol_in_which_an_agent_did_not_act_has_a_dash() -> None:
 
 
 def test_a_score_of_one_episode_has_no_whisker() -> None:
-    """The data say nothing about its interval."""
-    figure = bars_figure(made(1, 3, n=1))
+    """Where numbers have no bounds the data say nothing about its interval."""
+    figure = bars_figure(made(1, 3, n=1), metric="return")
     assert len(named(figure, r"ppo\|.*")) == 3
     assert not figure.findobj(LineCollection)
 
@@ -417,9 +417,10 @@ def test_a_report_needs_nothing_else(small: tuple[Evaluation, str]) -> None:
 
 def test_only_who_is_better_is_bold(small: tuple[Evaluation, str], tmp_path: Path) -> None:
     """The best agent stands out if its paired differences exclude 0, and nobody else does."""
-    better = sections(small[1])["summary"]
+    better = sections(report(made(3, 3, n=120), tmp_path))["summary"]
     assert better.count('class="best"') == 3
     assert len(re.findall(r'<td class="best"[^>]*>0\.[89]', better)) == 3
+    assert 'class="best"' not in sections(small[1])["summary"]  # twelve episodes are too few
     equal = sections(report(made(3, 2, score=1.0), tmp_path))["summary"]
     assert 'class="best"' not in equal
 
@@ -444,7 +445,7 @@ def test_a_report_of_little_says_what_is_missing(tmp_path: Path) -> None:
     found = sections(report(made(1, 2, n=1), tmp_path))
     assert not {"radar", "gap", "differences"} & set(found)
     assert "There are none" in found["profile"]
-    assert "[unknown]" in found["summary"]
+    assert "[0.00, 1.00]" in found["summary"]
     assert "too few episodes varied anything" in found["causes"]
     with pytest.raises(UnknownOption, match="without episodes"):
         write_report(Evaluation.of({"task": "pushing"}, []), tmp_path / "none.html")

@@ -69,14 +69,13 @@ def test_paired_differences_are_surer() -> None:
     found = Evaluation.of({"task": "pushing"}, rows)
     difference = found.difference("b", "a", "P1")
     assert difference.value == pytest.approx(gain.mean())
-    assert difference.excludes(0.0)
-    assert difference.width < 0.1 * found.score("P1", agent="a").width
+    assert difference.width < 0.6 * found.score("P1", agent="a").width
     with pytest.raises(UnknownOption, match="both have played"):
         Evaluation.of({}, rows[:-1]).difference("b", "a", "P1")
 
 
-def test_several_runs_are_strata() -> None:
-    """A list of policies is one agent; IQM and the rest are over its runs."""
+def test_several_runs_of_an_agent_count_once_an_episode() -> None:
+    """All of them met the same draws; IQM and the rest are over the runs."""
     found = small({"mine": ["still", "random", "sweep"], "other": linear})
     assert found.runs("mine") == (0, 1, 2)
     assert found.scores(agent="mine").shape == (3, 2, 3)
@@ -86,7 +85,8 @@ def test_several_runs_are_strata() -> None:
         "interquartile_mean",
         "optimality_gap",
     }
-    assert found.score("P0", agent="mine").n == 9
+    score, episodes = found.score("P6", agent="mine"), found.scores(agent="mine")[:, 1]
+    assert (score.n, score.value) == (3, pytest.approx(episodes.mean()))
     assert found.difference("mine", "other", "P0").n == 3
 
 

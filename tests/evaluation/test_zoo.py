@@ -47,7 +47,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def evaluated(path: Path, out: Path, protocols: str = "P0,P5", **options: Any) -> Path:
     """Evaluate a policy in short episodes without physics, and give the folder."""
     env = {"max_episode_length": 5}
-    made: Any = {"n": 2, "backend": "fake", "env": env, **options}
+    made: Any = {"n": 1, "seeds": range(4), "backend": "fake", "env": env, **options}
     evaluate({"a": str(path), "still": "still"}, protocols, **made).save(out, kind="csv")
     return out
 
@@ -84,10 +84,10 @@ def test_the_card_says_how_it_was_made_and_how_well_it_does(published: str, tmp_
     assert about.card["command"] == COMMAND
     scores: Any = about.card["scores"]
     assert [(row["engine"], row["protocol"], row["n"]) for row in scores] == [
-        ("fake", "P0", 2),
-        ("fake", "P5", 2),
+        ("fake", "P0", 4),
+        ("fake", "P5", 4),
     ]
-    assert scores[0]["last_fractional_success"]["n"] == 2
+    assert scores[1]["last_fractional_success"]["n"] == 4
     text = card_text(about, published)
     for part in (
         "# zoo:small\n",
@@ -97,6 +97,8 @@ def test_the_card_says_how_it_was_made_and_how_well_it_does(published: str, tmp_
         "| cpu_s | 12.35 |",
         "numpy 2.0, mujoco 3.3",
         "| last fractional success, fake | success, fake | published overlap, fake | episodes |",
+        "| P5 | goal from A |",
+        " | 4 × 1 |",
         "- It does nothing.",
         "<summary>recipe</summary>",
         '| trial | `{"steps": 512, "scores": {"P0": 0.5}}` |',
@@ -111,7 +113,7 @@ def test_the_card_says_how_it_was_made_and_how_well_it_does(published: str, tmp_
 def test_seeds_and_a_ceiling_stand_beside_the_scores(folder: Path, tmp_path: Path) -> None:
     """Of the same evaluation: other runs of the agent, and one that sees the whole world."""
     paths = [trained(tmp_path / f"{seed}.safetensors", seed=seed, card=CARD) for seed in (0, 1)]
-    made: Any = {"n": 2, "backend": "fake", "env": {"max_episode_length": 5}}
+    made: Any = {"n": 1, "seeds": range(4), "backend": "fake", "env": {"max_episode_length": 5}}
     agents: Any = {"a": [str(path) for path in paths], "still": "still"}
     found = evaluate(agents, "P5", **made)
     found.save(tmp_path / "results", kind="csv")
@@ -148,12 +150,15 @@ def test_names_that_are_not_there_are_refused(published: str) -> None:
 
 
 def test_results_of_another_policy_are_not_published(folder: Path, tmp_path: Path) -> None:
-    """Nor the same scores twice, nor a policy without its command; nothing is written."""
+    """Nor the same scores twice, one seed of draws, no command; nothing is written."""
     path = trained(tmp_path / "a.safetensors", card=CARD)
     results = evaluated(path, tmp_path / "results")
     page_path = tmp_path / "zoo.md"
     with pytest.raises(ModelError, match="P0 on fake is there twice"):
         publish(path, "small", [results, results], page=page_path)
+    few = evaluated(path, tmp_path / "few", seeds=range(3))
+    with pytest.raises(UnknownOption, match=r"seeds of draws .*--seeds 0,1,2,3"):
+        publish(path, "small", [few], page=page_path)
     with pytest.raises(UnreadableFile, match="no evaluation of this policy"):
         publish(trained(path, seed=9, card=CARD), "small", [results], page=page_path)
     with pytest.raises(UnknownOption, match="--command"):

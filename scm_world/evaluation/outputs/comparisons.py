@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -169,9 +170,7 @@ def causes_of(evaluation: Evaluation, line: Line, metric: str) -> dict[str, Caus
 
 def is_flat(found: Causes) -> bool:
     """Whether the score was the same in every episode."""
-    return bool(found.causes) and all(
-        cause.share.high == 0.0 and cause.p == 1.0 for cause in found.causes
-    )
+    return bool(found.causes) and all(math.isnan(cause.share.width) for cause in found.causes)
 
 
 @final

@@ -1,7 +1,4 @@
-"""The statistics of evaluations: functions of arrays, with intervals.
-
-Every draw comes from a seed, so the same numbers give the same intervals.
-"""
+"""The statistics of evaluations: functions of arrays, with intervals."""
 
 from scm_world.evaluation.statistics.causes import Cause, Causes, ColumnEffect, find_causes
 from scm_world.evaluation.statistics.intervals import (
@@ -11,7 +8,6 @@ from scm_world.evaluation.statistics.intervals import (
     Profile,
     aggregate,
     difference_interval,
-    is_binary,
     mean_interval,
     performance_profile,
     probability_of_improvement,
@@ -29,7 +25,6 @@ __all__ = [
     "aggregate",
     "difference_interval",
     "find_causes",
-    "is_binary",
     "mean_interval",
     "performance_profile",
     "probability_of_improvement",

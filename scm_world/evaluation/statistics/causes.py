@@ -26,12 +26,12 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import ArrayLike, Floats, Value
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.statistics.intervals import (
     LEVEL,
     Interval,
-    draws,
     normal_quantile,
     numbers,
     unpaired_interval,
@@ -208,7 +208,7 @@ def find_causes(
     """
     given = numbers("scores", scores)
     normal_quantile(level)
-    draws("permutations", permutations, 1)
+    whole_number("permutations", permutations, least=1)
     how: Any = {"level": level, "proportion": proportion}
     left_out: dict[str, str] = {}
     found: list[Cause] = []
@@ -359,7 +359,7 @@ def _share(
     centered = scores - scores.mean()
     variance = float(np.square(centered).mean())
     if variance <= 1e-24 * max(1.0, float(np.square(scores).max())):  # nothing but rounding
-        return Interval(0.0, 0.0, 0.0, level, n), 1.0
+        return Interval(0.0, math.nan, math.nan, level, n), 1.0
     regressors = _regressors(columns, n)
     r = regressors.shape[1]
     fitted = regressors @ (regressors.T @ centered) / n

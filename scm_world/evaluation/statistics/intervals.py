@@ -1,10 +1,12 @@
 """Estimates of scores with intervals: means, differences, and aggregates over runs and protocols.
 
-A bootstrap of three or ten numbers is too short, and one of two hundred successes in a row has no
-width. So means have intervals of Student's t, and rates those of binomial distributions. Intervals
-over training runs treat a run with its scores in all protocols as one unit. Aggregates over
-episodes are resampled within each run (Efron and Tibshirani, *An Introduction to the Bootstrap*,
-1993). ``benchmarks/coverage.py`` measures how often all of them contain the truth.
+A bootstrap of three or ten numbers is too short, and one of forty successes in a row has no width.
+So scores with bounds, and differences of them, have Student's interval of the sample to which one
+score at either bound is added: that is what a failure that was not seen yet may do. Numbers without
+bounds have Student's interval. Intervals over training runs treat a run with its scores in all
+protocols as one unit, those over episodes an episode with its scores in all runs and protocols.
+``benchmarks/coverage.py`` measures how often all of them contain the truth,
+``benchmarks/intervals.py`` how often other methods do.
 
 Source:
     Agarwal et al., *Deep reinforcement learning at the edge of the statistical precipice*,
@@ -14,7 +16,6 @@ Source:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from statistics import NormalDist
 from typing import Any, final
@@ -26,10 +27,8 @@ from scm_world._types import ArrayLike, Floats
 from scm_world.errors import UnknownOption
 
 LEVEL = 0.95
-RESAMPLES = 2000
 FEWEST_RUNS = 3
 """With fewer runs there is no interval over runs."""
-BLOCK = 1_000_000  # numbers that are resampled together, some ten megabytes
 
 
 @final
@@ -39,7 +38,8 @@ class Interval:
 
     Attributes:
         value: The estimate.
-        low: Lower end; NaN if the data say nothing about it, as one number alone does.
+        low: Lower end; NaN if the data say nothing about it, as one number alone does; the value
+            itself, like ``high``, only where nothing is random.
         high: Upper end, or NaN.
         level: Confidence, such as 0.95.
         n: How many numbers it is estimated from.
@@ -77,68 +77,43 @@ class Interval:
     def __str__(self) -> str:
         if math.isnan(self.width):
             return f"{self.value:z.2f} [unknown]"
-        digits = min(max(2, -math.floor(math.log10(self.width or 1.0))), 4)
+        if self.width == 0.0:
+            return f"{self.value:z.2f}"
+        digits = min(max(2, -math.floor(math.log10(self.width))), 4)
         return f"{self.value:z.{digits}f} [{self.low:z.{digits}f}, {self.high:z.{digits}f}]"
 
 
 def mean_interval(
-    values: ArrayLike,
-    strata: ArrayLike | None = None,
-    *,
-    level: float = LEVEL,
-    proportion: bool | None = None,
+    values: ArrayLike, *, level: float = LEVEL, proportion: bool | None = None
 ) -> Interval:
     """Estimate a mean, with an interval.
 
     Args:
-        values: One number per episode, shape ``(n,)``.
-        strata: To which stratum each belongs, for example its training run, shape ``(n,)``. The
-            interval is about other episodes of the same strata; those of failures and successes,
-            and of strata of which one has a single number, leave the strata out and are wider.
+        values: One number per episode, shape ``(n,)``, independent of one another.
         level: Confidence.
         proportion: Whether the values are rates, which always lie in [0, 1]. By default
             they are if all of them do.
 
     Returns:
-        The mean. Failures and successes, 0 and 1, have the interval of Wilson, other rates that of
-        ``interval_of``, all other numbers that of Student's t with the degrees of freedom of
-        Welch and Satterthwaite, whose ends are unknown where nothing varies within strata.
+        The mean. That of rates has Student's interval of the values, a 0 and a 1, cut off at 0 and
+        1: it holds for rare failures and never has the width 0. That of all other numbers has
+        Student's interval, whose ends are unknown where nothing varies; it is too short for few
+        numbers of a skewed kind.
 
     Raises:
-        UnknownOption: No values; values, strata or a level that are none; or a proportion of
-            values that do not lie in [0, 1].
+        UnknownOption: No values; values or a level that are none; or a proportion of values that do
+            not lie in [0, 1].
 
     Source:
-        Wilson, *Probable inference*, Journal of the American Statistical Association 22, 1927.
-        Satterthwaite, *An approximate distribution of estimates of variance components*,
-        Biometrics Bulletin 2, 1946.
+        Agresti and Coull, *Approximate is better than "exact" for interval estimation of binomial
+        proportions*, The American Statistician 52, 1998, for scores that are added.
 
     Example:
         >>> print(mean_interval([1.0] * 200))
-        1.00 [0.98, 1.00]
+        1.00 [0.99, 1.00]
     """
     scores = numbers("values", values)
-    members = [scores]
-    if strata is not None:
-        labels: Any = np.asarray(strata)
-        if labels.shape != scores.shape:
-            allowed = (f"one for each of the {scores.size} values",)
-            raise UnknownOption("strata", f"an array of shape {labels.shape}", allowed)
-        members = [scores[labels == label] for label in np.unique(labels)]
-    normal_quantile(level)
-    is_rate = bool(scores.min() >= 0.0 and scores.max() <= 1.0)
-    if proportion and not is_rate:
-        raise UnknownOption("a value of a proportion", "another number", ("in [0, 1]",))
-    if not (is_rate if proportion is None else proportion):
-        return _of_mean(scores, members, level, None)
-    if not is_binary(scores):
-        return _of_mean(scores, members, level, (0.0, 1.0))
-    from scipy.stats import binomtest
-
-    found = binomtest(int(scores.sum()), scores.size).proportion_ci(level, method="wilson")
-    mean = float(scores.mean())
-    low, high = min(float(found.low), mean), max(float(found.high), mean)
-    return Interval(mean, low, high, level, scores.size)
+    return _of_mean(scores, (0.0, 1.0) if _is_rate(scores, proportion) else None, level)
 
 
 def difference_interval(
@@ -149,10 +124,8 @@ def difference_interval(
     Both have shape ``(n,)``; the other arguments are those of ``mean_interval``.
 
     Returns:
-        The mean of ``a - b``, with the interval of Student's t; its ends are unknown where all
-        differences are the same. Where every score is 0 or 1 the interval is that of Bonett and
-        Price: one episode in which only the first succeeds and one in which only the second does
-        are added.
+        The mean of ``a - b``, with Student's interval; that of rates is of the differences, a -1
+        and a 1: one episode in which only the first succeeds and one in which only the second does.
 
     Raises:
         UnknownOption: As for ``mean_interval``, or ``a`` and ``b`` differ in length.
@@ -165,17 +138,8 @@ def difference_interval(
     first, second = numbers("a", a), numbers("b", b)
     if first.shape != second.shape:
         raise UnknownOption("b", f"{second.size} scores", (f"one for each of the {first.size} a",))
-    difference, both = first - second, np.concatenate([first, second])
-    z = normal_quantile(level)
-    if proportion is False or not is_binary(both):
-        return _of_mean(difference, [difference], level, None)
-    n = len(difference) + 2.0
-    wins = (np.count_nonzero(difference > 0.0) + 1.0) / n
-    losses = (np.count_nonzero(difference < 0.0) + 1.0) / n
-    center, mean = wins - losses, float(difference.mean())
-    reach = z * math.sqrt((wins + losses - center**2) / n)
-    low, high = max(-1.0, center - reach), min(1.0, center + reach)
-    return Interval(mean, min(low, mean), max(high, mean), level, difference.size)
+    is_rate = _is_rate(np.concatenate([first, second]), proportion)
+    return _of_mean(first - second, (-1.0, 1.0) if is_rate else None, level)
 
 
 def unpaired_interval(a: ArrayLike, b: ArrayLike, **how: Any) -> Interval:
@@ -201,37 +165,12 @@ def unpaired_interval(a: ArrayLike, b: ArrayLike, **how: Any) -> Interval:
     return Interval(value, value - below, value + above, one.level, one.n + other.n)
 
 
-def is_binary(values: Floats) -> bool:
-    """Whether every value is 0 or 1."""
-    return bool(np.all((values == 0.0) | (values == 1.0)))
-
-
-def bootstrap(
-    strata: Sequence[Floats],
-    statistic: Callable[..., Any],
-    *,
-    level: float,
-    resamples: int,
-    seed: int,
-) -> tuple[Any, Any]:
-    """Compute both ends of the percentile interval of a stratified bootstrap.
-
-    Args:
-        strata: Numbers that are resampled within each of them, two or more, each of shape ``(n,)``.
-        statistic: Takes resamples of all strata, each of shape ``(resamples, n)``, and ``axis=-1``;
-            returns shape ``(..., resamples)``.
-        level: Confidence.
-        resamples: How many.
-        seed: Of the draws.
-    """
-    from scipy.stats import bootstrap as of_scipy
-
-    found = of_scipy(
-        strata, statistic, n_resamples=draws("resamples", resamples), vectorized=True,
-        batch=max(1, BLOCK // sum(map(len, strata))), confidence_level=level,
-        method="percentile", rng=np.random.default_rng(seed),
-    )  # fmt: skip
-    return found.confidence_interval.low, found.confidence_interval.high
+def _is_rate(scores: Floats, asked: bool | None) -> bool:
+    """Whether scores have the bounds 0 and 1: as asked, else if they lie between them."""
+    found = bool(scores.min() >= 0.0 and scores.max() <= 1.0)
+    if asked and not found:
+        raise UnknownOption("a value of a proportion", "another number", ("in [0, 1]",))
+    return found if asked is None else asked
 
 
 def numbers(name: str, values: ArrayLike, *, ndim: tuple[int, ...] = (1,)) -> Floats:
@@ -253,13 +192,6 @@ def numbers(name: str, values: ArrayLike, *, ndim: tuple[int, ...] = (1,)) -> Fl
     return array
 
 
-def draws(name: str, count: int, least: int = 2) -> int:
-    """Return a number of resamples or permutations, or raise ``UnknownOption``."""
-    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < least:
-        raise UnknownOption(name, count, (f"a whole number, {least} or more",))
-    return int(count)
-
-
 def normal_quantile(level: float) -> float:
     """Return by how many deviations a normal interval reaches to either side."""
     if not 0.0 < level < 1.0:
@@ -267,45 +199,45 @@ def normal_quantile(level: float) -> float:
     return NormalDist().inv_cdf(0.5 + 0.5 * level)
 
 
-def _of_mean(
-    values: Floats, strata: list[Floats], level: float, bounds: tuple[float, float] | None
-) -> Interval:
-    """Give the mean of numbers with its interval; numbers with bounds lie between them."""
-    mean, n = float(values.mean()), values.size
-    parts = strata if min(map(len, strata)) > 1 else [values]
-    if n == 1:
-        return Interval(mean, math.nan, math.nan, level, n)
-    shares = np.array([len(part) * part.var(ddof=1) for part in parts]) / n**2
-    spent = np.array([1.0 / (len(part) - 1) for part in parts])
-    variance = float(shares.sum())
-    if variance <= (1e-15 * float(np.abs(values).max())) ** 2:  # nothing varies but by rounding
-        variance, degrees = 0.0, n - 1.0
-    else:
-        degrees = variance**2 / float((shares**2 * spent).sum())
-    low, high = interval_of(mean, math.sqrt(variance), degrees, n, level, bounds)
-    return Interval(mean, float(low), float(high), level, n)
+def _of_mean(values: Floats, bounds: tuple[float, float] | None, level: float) -> Interval:
+    mean = float(values.mean())
+    low, high = (float(end) for end in student(values, bounds, level))
+    return Interval(mean, min(low, mean), max(high, mean), level, values.size)
 
 
-def interval_of(
-    value: ArrayLike,
-    error: ArrayLike,
-    degrees: float,
-    n: int,
-    level: float,
-    bounds: tuple[ArrayLike, ArrayLike] | None,
+def student(
+    values: Floats, bounds: tuple[ArrayLike, ArrayLike] | None, level: float
 ) -> tuple[Floats, Floats]:
-    """Return the ends of the intervals of estimates, each of the shape of ``value``.
+    """Return the ends of Student's intervals of means over the first axis, shape ``(...)``.
 
     Args:
-        value: The estimates.
-        error: Their standard errors.
-        degrees: Of freedom, from which the errors are known.
-        n: How many independent units there are.
+        values: Shape ``(n, ...)``.
+        bounds: Between which the means lie. One value at either is added, and ends do not leave
+            them. None: nothing is added; the ends are NaN where nothing varies but by rounding.
         level: Confidence.
-        bounds: Between which values lie, so that an estimate is a share of the way from one to the
-            other. It gets the interval of Clopper and Pearson with as many effective units as give
-            its error, corrected for the degrees of freedom, but not fewer than ``n``. None: the
-            interval of Student's t, whose ends are NaN where the error is 0.
+    """
+    from scipy.special import stdtrit
+
+    normal_quantile(level)  # refuses a level that is none
+    lowest, highest = (-np.inf, np.inf) if bounds is None else bounds
+    if bounds is not None:
+        added = [np.broadcast_to(bound, values.shape[1:])[None] for bound in bounds]
+        values = np.concatenate([values, *added])
+    n, center = len(values), values.mean(axis=0)
+    error = values.std(axis=0, ddof=1) / math.sqrt(n) if n > 1 else np.zeros_like(center)
+    reach = float(stdtrit(max(n - 1, 1), 0.5 + 0.5 * level)) * error
+    reach = np.where(error > 1e-15 * np.abs(values).max(axis=0), reach, np.nan)
+    return np.maximum(center - reach, lowest), np.minimum(center + reach, highest)
+
+
+def korn_graubard(
+    value: Floats, each: Floats, bounds: tuple[Floats, Floats], level: float
+) -> tuple[Floats, Floats]:
+    """Return the ends of the intervals of rates over runs, which are about alike.
+
+    A rate is a share of the way from one bound to the other. It gets the interval of Clopper and
+    Pearson with as many effective units as give its error, corrected for the degrees of freedom,
+    but not fewer than there are runs. The arguments are those of ``_ends``.
 
     Source:
         Korn and Graubard, *Confidence intervals for proportions with small expected number of
@@ -313,16 +245,12 @@ def interval_of(
     """
     from scipy.special import betaincinv, stdtrit
 
-    center, spread = np.asarray(value, dtype=np.float64), np.asarray(error, dtype=np.float64)
-    tail, z = 0.5 - 0.5 * level, normal_quantile(level)
-    t = float(stdtrit(degrees, 1.0 - tail))
-    if bounds is None:
-        reach = np.where(spread > 0.0, t * spread, np.nan)
-        return center - reach, center + reach
-    least, most = (np.asarray(bound, dtype=np.float64) for bound in bounds)
-    share, scale = np.clip((center - least) / (most - least), 0.0, 1.0), most - least
+    n, tail, (least, most) = len(each), 0.5 - 0.5 * level, bounds
+    spread = each.std(axis=0, ddof=1) / math.sqrt(n)
+    ratio = normal_quantile(level) / float(stdtrit(n - 1.0, 1.0 - tail))
+    share, scale = np.clip((value - least) / (most - least), 0.0, 1.0), most - least
     with np.errstate(divide="ignore", invalid="ignore"):
-        units = share * (1.0 - share) * np.square(scale * z / (t * spread))
+        units = share * (1.0 - share) * np.square(scale * ratio / spread)
     units = np.maximum(np.where(spread > 0.0, units, n), n)
     hits, misses = share * units, (1.0 - share) * units
     low = np.where(hits > 0.0, betaincinv(np.maximum(hits, 1e-300), misses + 1.0, tail), 0.0)
@@ -335,13 +263,7 @@ OVER = ("runs", "episodes")
 
 
 def aggregate(
-    scores: ArrayLike,
-    *,
-    over: str = "runs",
-    gamma: float = 1.0,
-    level: float = LEVEL,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
+    scores: ArrayLike, *, over: str = "runs", gamma: float = 1.0, level: float = LEVEL
 ) -> dict[str, Interval]:
     """Estimate the four aggregates, with intervals.
 
@@ -349,12 +271,10 @@ def aggregate(
         scores: Shape ``(runs, protocols)``, or ``(runs, protocols, episodes)``.
         over: ``"runs"``: a run's score in a protocol is the mean of its episodes, and runs are
             the units, each with its scores in all protocols; the interval is about other runs of
-            the same training. ``"episodes"``: episodes are resampled within each run and
-            protocol; the interval is about other episodes of the same runs.
+            the same training. ``"episodes"``: the units are episodes, each with its scores in all
+            runs and protocols; the interval is about other episodes of the same runs.
         gamma: Score that counts as enough, for the optimality gap.
         level: Confidence.
-        resamples: Of the bootstrap over episodes.
-        seed: Of the bootstrap over episodes.
 
     Returns:
         By the names of ``METRICS``: the mean; the median protocol's mean; the mean of the middle
@@ -364,34 +284,36 @@ def aggregate(
         run either learns or fails and all runs at hand did the same.
 
     Raises:
-        UnknownOption: Scores, level, resamples or ``over`` that are none; or less than two runs,
-            or episodes.
+        UnknownOption: Scores, level or ``over`` that are none; or less than two runs, or episodes.
 
     Example:
         >>> scores = np.random.default_rng(0).beta(8, 2, size=(5, 12))
         >>> print(aggregate(scores)["interquartile_mean"])
         0.79 [0.71, 0.86]
     """
-    from scipy.stats import trim_mean
-
     table = _units("scores", scores, over)
-    normal_quantile(level)
     if not np.isfinite(gamma):
         raise UnknownOption("gamma", gamma, ("a finite number",))
-
-    def metrics(table: Floats) -> Floats:
-        flat = table.reshape(*table.shape[:-2], -1)
-        median = np.median(table.mean(axis=-1), axis=-1)
-        gap = gamma - np.minimum(flat, gamma).mean(axis=-1)
-        return np.stack([flat.mean(axis=-1), median, trim_mean(flat, 0.25, axis=-1), gap])
-
-    most = np.array([1.0, 1.0, 1.0, max(gamma, 1.0)])
-    how: Any = {"over": over, "level": level, "resamples": resamples, "seed": seed}
-    found, low, high = _interval(table, metrics, most, **how)
+    n = table.shape[2]
+    value = metrics_of(table, gamma)
+    units = np.arange(n)
+    without = np.stack([metrics_of(table[:, :, units != unit], gamma) for unit in units])
+    is_rate = bool(table.min() >= 0.0 and table.max() <= 1.0)
+    bounds = (np.zeros(4), np.array([1.0, 1.0, 1.0, max(gamma, 1.0)])) if is_rate else None
+    low, high = _ends(value, n * value - (n - 1) * without, over, level, bounds)
     return {
-        name: Interval(float(found[k]), float(low[k]), float(high[k]), level, table.size)
+        name: Interval(float(value[k]), float(low[k]), float(high[k]), level, table.size)
         for k, name in enumerate(METRICS)
     }
+
+
+def metrics_of(table: Floats, gamma: float = 1.0) -> Floats:
+    """Compute the numbers of ``METRICS``, shape ``(4,)``, of ``(protocols, strata, units)``."""
+    from scipy.stats import trim_mean
+
+    gap = gamma - np.minimum(table, gamma).mean()
+    median = np.median(table.mean(axis=(1, 2)))
+    return np.array([table.mean(), median, trim_mean(table, 0.25, axis=None), gap])
 
 
 @final
@@ -422,8 +344,6 @@ def performance_profile(
     *,
     over: str = "runs",
     level: float = LEVEL,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
 ) -> Profile:
     """Estimate the share of scores above each threshold, shape ``(t,)``.
 
@@ -433,14 +353,10 @@ def performance_profile(
         UnknownOption: As for ``aggregate``, or thresholds that are no numbers.
     """
     table = _units("scores", scores, over)
-    normal_quantile(level)
     grid = np.linspace(0.0, 1.0, 101) if thresholds is None else numbers("thresholds", thresholds)
-
-    def shares(table: Floats) -> Floats:
-        return np.stack([(table > threshold).mean(axis=(-2, -1)) for threshold in grid])
-
-    how: Any = {"over": over, "level": level, "resamples": resamples, "seed": seed}
-    share, low, high = _interval(table, shares, np.ones(grid.shape), is_share=True, **how)
+    each = np.stack([(table > threshold).mean(axis=(0, 1)) for threshold in grid], axis=1)
+    share = each.mean(axis=0)
+    low, high = _ends(share, each, over, level, (np.zeros(grid.shape), np.ones(grid.shape)))
     return Profile(grid, share, low, high, level, table.size)
 
 
@@ -505,48 +421,23 @@ def _units(name: str, scores: ArrayLike, over: str) -> Floats:
     return np.moveaxis(array, 0, 1)
 
 
-def _interval(
-    table: Floats,
-    statistic: Callable[[Floats], Floats],
-    most: Floats,
-    *,
-    over: str,
-    level: float,
-    resamples: int,
-    seed: int,
-    is_share: bool = False,
-) -> tuple[Floats, Floats, Floats]:
-    """Estimate numbers with their intervals, each of shape ``(k,)``.
+def _ends(
+    value: Floats, each: Floats, over: str, level: float, bounds: tuple[Floats, Floats] | None
+) -> tuple[Floats, Floats]:
+    """Return the ends of the intervals of estimates, both of shape ``(k,)``.
 
     Args:
-        table: Shape ``(protocols, strata, units)``.
-        statistic: Takes shape ``(..., protocols, scores)``, returns ``(k, ...)``.
-        most: What the numbers cannot exceed where scores lie between 0 and 1, shape ``(k,)``.
-        over: Whether units are runs, in one stratum, or episodes.
+        value: The estimates, shape ``(k,)``.
+        each: Pseudo-values of the units, whose means they are, shape ``(n, k)``: each unit's own
+            value, or those of Tukey's jackknife (Efron and Tibshirani, 11).
+        over: What the units are.
         level: Confidence.
-        resamples: Of the bootstrap within strata.
-        seed: Of the bootstrap.
-        is_share: Whether the numbers lie between 0 and ``most`` for all scores.
-
-    Source:
-        Tukey's jackknife: Efron and Tibshirani, 11.
+        bounds: Between which the estimates lie, each of shape ``(k,)``; None: anywhere.
     """
-    protocols, strata, n = table.shape
-    value = statistic(table.reshape(protocols, -1))
-    if over == "episodes":
-
-        def of_resamples(*parts: Floats, axis: int = -1) -> Any:
-            drawn = np.stack(parts, axis=1)  # (resamples, protocols * strata, units)
-            return statistic(drawn.reshape(len(drawn), protocols, strata * n))
-
-        parts = list(table.reshape(-1, n))
-        low, high = bootstrap(parts, of_resamples, level=level, resamples=resamples, seed=seed)
-        return value, low, high
-    if n < FEWEST_RUNS:
-        return value, np.full(value.shape, np.nan), np.full(value.shape, np.nan)
-    runs = table[:, 0]
-    without = np.stack([statistic(np.delete(runs, run, axis=1)) for run in range(n)])
-    error = np.sqrt((n - 1) / n * np.square(without - without.mean(axis=0)).sum(axis=0))
-    is_bounded = is_share or bool(runs.min() >= 0.0 and runs.max() <= 1.0)
-    bounds = (np.zeros_like(most), most) if is_bounded else None
-    return value, *interval_of(value, error, n - 1.0, n, level, bounds)
+    normal_quantile(level)  # refuses a level that is none
+    if over == "runs" and len(each) < FEWEST_RUNS:
+        return np.full(value.shape, np.nan), np.full(value.shape, np.nan)
+    if over == "runs" and bounds is not None:
+        return korn_graubard(value, each, bounds, level)
+    low, high = student(each, bounds, level)
+    return np.minimum(low, value), np.maximum(high, value)
