@@ -54,8 +54,8 @@ def evaluate(
             default what the policy was trained for, or pushing.
         protocols: Names with commas, such as P0,P5; all of the task by default. P2@100 intervenes
             within episodes, from control step 100 on.
-        n: Episodes of each protocol.
-        seeds: Seeds of the noise, with commas.
+        n: Episodes of each protocol, for each seed.
+        seeds: Seeds of the draws and of all other noise, with commas.
         backend: Physics backend: mujoco, bullet, step, fake or trifinger_platform; or two with a
             comma, compared. That of the task by default.
         env: Option of the environment, such as frame_skip=3; repeat it for more.
