@@ -10,10 +10,12 @@ from collections.abc import Callable, Collection, Container, Iterable, Mapping, 
 from contextlib import suppress
 from functools import cache, wraps
 from importlib import import_module
+from importlib.util import find_spec
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
@@ -113,6 +115,19 @@ def _fits(value: Any, hint: Any) -> bool:
     return all(_fits(one, parts[0]) for one in each)
 
 
+def real_numbers(value: Any) -> NDArray[np.float64]:
+    """Return real numbers as 64-bit floats.
+
+    Raises:
+        TypeError: They are complex, a text, dates, or no numbers at all.
+        ValueError: A list of lists of several lengths.
+    """
+    found = np.asarray(value)
+    if found.dtype.kind not in "biufO":
+        raise TypeError(f"{value!r} is no real numbers")
+    return found.astype(np.float64, copy=False)
+
+
 def load(module: str, library: str, extra: str = "") -> Any:
     """Import a module of an optional library.
 
@@ -122,12 +137,26 @@ def load(module: str, library: str, extra: str = "") -> Any:
         extra: The optional dependency of this package that brings it; named like it if empty.
 
     Raises:
-        MissingExtra: It is not installed.
+        MissingExtra: It is not installed, or something that it needs.
     """
     try:
         return import_module(module)
     except ImportError as error:
-        raise MissingExtra(library, extra or library) from error
+        raise missing(error, module, library, extra) from error
+
+
+def missing(error: ImportError, module: str, library: str, extra: str = "") -> MissingExtra:
+    """Return the error that names what is not installed: a library, or one that it imports.
+
+    Args:
+        error: That importing it raised.
+        module: As in ``load``.
+        library: As in ``load``.
+        extra: As in ``load``.
+    """
+    absent = (error.name or "").partition(".")[0]
+    other = absent not in ("", module.partition(".")[0]) and find_spec(absent) is None
+    return MissingExtra(absent if other else library, extra or library)
 
 
 def enter(

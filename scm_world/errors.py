@@ -5,6 +5,7 @@ allowed and what to do::
 
     ScmWorldError
     ├── ModelError               a causal model that cannot be built (all its problems at once)
+    │   └── FunctionFailure      a function of a user that raised an error
     ├── InterventionError        a do() that was refused; the world is as it was
     │   ├── UnknownVariable      no such name; the nearest one is suggested
     │   ├── NotIntervenable      the variable is measured, not set
@@ -55,6 +56,7 @@ __all__ = [
     "EngineFailure",
     "EvaluationError",
     "Forbidden",
+    "FunctionFailure",
     "ImpossibleObservation",
     "Infeasible",
     "InterventionError",
@@ -76,6 +78,7 @@ __all__ = [
     "UnwritableFolder",
     "WrongShape",
     "WrongType",
+    "blamed",
     "in_one_line",
     "nearest",
     "raise_all",
@@ -159,6 +162,50 @@ class ModelError(ScmWorldError, ValueError):
         super().__init__("\n".join(self.problems if len(self.problems) == 1 else several))
 
 
+class FunctionFailure(ModelError):
+    """A function of a user that raised an error, or gave what it must not give.
+
+    Attributes:
+        row: Of several worlds, the number of the one in which it happened.
+    """
+
+    row: int | None = None
+
+    def __init__(self, problem: str) -> None:
+        self.problems = (problem,)
+        Exception.__init__(self, problem)  # it is one sentence, and not about a declaration
+
+
+class blamed:  # noqa: N801 # used like the functions of ``contextlib``
+    """Name a function, module or policy of a user in the errors that it raises.
+
+    Errors of this package pass through as they are.
+
+    Args:
+        name: Begins the message.
+
+    Raises:
+        FunctionFailure: Another error was raised, which is its cause.
+
+    Example:
+        >>> with blamed("the policy 'mine'"):
+        ...     {}["speed"]
+        Traceback (most recent call last):
+        scm_world.errors.FunctionFailure: the policy 'mine' raised KeyError: 'speed'
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __enter__(self) -> None:
+        """Do nothing."""
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        """Name it in an error."""
+        if isinstance(error, Exception) and not isinstance(error, ScmWorldError):
+            raise FunctionFailure(f"{self.name} raised {in_one_line(error)}") from error
+
+
 class ImpossibleObservation(ModelError):
     """An observation that the model cannot give.
 
@@ -199,7 +246,7 @@ class InterventionError(ScmWorldError, ValueError):
 
 
 class UnknownVariable(InterventionError):
-    """No variable has this name.
+    """No variable has this name, or fits this pattern.
 
     Attributes:
         near: Names of which this is the first or the last part, the shortest first.
@@ -215,7 +262,15 @@ class UnknownVariable(InterventionError):
         if self.near:
             more = f" and {len(self.near) - SHOWN} more" if len(self.near) > SHOWN else ""
             hint = f"; near it are: {', '.join(self.near[:SHOWN])}{more}"
-        super().__init__(f"no variable is named {name!r}{hint}", variable=name)
+        said = f"is named {name!r}"
+        if {*"*?"} & {*name}:
+            ends = (f"*.{one.rpartition('.')[2]}" for one in known if "." in one)
+            patterns = [*dict.fromkeys(ends)] or known
+            self.suggestion = next(iter(difflib.get_close_matches(name, patterns, 1, 0.75)), None)
+            more = ", …" if len(patterns) > SHOWN else ""
+            shown = f"; there are: {', '.join(patterns[:SHOWN])}{more}"
+            hint, said = suggested(self.suggestion) or shown, f"fits the pattern {name!r}"
+        super().__init__(f"no variable {said}{hint}", variable=name)
 
 
 class NotIntervenable(InterventionError):
@@ -464,10 +519,13 @@ class ActionError(ScmWorldError, ValueError):
 
 
 class NotReset(ScmWorldError, RuntimeError):
-    """The world was never reset, so there is nothing to step, ask or intervene on."""
+    """The world was never reset, or was ``closed``: nothing to step, ask or intervene on."""
 
-    def __init__(self) -> None:
-        super().__init__("the world has no episode yet; call reset() first")
+    def __init__(self, *, closed: bool = False) -> None:
+        self.closed = closed
+        why = "was closed, which ended its episode; call reset() to begin another one"
+        why = why if closed else "has no episode yet; call reset() first"
+        super().__init__(f"the world {why}")
 
 
 class UnknownOption(ScmWorldError, ValueError):

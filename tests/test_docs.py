@@ -5,13 +5,16 @@ from __future__ import annotations
 import importlib.util
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from scm_world.cli import app
 from scm_world.errors import MissingExtra
 
 ROOT = Path(__file__).parent.parent
@@ -38,6 +41,35 @@ def test_python_in_documents_runs(path: Path, capsys: pytest.CaptureFixture[str]
             assert printed == found[2]
     if missing is not None:
         pytest.skip(missing)
+
+
+CONSOLE = re.compile(r"^```console\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+SHORT_COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {  # numbers that make them short
+    "agents.md": {
+        "train": ("--steps=1024", "--no-evaluate"),
+        "evaluate zoo": ("-n", "4", "--env=max_episode_length=20", "--workers=1"),
+        "evaluate --check": ("--part=2",),
+    }
+}
+
+
+@pytest.mark.parametrize("name", SHORT_COMMANDS)
+def test_commands_of_a_guide_run_one_after_another(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each ends without an error, and finds what those before it have written."""
+    pytest.importorskip("stable_baselines3")
+    pytest.importorskip("pybullet")
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "docs" / "guides" / name).read_text()
+    lines = [line for found in CONSOLE.findall(text) for line in found.splitlines()]
+    commands = [line.removeprefix("scm-world ") for line in lines if line.startswith("scm-world ")]
+    assert len(commands) > 3
+    for command in commands:
+        more = [n for start, n in SHORT_COMMANDS[name].items() if command.startswith(start)]
+        words = [*shlex.split(command), *(word for one in more for word in one)]
+        done = CliRunner().invoke(app, words, catch_exceptions=False)
+        assert done.exit_code == 0, (command, done.output)
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
@@ -96,6 +128,7 @@ def test_the_tables_of_variables_are_up_to_date() -> None:
 
 EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it short
     "augmentation": ("24", "60"),
+    "cartpole": (),
     "cartpole_swing_up": (),
     "curricula": (),
     "demonstrations": ("1", "10"),
@@ -122,7 +155,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it sho
 }
 SHORT = (
     *("augmentation", "own_backend", "own_curriculum", "own_rl_learner", "own_task"),
-    *("cartpole_swing_up", "panda_reach", "predator_prey"),
+    *("cartpole", "cartpole_swing_up", "panda_reach", "predator_prey"),
     *("sim_to_sim", "train_and_evaluate", "transfer_a_to_b"),
 )
 LEARNING = {  # they need the extra "train", which few machines have

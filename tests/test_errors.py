@@ -21,6 +21,7 @@ from scm_world.errors import (
     EngineFailure,
     EvaluationError,
     Forbidden,
+    FunctionFailure,
     ImpossibleObservation,
     Infeasible,
     InterventionError,
@@ -138,7 +139,12 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
         {"cycles": (("x", "y"),)},
     ),
     (ActionError("an action is 9 numbers", 3), "an action is 9 numbers", {"action": 3}),
-    (NotReset(), "the world has no episode yet; call reset() first", {}),
+    (
+        FunctionFailure("the policy 'mine' raised KeyError: 'x'"),
+        "the policy 'mine' raised KeyError: 'x'",
+        {"problems": ("the policy 'mine' raised KeyError: 'x'",), "row": None},
+    ),
+    (NotReset(), "the world has no episode yet; call reset() first", {"closed": False}),
     (
         UnknownOption("task", "pushin", ["reaching", "pushing"]),
         "no task is named 'pushin'; did you mean 'pushing'?; there are: reaching, pushing",

@@ -90,8 +90,6 @@ def train(
 
     used = backend or load_task(task).backend
     folder: Any = console.results_folder(out, "train", tag(made.task), made.algo, made.name, seed)
-    if not quiet:
-        console.say(f"Training {made}", f"on {used}, seed {seed}, in {folder}", "")
     bar = nullcontext() if quiet else console.progress("steps", lines=10)
     with console.resumable(folder, "checkpoints/*.pt", "checkpoints"), bar as tell:
         found = loop.train(
@@ -170,9 +168,6 @@ def clone(
     used = backend or load_task(task).backend
     teacher = made.teacher if path is None else path.stem
     folder: Any = console.results_folder(out, "clone", tag(made.task), teacher, seed)
-    if not quiet:
-        source = source or made.teacher
-        console.say(f"Learning {made}", f"from {source} on {used}, seed {seed}, in {folder}", "")
     bar = nullcontext() if quiet else console.progress("episodes")
     with console.resumable(folder, "demonstrations/*.npz", "files of episodes"), bar as tell:
         found = imitation.clone(

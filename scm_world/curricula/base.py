@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, TypeVar, final
@@ -14,12 +15,12 @@ from pydantic import PlainSerializer, PlainValidator, ValidationError
 
 from scm_world._arguments import one_of
 from scm_world._types import Value
-from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.errors import ModelError, ScmWorldError, UnknownOption, UnreadableFile
 from scm_world.graph import flatten
 from scm_world.queries.timed import as_act
 from scm_world.variables import Draw, Function, Intervention, Noise
 from scm_world.variables.mechanisms import check_trusted
-from scm_world.variables.spaces import Frozen
+from scm_world.variables.spaces import Frozen, problems_of
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
 
@@ -39,6 +40,24 @@ class Progress:
 
     level: int = 0
     recent: deque[bool] = field(default_factory=deque)
+
+
+@contextmanager
+def state_read(source: str) -> Iterator[None]:
+    """Refuse plain data that is no state of a curriculum.
+
+    Args:
+        source: The method whose result is expected.
+
+    Raises:
+        UnreadableFile: What is read inside is something else.
+    """
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        said = f"{error} is missing" if isinstance(error, KeyError) else f"it is none ({error})"
+        advice = f"give what {source} returned, of as many environments"
+        raise UnreadableFile("the state of a curriculum", said, advice) from None
 
 
 @final
@@ -71,15 +90,12 @@ class Memory:
         Raises:
             UnreadableFile: It is something else.
         """
-        try:
+        with state_read("state()"):
             stages = {
                 str(key): Progress(int(kept["level"]), deque(map(bool, kept["recent"])))
                 for key, kept in data["stages"].items()
             }
             return cls(int(data["episode"]), stages)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            advice = "give what state() gave"
-            raise UnreadableFile("the state of a curriculum", repr(error), advice) from None
 
 
 @final
@@ -224,8 +240,11 @@ def _from_file(kind: str, given: Mapping[str, Any]) -> Part:
     one_of("part of a curriculum", kind, Part.KINDS)
     try:
         return Part.KINDS[kind].model_validate(dict(given))
+    except ScmWorldError:
+        raise
     except (ValidationError, TypeError) as error:
-        allowed = (f"the data of one, which this is not: {error}",)
+        said = "; ".join(problems_of(error)) if isinstance(error, ValidationError) else str(error)
+        allowed = (f"the data of one, which this is not: {said}",)
         raise UnknownOption("part of a curriculum", kind, allowed) from None
 
 
@@ -347,7 +366,10 @@ def read_from(kind: type[Made], data: Any, *, form: str, trusted: Sequence[str])
     validate: Any = kind
     try:
         made: Made = validate.model_validate({k: v for k, v in data.items() if k != "format"})
-    except (ValidationError, TypeError, ValueError) as error:
-        raise ModelError([f"not a {what}: {error}"]) from None
+    except ValidationError as error:
+        raise ModelError([f"not a {what}: {said}" for said in problems_of(error)]) from None
+    except (TypeError, ValueError) as error:
+        said_ = error.problems if isinstance(error, ModelError) else (str(error),)
+        raise ModelError([f"not a {what}: {one}" for one in said_]) from None
     check_trusted((f for part in made.part.walk() for f in part.functions()), trusted)
     return made

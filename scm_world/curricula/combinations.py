@@ -138,12 +138,15 @@ class During(_Timed):
 
     def __init__(self, episodes: Any = None, part: Any = None, **fields: Any) -> None:
         if episodes is not None:
-            if not isinstance(episodes, range) or episodes.step < 1 or episodes.start < 0:
+            usable = isinstance(episodes, range) and episodes.step > 0 <= episodes.start
+            if not (usable and len(episodes)):
                 allowed = ("a range such as range(1_000, 5_000)", "range(first, stop, period)")
                 raise UnknownOption("episodes", episodes, allowed)
             fields |= {"first": episodes.start, "stop": episodes.stop, "period": episodes.step}
         fields["first"] = whole_number("first", fields.get("first", 0), least=0)
         fields["period"] = whole_number("period", fields.get("period", 1), least=1)
+        if fields.get("stop") is not None:
+            fields["stop"] = whole_number("stop", fields["stop"], least=fields["first"] + 1)
         super().__init__(part=as_part(part), **fields)
 
     def acts(self, situation: Situation) -> Acts:

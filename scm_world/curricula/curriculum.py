@@ -95,6 +95,8 @@ class Curriculum(Frozen):
         advice = "give a file with the text of Curriculum.to_json()"
         try:
             return cls.from_json(read_text(path), trusted=trusted)
+        except ModelError as error:
+            raise UnreadableFile(str(path), "; ".join(error.problems), advice) from None
         except DAMAGED as error:
             raise UnreadableFile(str(path), str(error), advice) from None
 

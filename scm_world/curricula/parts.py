@@ -13,7 +13,7 @@ from scm_world._arguments import one_of, whole_number
 from scm_world._types import Value
 from scm_world.curricula.base import STREAM, Acts, Part, Situation, acts_of, words
 from scm_world.curricula.targets import matching
-from scm_world.errors import InterventionError, UnknownOption, UnknownVariable
+from scm_world.errors import InterventionError, UnknownOption, UnknownVariable, blamed
 from scm_world.geometry.rotations import (
     from_rotation_vector,
     quaternion_inverse,
@@ -73,7 +73,10 @@ class Resample(Part):
         if not (isinstance(space, Frozen | dict) or space in SPACES):
             raise UnknownOption("space", space, (*SPACES, "a Subset", "a distribution"))
         refuse_infinite("space", space)
-        super().__init__(what=words("what", what), space=space, **fields)
+        named = words("what", what)
+        if not named:
+            raise UnknownOption("what", what, ("a name or a pattern", "several of them"))
+        super().__init__(what=named, space=space, **fields)
 
     def acts(self, situation: Situation) -> Acts:
         """Draw, where it is due."""
@@ -207,8 +210,15 @@ class Goal(Part):
         yield "@goals"
 
     def declared(self, declaration: CompiledTask) -> None:
-        """Look for causes that the goal does not have."""
+        """Look for causes that the goal does not have.
+
+        Raises:
+            UnknownOption: The task has no goals.
+        """
         causes = declaration.task.sample_goal(self.space)
+        if not causes:
+            allowed = (f"a task with goals; draw variables of {declaration.task.name} by resample",)
+            raise UnknownOption("task for goals", declaration.task.name, allowed)
         for name in self.besides:
             if name not in causes:
                 raise UnknownVariable(name, causes)
@@ -343,11 +353,13 @@ class Follow(Part):
 
         Raises:
             UnknownOption: It gave no intervention.
+            FunctionFailure: It raised an error.
         """
         if not situation.due:
             return {}
-        function: Any = self.function.bind()
-        given = function(situation)
+        function: Any = self.function
+        with blamed(f"the function {function.reference!r} of a curriculum"):
+            given = function.bind()(situation)
         if given is None:
             return {}
         if not isinstance(given, Mapping):

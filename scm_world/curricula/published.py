@@ -67,7 +67,8 @@ def published_actor(
         case "rigid_pose_actor":
             chosen = (positions, orientations)
             pairs = zip(chosen, ("cylindrical_position", "euler_orientation"), strict=True)
-            return Resample([f"tool_*.{what}" for wanted, what in pairs if wanted], space=space)
+            what = [f"tool_*.{one}" for wanted, one in pairs if wanted]
+            return Resample(what, space=space) if what else Do({})
         case "visual_actor":
             return Resample("*color", space=space)
     raise UnknownOption("actor", name, ACTORS)

@@ -13,13 +13,15 @@ from gymnasium.vector import AutoresetMode, VectorWrapper
 from numpy.typing import NDArray
 
 from scm_world._arguments import one_of, whole_number
-from scm_world.curricula.base import Memory
+from scm_world.curricula.base import Memory, state_read
 from scm_world.curricula.combinations import count
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
 from scm_world.curricula.wrapper import CurriculumEnv, place
 from scm_world.env import ScmWorldEnv
+from scm_world.env.arguments import RESETS, reset_options
+from scm_world.env.batched.asking import MASK, masked
 from scm_world.env.batched.vector_env import EXECUTORS
-from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.errors import UnknownOption
 
 SUCCESS = "is_success"
 
@@ -156,14 +158,11 @@ class CurriculumVectorEnv(VectorWrapper):
             UnreadableFile: It is something else.
         """
         memory = Memory.from_dict(state)
-        try:
+        with state_read("state()"):
             again = [whole_number("episode", number, least=0) for number in state["again"]]
             places = [place(noise) for noise in state["noises"]]
             if len(places) != self.num_envs:
-                raise ValueError(f"it is of {len(places)} environments")
-        except (KeyError, TypeError, ValueError) as error:
-            advice = f"give what state() gave, of {self.num_envs} environments"
-            raise UnreadableFile("the state of a curriculum", repr(error), advice) from None
+                raise ValueError(f"{len(places)} environments, and here are {self.num_envs}")
         self._members.set_attr("where", places)
         self.memory, self._again = memory, again
         self._forget()
@@ -200,16 +199,13 @@ class CurriculumVectorEnv(VectorWrapper):
         Raises:
             UnreadableFile: ``running`` is something else.
         """
-        try:
+        with state_read("running()"):
             memories = [Memory.from_dict(memory) for memory in running["memories"]]
             turns = [t and (int(t[0]), Memory.from_dict(t[1])) for t in running["turns"]]
             left = [int(number) for number in running["left"]]
             kept = {name: running[name] for name in ("present", "waiting", "stepped", "success")}
             if any(len(one) != self.num_envs for one in (memories, turns, *kept.values())):
-                raise ValueError("it is of another number of environments")
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            advice = f"give what running() gave, of {self.num_envs} environments"
-            raise UnreadableFile("running episodes", repr(error), advice) from None
+                raise ValueError(f"another number of environments than {self.num_envs}")
         self.resume({name: running[name] for name in ("episode", "stages", "again", "noises")})
         self._members.set_attr("turn", [(memory.episode, memory) for memory in memories])
         self.env.reset()
@@ -227,8 +223,7 @@ class CurriculumVectorEnv(VectorWrapper):
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in all of them, or in those of ``options["reset_mask"]``."""
-        mask = (options or {}).get("reset_mask")
-        begun = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask, bool)
+        begun = masked(reset_options(options, (*RESETS, MASK)).get(MASK), self.num_envs)
         for index in np.flatnonzero(begun):
             self._ended(index, counts=bool(self._stepped[index]))
         self._hand_out(begun)

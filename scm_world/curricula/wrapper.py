@@ -11,13 +11,14 @@ from gymnasium.utils import RecordConstructorArgs
 
 from scm_world._arguments import whole_number
 from scm_world._types import Value
-from scm_world.curricula.base import Acts, Memory, Situation
+from scm_world.curricula.base import Acts, Memory, Situation, state_read
 from scm_world.curricula.combinations import count
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
 from scm_world.curricula.parts import Interpolate
 from scm_world.env import ScmWorldEnv
+from scm_world.env.arguments import RESETS, reset_options
 from scm_world.env.wrappers import unwrapped_env
-from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
+from scm_world.errors import ModelError, UnknownOption, UnknownVariable, blamed
 from scm_world.graph import flatten
 from scm_world.world import Simulation
 
@@ -128,7 +129,8 @@ class CurriculumRunner:
         memory, model = self.memory, world.model
         situation = Situation(world, memory.episode, step, memory, due=step == 0, first=first)
         situation = replace(situation, initial=self._initial)
-        acts = self.curriculum.part.acts(situation)
+        with blamed(f"the curriculum, in control step {step} of episode {memory.episode},"):
+            acts = self.curriculum.part.acts(situation)
         if first is not None:
             acts = {name: act for name, act in acts.items() if name in first}
 
@@ -234,7 +236,9 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         Raises:
             UnreadableFile: It is something else.
         """
-        memory, where = Memory.from_dict(state), place(state.get("noise"))
+        memory = Memory.from_dict(state)
+        with state_read("state()"):
+            where = place(state["noise"])
         self._turn.memory, self.where = memory, where
 
     @property
@@ -259,20 +263,21 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         Raises:
             InterventionError: An intervention was refused.
         """
+        given = reset_options(options, RESETS)
         self._close()
         if self._next is not None:
             episode, memory = self._next
             self._turn.memory = Memory(episode, memory.stages)
-        elif options and options.get("episode") is not None:
-            self._turn.memory.episode = whole_number("episode", options["episode"], least=0)
+        elif given.get("episode") is not None:
+            self._turn.memory.episode = whole_number("episode", given["episode"], least=0)
         if self._place is not None and seed is None:
             seed, number = self._place
-            options = {"episode": number, **(options or {})}
-        observation, info = self.env.reset(seed=seed, options=options)
+            given = {"episode": number, **given}
+        observation, info = self.env.reset(seed=seed, options=given)
         if not self._checked:
             self.curriculum.check(self._inner.world)
             self._checked = True
-        if self._turn.begin(self._inner, besides=flatten((options or {}).get("do") or {})):
+        if self._turn.begin(self._inner, besides=flatten(given.get("do") or {})):
             observation, info = self._seen(info)
         self._next = self._place = None
         self._begun = self._running = True
@@ -340,16 +345,12 @@ def place(given: Any) -> tuple[int, int] | None:
     """Read a seed and an episode.
 
     Raises:
-        UnreadableFile: It is something else.
+        ValueError: It is something else.
     """
     if given is None:
         return None
-    try:
-        seed, episode = given
-        return whole_number("seed", seed, least=0), whole_number("episode", episode, least=0)
-    except (TypeError, ValueError) as error:
-        advice = "give what state() gave"
-        raise UnreadableFile("the state of a curriculum", repr(error), advice) from None
+    seed, episode = given
+    return whole_number("seed", seed, least=0), whole_number("episode", episode, least=0)
 
 
 def _plain(curriculum: Curriculum) -> Any:

@@ -8,20 +8,25 @@ from functools import wraps
 from inspect import signature
 from typing import Any, TypeVar, cast
 
+import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
+from scm_world._arguments import one_of, real_numbers
 from scm_world._types import Floats
 from scm_world.errors import ActionError, Infeasible, InterventionError, UnknownOption
 from scm_world.graph import flatten
 from scm_world.tasks import Task, make_task
 from scm_world.variables import Draw, Null
-from scm_world.variables.kinds import SPACES
+from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.structures import StructureCache
 
 Init = TypeVar("Init", bound=Callable[..., None])
+
+RESETS = ("do", "episode")
+"""Options of a reset."""
 
 
 def refuse_unknown(given: Iterable[str], *known: Callable[..., Any]) -> None:
@@ -48,6 +53,20 @@ def known_options(init: Init) -> Init:
     return cast(Init, checked)
 
 
+def reset_options(options: Any, known: Iterable[str]) -> dict[str, Any]:
+    """Read the options of a reset, by name.
+
+    Raises:
+        UnknownOption: They are no dictionary, or there is no such option.
+    """
+    given = {} if options is None else options
+    if not isinstance(given, Mapping):
+        raise UnknownOption("options of a reset", options, ("a dictionary", *known))
+    for name in given:
+        one_of("reset option", name, [*known])
+    return dict(given)
+
+
 def limited(spec: EnvSpec | None, steps: int) -> EnvSpec | None:
     """Give what Gymnasium knows of an environment the length of its episodes, if it has none."""
     if spec is None or spec.max_episode_steps is not None:
@@ -61,17 +80,17 @@ def finite(size: int) -> str:
 
 
 def doubles(action: Any, size: int) -> Floats:
-    """Read an action.
+    """Read an action, or several.
 
     Args:
         action: What was given.
         size: How many numbers it should be, for the message.
 
     Raises:
-        ActionError: It is no numbers.
+        ActionError: It is no real numbers.
     """
     try:
-        return np.asarray(action, dtype=np.float64)
+        return real_numbers(action)
     except (TypeError, ValueError):
         raise ActionError(f"an action is {finite(size)}, got {action!r}", action) from None
 
@@ -166,6 +185,26 @@ def begin(
             seed = episode = None
         else:
             return
+
+
+def warn_of_changes(
+    structure: CompiledTask, start: Mapping[str, Any], goals: SpaceName | None
+) -> None:
+    """Warn where episodes draw which bodies there are: what is observed has several shapes then.
+
+    Args:
+        structure: Of the first episode.
+        start: What is done at every reset.
+        goals: The space of random goals, if there are some.
+    """
+    goal = {} if goals is None else structure.task.sample_goal(goals)
+    deciding = structure.task.decided_by
+    drawn = [name for name in deciding if isinstance({**goal, **start}.get(name), Draw)]
+    if drawn:
+        gymnasium.logger.warn(
+            f"{', '.join(drawn)}, drawn in every episode, decides which bodies exist, so that "
+            "observation_space changes; pad={…} with the largest values keeps one shape"
+        )
 
 
 def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledTask:

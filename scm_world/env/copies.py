@@ -7,7 +7,7 @@ from typing import Any, Self, final
 
 from gymnasium.utils import EzPickle
 
-from scm_world.errors import NotReset
+from scm_world.errors import NotReset, SnapshotMismatch
 from scm_world.world import Simulation, WorldSnapshot
 
 
@@ -52,8 +52,10 @@ class Copied(EzPickle):
         """Go back to a snapshot, bit for bit.
 
         Raises:
-            SnapshotMismatch: It is one of another task or engine.
+            SnapshotMismatch: It is none of an environment, or one of another task or engine.
         """
+        if not isinstance(snapshot, EnvSnapshot):
+            raise SnapshotMismatch(f"{snapshot!r} is no snapshot; give what snapshot() returned")
         self.world.restore(snapshot.world)
         self._done = list(snapshot.interventions)
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats, Values
 from scm_world.env.arguments import (
+    RESETS,
     action_scale,
     asked,
     begin,
@@ -24,6 +25,8 @@ from scm_world.env.arguments import (
     limited,
     made_task,
     names_of,
+    reset_options,
+    warn_of_changes,
 )
 from scm_world.env.copies import Copied
 from scm_world.env.delta import COMMAND, PREFIX, Delta, checked_mode
@@ -44,7 +47,7 @@ from scm_world.geometry.clipping import scaled_clip_kernel
 from scm_world.graph import flatten
 from scm_world.models.camera import Camera
 from scm_world.tasks import Task
-from scm_world.tasks.rewards import FRACTION, SUCCESS, one_number
+from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Simulation
@@ -53,13 +56,12 @@ from scm_world.world.plan import merged
 
 RENDER_MODES = ("rgb_array", "human")
 SINGLE = np.dtype(np.float32)
-REWARD, TERMINATED = "reward", "terminated"
+REWARD = "reward"
 _NOT_GIVEN = ("self", "__class__")
 _NO_REWARD = (
     "the task {!r} has no reward, and an environment gives one at every step; give "
     "reward=(function, 'hinge.position', …): a function and the names of what it is given"
 )
-_RESETS = ("do", "episode")
 
 
 class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -73,8 +75,9 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
     truncated at its length, and terminated where the variable ``terminated`` says so, if the task
     has one. ``info`` has ``success``, ``fractional_success`` and goals if the task has them. An
     intervention that changes which bodies exist changes what is
-    observed: ``observation_space`` is then the one of the new structure. A copy, or what comes
-    out of a pickle, continues bit-identically to the original.
+    observed: ``observation_space`` is then the one of the new structure, unless ``pad`` says how
+    many there can be. A copy, or what comes out of a pickle, continues bit-identically to the
+    original.
 
     Args:
         task: Name of a registered task, or a task.
@@ -100,6 +103,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             it. The noise of the sensors does not reach them.
         keypoints: Append the eight corners of every block and every goal; ``"view"``: what a hand
             sees of every block that has a goal, see ``scm_world.tasks.trifinger.views``.
+        pad: Values of what decides which bodies exist, such as ``{"number_of_obstacles": 3}``. The
+            vector always has the places of these bodies then, with zeros where one is missing.
         cameras: Names (``"60"``, ``"120"``, ``"300"``, ``"overview"``) or cameras, for
             ``"pixel"``; the three of the robot if None.
         image_size: Height and width of pictures, or both in one [pixels].
@@ -163,6 +168,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         include: Sequence[str] = (),
         context: str = "none",
         keypoints: bool | str = False,
+        pad: Mapping[str, Any] | None = None,
         cameras: Sequence[str | Camera] | None = None,
         image_size: int | tuple[int, int] | None = None,
         stack: str = STACKS[0],
@@ -191,6 +197,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             stack=stack,
             normalize=normalize_observations,
             goals=goal_env,
+            pad=pad,
         )
         made = made_task(task, task_options)
         mode = checked_mode(action_mode, made)
@@ -260,7 +267,13 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._observers: WeakKeyDictionary[
             CompiledTask, tuple[Observer, Goals | None, frozenset[str], tuple[str, ...]]
         ] = WeakKeyDictionary()
-        self._arrange(beginning_structure(self.world, self._start))
+        structure = beginning_structure(self.world, self._start)
+        self._largest = None
+        if pad is not None:
+            self._largest = beginning_structure(self.world, {**self._start, **asked(pad)})
+        else:
+            warn_of_changes(structure, self._start, self._random_goal)
+        self._arrange(structure)
         if goal_env:
             self.compute_reward = goal_reward(self.world)
 
@@ -274,22 +287,44 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self.__dict__["spec"] = limited(spec, self.limit)
 
     def as_action(self, command: ArrayLike) -> NDArray[np.float64]:
-        """Give the (absolute) action that stands for a command in SI units, shape (n,)."""
-        found: NDArray[np.float64] = (np.asarray(command) - self._middle) / self._half
+        """Return the (absolute) action that stands for a command in SI units, shape (n,).
+
+        Raises:
+            ActionError: The command has another shape, or is no real numbers.
+        """
+        found: NDArray[np.float64] = (self._read(command) - self._middle) / self._half
         return found
 
     def toward(self, command: ArrayLike) -> NDArray[np.float64]:
-        """Give the action, now, that leads to a command in SI units or near it, shape (n,)."""
+        """Return the action, now, that leads to a command in SI units or near it, shape (n,).
+
+        Raises:
+            ActionError: The command has another shape, or is no real numbers.
+        """
         if self._delta is None:
             return self.as_action(command)
-        return self._delta.toward(np.asarray(command, dtype=np.float64))
+        return self._delta.toward(self._read(command))
+
+    def _read(self, action: ArrayLike) -> Any:
+        """Read an action or a command, shape (n,); 32-bit numbers stay what they are.
+
+        Raises:
+            ActionError: It has another shape, or is no real numbers.
+        """
+        given: Any = action
+        if getattr(action, "dtype", None) is not SINGLE:
+            given = doubles(action, self._given.size)
+        if given.shape != self._given.shape:
+            raise ActionError(f"an action has shape {self._given.shape}, got {given.shape}", action)
+        return given
 
     def _arrange(self, declaration: CompiledTask) -> None:
         """Observe the structure that there is."""
         found = self._observers.get(declaration)
         if found is None:
             goals = Goals(declaration) if any(declaration.task.goal_names()) else None
-            made = observer(self.world, declaration, self._how, goals)
+            largest = self._largest or declaration
+            made = observer(self.world, declaration, self._how, goals, largest)
             counted = [n for n in (FRACTION, SUCCESS, TERMINATED) if n in declaration.model]
             wanted = () if goals is None else goals.names
             needed = (*made.names, *wanted, *self._terms, *counted, REWARD)
@@ -332,12 +367,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             ModelError: A custom reward term is no number.
         """
         super().reset(seed=seed)
-        asked_for = {} if options is None else options
-        if not isinstance(asked_for, Mapping):
-            raise UnknownOption("options of a reset", options, ("a dictionary", *_RESETS))
-        unknown = asked_for.keys() - _RESETS
-        if unknown:
-            raise UnknownOption("reset option", min(unknown), _RESETS)
+        asked_for = reset_options(options, RESETS)
         request = self._acts(asked_for.get("do"))
         number = asked_for.get("episode")
         begin(self.world, seed, request, self._attempts, number)
@@ -383,11 +413,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
         """
-        given: Any = action
-        if getattr(action, "dtype", None) is not SINGLE:
-            given = doubles(action, self._given.size)
-        if given.shape != self._given.shape:
-            raise ActionError(f"an action has shape {self._given.shape}, got {given.shape}", action)
+        given = self._read(action)
         if self._delta is not None:
             given = self._delta.absolute(np.array(given, dtype=np.float64))
         self._given[...] = given  # every 32-bit number is a 64-bit one
@@ -422,13 +448,15 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         return self.present()[0]
 
     def observe_values(self, values: Values) -> NDArray[np.float32]:
-        """Give the observation of other values of what is ``observed``, without noise.
+        """Return the observation of other values of what is ``observed``, without noise.
 
         Raises:
-            UnknownOption: The observation is no vector.
+            UnknownOption: The observation is no vector, or a value is missing.
         """
         if not isinstance(self._observer, Vector):
             raise UnknownOption("observation of values", self._how.mode, ("a vector",))
+        if not isinstance(values, Mapping) or not values.keys() >= {*self._observer.names}:
+            raise UnknownOption("values of an observation", values, self._observer.names)
         return self._observer.observe_values(values)
 
     def present(self) -> tuple[Observation, dict[str, Any]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, final
 
@@ -24,9 +24,10 @@ from scm_world.env.vector import (
     keypoints,
     spread,
 )
-from scm_world.errors import UnknownOption
+from scm_world.errors import InterventionError, UnknownOption
 from scm_world.models.camera import Camera
 from scm_world.tasks import TIME, Observed, Task
+from scm_world.tasks.base import numbers_of
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Linear
 from scm_world.world import Simulation
@@ -56,6 +57,7 @@ class Goals:
 
     Attributes:
         names: The variables that have to be computed.
+        size: How many numbers each vector has.
         bound: Numbers beyond it saturate in observations.
         spaces: Of ``achieved_goal`` and of ``desired_goal``: 64-bit floats of their true shapes,
             so that a reward that is computed from them is exact.
@@ -66,6 +68,7 @@ class Goals:
         self.names = (*sides[0], *sides[1])
         where = declaration.mechanisms.where
         self._sides = tuple(places(where[name] for name in side) for side in sides)
+        self.size = self._sides[0].size
         self.bound = BOUND if declaration.task.saturates else WIDE
         self.spaces: dict[str, gymnasium.Space[Any]] = {
             name: gymnasium.spaces.Box(-self.bound, self.bound, (side.size,), np.float64)
@@ -112,12 +115,28 @@ def goal_reward(world: Simulation) -> Callable[[ArrayLike, ArrayLike, Any], Any]
         Returns:
             The weighted sum of the terms that goals alone decide, shape (...); times the control
             period under the conventions that say so.
+
+        Raises:
+            UnknownOption: They are no finite numbers, or have other shapes.
         """
         nonlocal warned
-        have, want = np.asarray(achieved, dtype=float), np.asarray(desired, dtype=float)
+        size = Goals(world.compiled).size
+
+        def read(name: str, given: ArrayLike) -> Floats:
+            goal = numbers_of(given)
+            if goal is None or goal.shape[-1:] != (size,):
+                raise UnknownOption(name, given, (f"finite numbers of shape (..., {size})",))
+            return goal
+
+        have, want = read("achieved goal", achieved), read("desired goal", desired)
+        try:
+            shape = np.broadcast_shapes(have.shape[:-1], want.shape[:-1])
+        except ValueError:
+            allowed = (f"({', '.join(map(str, have.shape))}), as that of achieved goals",)
+            raise UnknownOption("shape of desired goals", want.shape, allowed) from None
         node: Any = world.model.declared("reward")
         weights = zip((parent.name for parent in node.parents), node.mechanism.weights, strict=True)
-        total = np.zeros(np.broadcast_shapes(have.shape[:-1], want.shape[:-1]))
+        total = np.zeros(shape)
         for name, weight in weights:
             if name in TERMS:
                 total = total + weight * TERMS[name](world.task, have, want)
@@ -180,6 +199,7 @@ class Observing:
     stack: str = STACKS[0]
     normalize: bool = True
     goals: bool = False
+    pad: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         one_of("observation_mode", self.mode, MODES)
@@ -194,6 +214,8 @@ class Observing:
         one_of("stack", self.stack, STACKS)
         if self.keypoints not in (False, True, "view"):
             raise UnknownOption("keypoints", self.keypoints, ("False", "True", "view"))
+        if self.pad is not None and (pictures or self.keypoints):
+            raise UnknownOption("pad", self.pad, ("None with pictures and keypoints",))
         for option, usual in (("cameras", None), ("image_size", None), ("stack", STACKS[0])):
             value = getattr(self, option)
             if value != usual and not pictures:
@@ -229,7 +251,11 @@ class DictObserver:
 
 
 def observer(
-    world: Simulation, declaration: CompiledTask, how: Observing, goals: Goals | None
+    world: Simulation,
+    declaration: CompiledTask,
+    how: Observing,
+    goals: Goals | None,
+    largest: CompiledTask,
 ) -> Observer:
     """Put together what is asked for.
 
@@ -238,9 +264,11 @@ def observer(
         declaration: Of the structure; the observer holds for that one only.
         how: What is asked for.
         goals: Of the structure, if it has some.
+        largest: The structure whose layout the vectors have; the same one without padding.
 
     Raises:
         UnknownOption: The task has no boxes or no goals, or there is no such camera.
+        InterventionError: The structure has bodies that the largest one does not have.
         UnknownVariable: There is no such variable.
     """
     main: Observer
@@ -254,11 +282,13 @@ def observer(
 
         main = Pixels(world, how.cameras, how.image_size, how.stack)
     else:
-        main = _vector(world, declaration, how)
+        main = _vector(world, declaration, how, largest)
     parts: dict[str, Observer] = {"observation": main}
     if how.context == "privileged":
-        about = _quiet(_parts(world, declaration, context(declaration)))
-        parts["context"] = Vector(world, declaration, about, normalize=how.normalize)
+        about = _quiet(_parts(world, largest, context(largest)))
+        parts["context"] = Vector(
+            world, declaration, about, normalize=how.normalize, padded=how.pad is not None
+        )
     return (
         DictObserver(world, parts, goals if how.goals else None)
         if len(parts) > 1 or how.goals
@@ -282,20 +312,33 @@ def published(world: Simulation, declaration: CompiledTask) -> dict[str, Observe
     return {part.variable: part for part in parts}
 
 
-def _vector(world: Simulation, declaration: CompiledTask, how: Observing) -> Vector:
+def _names(world: Simulation, declaration: CompiledTask, how: Observing) -> list[str]:
     names = list(how.names if how.mode == "custom" else published(world, declaration))
     if how.mode == "full":
         names += [name for name in declaration.model if name not in declaration.parts]
-    names = list(dict.fromkeys((*names, *how.include)))
-    parts = _parts(world, declaration, names)
+    return list(dict.fromkeys((*names, *how.include)))
+
+
+def _vector(
+    world: Simulation, declaration: CompiledTask, how: Observing, largest: CompiledTask
+) -> Vector:
+    names = _names(world, largest, how)
+    for name in () if declaration is largest else _names(world, declaration, how):
+        if name not in names:
+            message = f"{name!r} has no place in the observation: pad={how.pad} is too small"
+            raise InterventionError(message, variable=name)
+    parts = _parts(world, largest, names)
     points = _keypoints(declaration, how.keypoints) if how.keypoints else None
     if points is not None:
         reach = np.full(points[1], 1.0 if how.keypoints is True else 4.0)  # [m], [rad]
         parts.append(ObservedPart(KEYPOINTS, -reach, reach))
     if how.context == "observation":
-        rest = [name for name in context(declaration) if name not in names]
-        parts += _quiet(_parts(world, declaration, rest))
-    return Vector(world, declaration, parts, normalize=how.normalize, keypoints=points)
+        rest = [name for name in context(largest) if name not in names]
+        parts += _quiet(_parts(world, largest, rest))
+    padded = how.pad is not None
+    return Vector(
+        world, declaration, parts, normalize=how.normalize, keypoints=points, padded=padded
+    )
 
 
 def _parts(

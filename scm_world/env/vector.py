@@ -186,6 +186,7 @@ class Vector:
         parts: In their order.
         normalize: Whether the numbers are scaled to [-1, 1].
         keypoints: How corners or a view are computed, if they are a part.
+        padded: Whether parts may be missing in the structure: their numbers are 0.
 
     Attributes:
         names: The variables that have to be computed.
@@ -201,20 +202,30 @@ class Vector:
         *,
         normalize: bool,
         keypoints: View | None = None,
+        padded: bool = False,
     ) -> None:
         self._world, self._keypoints = world, keypoints
         self._slices = _places(parts)
         self.layouts: Layouts = {"observation": self._slices}
-        self.names = tuple(part.name for part in parts if part.name != KEYPOINTS)
+        where = declaration.mechanisms.where
+        self.names = tuple(part.name for part in parts if part.name in where)
         self.names += () if keypoints is None else keypoints[0]
         low = np.concatenate([part.low for part in parts])
         high = np.concatenate([part.high for part in parts])
         bounded = (low > -WIDE) & (high < WIDE)
         sensed = np.concatenate([np.full(part.low.size, part.sensed) for part in parts])
-        self._spread = np.where(bounded & sensed, (high - low) / 2.0, 0.0)
-        where = declaration.mechanisms.where
+        there = np.concatenate(
+            [np.full(part.low.size, part.name in (*where, KEYPOINTS)) for part in parts]
+        )
+        self._spread = np.where(bounded & sensed & there, (high - low) / 2.0, 0.0)
         self._size = low.size
-        self._read = places(where[name] for name in self._slices if name != KEYPOINTS)
+        self._read = np.concatenate(
+            [  # what is not there reads any column, times 0
+                places([where[part.name]]) if part.name in where else np.zeros(part.low.size, int)
+                for part in parts
+                if part.name != KEYPOINTS
+            ]
+        )
         self._published = world.conventions.published_observation
         self._turns = [
             place
@@ -222,13 +233,21 @@ class Vector:
             if self._published and name.endswith(".orientation")
         ]
         hard = np.concatenate([np.full(part.low.size, part.saturates) for part in parts])
-        self._scale(low, high, normalize & bounded & (high > low), hard)
+        self._scale(low, high, normalize & bounded & (high > low), hard, padded=padded)
+        if padded:
+            self._scales[:, ~there] = [[-np.inf], [np.inf], [0.0], [0.0]]
         self._version = -1
         self._senses = SENSOR_NOISE in declaration.model
         self._noise = 0.0
 
     def _scale(
-        self, low: Floats, high: Floats, scaled: NDArray[np.bool_], hard: NDArray[np.bool_]
+        self,
+        low: Floats,
+        high: Floats,
+        scaled: NDArray[np.bool_],
+        hard: NDArray[np.bool_],
+        *,
+        padded: bool,
     ) -> None:
         width = np.where(scaled, high - low, 2.0)
         gain = np.where(scaled, 2.0 / width, 1.0)
@@ -239,7 +258,9 @@ class Vector:
         self._scales = np.stack([*limits, gain, offset])
         inside = (np.where(scaled, -1.0, low), np.where(scaled, 1.0, high))
         inside = (np.where(hard, inside[0], -WIDE), np.where(hard, inside[1], WIDE))
-        self.space = box(*(limits if self._published else inside))
+        ends = limits if self._published else inside
+        ends = (np.minimum(ends[0], 0.0), np.maximum(ends[1], 0.0)) if padded else ends
+        self.space = box(*ends)
         world = self._world
         self._shift, self._shifts = 0.0, np.zeros(self._read.size)
         if self._published and TIME in self._slices and world.given_length is not None:
@@ -283,7 +304,9 @@ class Vector:
     def observe_values(self, values: Values) -> NDArray[np.float32]:
         """Give the observation of other values of what is observed, without noise, shape (n,)."""
         seen = {} if self._keypoints is None else {KEYPOINTS: self._keypoints[2](values)}
-        raw = np.concatenate([np.ravel({**values, **seen}[name]) for name in self._slices])
+        given = {**values, **seen}
+        absent = {n: np.zeros(s.stop - s.start) for n, s in self._slices.items() if n not in given}
+        raw = np.concatenate([np.ravel({**given, **absent}[name]) for name in self._slices])
         found: NDArray[np.float32] = np.empty((1, self._size), dtype=np.float32)
         scale_rows(raw[None], FIRST, np.arange(raw.size), np.zeros(raw.size), self._scales, found)
         shown: NDArray[np.float32] = found[0]

@@ -11,6 +11,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from scm_world._arguments import whole_number
+from scm_world.env.arguments import doubles
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import UnknownOption
 
@@ -60,6 +61,7 @@ class MovingAverageAction(gymnasium.ActionWrapper[Any, Actions, Actions], Record
 
     def action(self, action: Actions) -> Actions:
         """Give the mean of the last actions."""
+        doubles(action, int(np.prod(self.action_space.shape or ())))  # refuses what is none
         self._last.append(np.array(action))
         mean: Any = np.mean(self._last, axis=0, dtype=np.float64)
         kind = self._last[-1].dtype

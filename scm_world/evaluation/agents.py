@@ -82,9 +82,6 @@ class AgentRun:
             return replace(self, about={**self.about, **traits})
         except ScmWorldError as error:
             raise EvaluationError({"agent": self.agent, "run": self.run}, str(error)) from error
-        except Exception as error:
-            error.add_note(f"agent {self.agent}, run {self.run}, before the first episode")
-            raise
 
 
 def _walked(player: Player, env: Any, steps: int) -> list[bytes]:

@@ -16,7 +16,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption, UnknownVariable
 from scm_world.evaluation.players import Player
 from scm_world.evaluation.protocols import Protocol
-from scm_world.tasks.rewards import FRACTION, SUCCESS
+from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED
 from scm_world.variables import Null, Subset
 from scm_world.variables.reserved import SENSOR_NOISE
 
@@ -256,7 +256,8 @@ def unrelated(env: ScmWorldEnv, about: Mapping[str, Any]) -> tuple[str, ...]:
     observed = env.observed
     if about["kind"] == "named":
         observed = tuple(name for name in model if model.declared(name).role == "state")
-    counted = {n for n in (*observed, FRACTION, SUCCESS, "reward", SENSOR_NOISE) if n in model}
+    scored_by = (FRACTION, SUCCESS, TERMINATED, "reward", SENSOR_NOISE)
+    counted = {name for name in (*observed, *scored_by) if name in model}
     counted |= {cause for name in tuple(counted) for cause in model.ancestors(name)}
     settable = (name for name in model if model.declared(name).settable)
     return tuple(name for name in settable if counted.isdisjoint(model.targets(name)))
@@ -322,6 +323,3 @@ def _placed(place: dict[str, Any], env: ScmWorldEnv) -> Iterator[None]:
         if env.world.index:
             place = {**place, "control step": env.world.index}
         raise EvaluationError(place, str(error)) from error
-    except Exception as error:
-        error.add_note(", ".join(f"{name} {value}" for name, value in place.items()))
-        raise

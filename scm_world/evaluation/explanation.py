@@ -78,7 +78,8 @@ class Otherwise:
         would_be: Its value otherwise.
         score: Of the episode.
         would_score: It would have scored this.
-        would_succeed: Whether it would have succeeded in the end, if the task says so.
+        succeeded: Whether it succeeded in the end, if the task says so.
+        would_succeed: Whether it would have succeeded.
     """
 
     variable: str
@@ -86,6 +87,7 @@ class Otherwise:
     would_be: tuple[float, ...]
     score: float
     would_score: float
+    succeeded: bool | None
     would_succeed: bool | None
 
     @property
@@ -94,7 +96,8 @@ class Otherwise:
         return self.would_score - self.score
 
     def __str__(self) -> str:
-        success = "would have succeeded" if self.would_succeed else "would not have succeeded"
+        success = "would have succeeded" if self.would_succeed else "would have failed"
+        success += ", as it did" if self.would_succeed == self.succeeded else ""
         success = "would have scored" if self.would_succeed is None else success
         was, would_be = (_numbers(value) for value in (self.was, self.would_be))
         return (
@@ -209,14 +212,14 @@ def why(
             except EvaluationError as error:
                 left_out[name] = error.reason
             else:
-                success = then.scores.get("success")
+                ends = (played.scores.get("success") for played in (row, then))
                 would = Otherwise(
                     name,
                     tuple(row.drawn[name]),
                     tuple(then.drawn.get(name, seen)),
                     row.scores[metric],
                     then.scores[metric],
-                    None if success is None else bool(success),
+                    *(None if success is None else bool(success) for success in ends),
                 )
                 if reason := _no_answer(would, row, then, part.found, runner.env.world):
                     left_out[name] = reason

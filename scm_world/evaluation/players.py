@@ -20,7 +20,7 @@ from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
 from scm_world.env.arguments import action_scale
 from scm_world.env.delta import PREFIX as RELATIVE_MODE
-from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
+from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile, blamed
 from scm_world.evaluation.recording_files import Recorded, from_parquet
 from scm_world.output.reading import LARGEST_TABLE, read_bytes
 from scm_world.policies import MlpPolicy, OnnxPolicy, PolicyAbout, file_of, load_policy, load_sb2
@@ -128,6 +128,7 @@ class Player:
         made_for: PolicyAbout | None = None,
     ) -> None:
         self._about, self._start = dict(about), start
+        self._who = f"the policy {self._about['name']!r}"
         self.policy: Any = None
         self.made_for = made_for
         self._env: ScmWorldEnv | None = None
@@ -148,8 +149,10 @@ class Player:
             UnknownOption: It has other observations or actions than the policy was trained with.
             ActionError: Its observations or actions have other shapes.
             UnreadableFile: A network in a file takes other observations.
+            FunctionFailure: The policy raised an error.
         """
-        self._env, self._act = env, self._start(env)
+        with blamed(self._who):
+            self._env, self._act = env, self._start(env)
 
     def act(self, observation: Any) -> Actions:
         """Choose an action of the environment, shape (n_actions,).
@@ -159,11 +162,13 @@ class Player:
 
         Raises:
             ActionError: The policy gave no such action, or no episode has begun.
+            FunctionFailure: It raised an error.
         """
-        name = self._about["name"]
         if self._act is None:
-            raise ActionError(f"the policy {name!r} acts in no episode; call begin()", None)
-        return checked(self._act(observation), self._env, name)
+            raise ActionError(f"{self._who} acts in no episode; call begin()", None)
+        with blamed(self._who):
+            action = self._act(observation)
+        return checked(action, self._env, self._about["name"])
 
     def __getstate__(self) -> dict[str, Any]:
         """Copy and pickle without the episode."""
@@ -226,7 +231,15 @@ def _function(policy: Any, env: ScmWorldEnv) -> Actor:
 
 
 def _model(model: Any, env: ScmWorldEnv) -> Actor:
-    """Carry the state of a recurrent model from step to step."""
+    """Carry the state of a recurrent model from step to step.
+
+    Raises:
+        ActionError: It observes something of another shape.
+    """
+    shapes = [_shapes(getattr(one, "observation_space", None)) for one in (model, env)]
+    if shapes[0] not in (None, shapes[1]):
+        problem = f"it observes shape {shapes[0]}, and the environment shows {shapes[1]}"
+        raise ActionError(f"{problem}; give the options of its training: env={{…}}", None)
     state, first = None, True
 
     def act(observation: Any) -> Any:
@@ -238,6 +251,18 @@ def _model(model: Any, env: ScmWorldEnv) -> Actor:
         return action
 
     return act
+
+
+def _shapes(space: Any) -> Any:
+    """Return the shape of what a space contains, by name where it has parts; None without one.
+
+    Pictures have one shape, wherever their channels stand.
+    """
+    parts = getattr(space, "spaces", None)
+    if isinstance(parts, Mapping):
+        return {name: _shapes(part) for name, part in parts.items()}
+    shape = getattr(space, "shape", None)
+    return tuple(sorted(shape)) if shape is not None and len(shape) == 3 else shape
 
 
 def _network(policy: MlpPolicy | OnnxPolicy, name: str, env: ScmWorldEnv) -> Actor:

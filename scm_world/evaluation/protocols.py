@@ -272,8 +272,8 @@ def protocols_of(task: Task | str, backend: str | None = None) -> tuple[Protocol
 
     The tasks of this package have those of the table. P10 and P11 draw everything that the
     predecessor draws, the joints excepted; a fair coin decides in each episode whether sizes or
-    positions are drawn, as published. A task registered by a user has P0 alone. Any other task, of
-    a model or of a step function, has those that follow from its spaces: see ``general``.
+    positions are drawn, as published. Any other task, whether it is registered or named by a file
+    or a function, has those that follow from its spaces: see ``general``.
 
     Args:
         task: Name of a registered task, a file or function that names one, or a task.
@@ -287,9 +287,7 @@ def protocols_of(task: Task | str, backend: str | None = None) -> tuple[Protocol
         [('P1', 'A'), ('P2', 'B')]
     """
     name = task.name if isinstance(task, Task) else task
-    if name in tasks() and isinstance(task, str | tasks()[name]):
-        if name not in ROLES:
-            return (_protocol(_BLOCK, *ROWS[0]),)  # nothing varies in it
+    if name in ROLES and isinstance(task, str | tasks()[name]):
         rows = (*ROWS, REACHING) if name == "reaching" else ROWS
         return tuple(_protocol(ROLES[name], *row) for row in rows)
     return general(as_task(task), backend)
@@ -299,15 +297,17 @@ def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:
     """Give the protocols that follow from the spaces of any task.
 
     In ``P0`` nothing varies. In ``A`` every variable with a space A is drawn from it, and in
-    ``A:pole.mass`` only that one; likewise ``B``.
+    ``A:pole.mass`` only that one; likewise ``B``. Where variables decide which bodies there are,
+    P0 is the only one: the others would change what a policy observes.
 
     Args:
-        task: Of a model or a step function.
+        task: Any.
         backend: Whose parameters count; that of the task if None.
     """
-    declaration = Simulation(task, backend=backend).compiled
+    world = Simulation(task, backend=backend)
+    declaration = world.compiled
     found = [Protocol("P0", doc="nothing varies")]
-    spaces: tuple[SpaceName, ...] = ("A", "B")
+    spaces: tuple[SpaceName, ...] = () if len(world.structures.head) else ("A", "B")
     for space in spaces:
         names = Resample("@everything", space=space).targets(declaration)
         if names:

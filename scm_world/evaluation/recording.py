@@ -241,8 +241,9 @@ class Recording:
             MissingExtra: Minari is not installed.
             ModelError: Observations have several shapes, the task has no id with Gymnasium, or
                 something cannot be written.
-            UnknownOption: The task is a function of no trusted package.
-            ValueError: There is such a dataset already, says Minari.
+            UnknownOption: The task is a function of no trusted package, or there is a dataset of
+                this name.
+            ValueError: Minari refuses a name or an argument.
         """
         refuse_untrusted(_name(self.environment), self.trusted)
         usual = {

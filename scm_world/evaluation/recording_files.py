@@ -421,6 +421,11 @@ def _array(row: NDArray[Any], *shape: int) -> NDArray[Any]:
 def to_minari(episodes: Sequence[Recorded], dataset_id: str, **about: Any) -> Any:
     """Write a dataset of Minari; see ``Recording.to_minari``."""
     minari = load("minari", "minari", "minari")
+    local = load("minari.storage.local", "minari", "minari")
+    folder = Path(local.get_dataset_path(str(dataset_id)))
+    if folder.exists():
+        allowed = f"one that is not taken: minari.delete_dataset({dataset_id!r}) removes this one"
+        raise UnknownOption("id of a dataset", dataset_id, (allowed,))
     buffer = load("minari.data_collector.episode_buffer", "minari", "minari").EpisodeBuffer
     arguments = _gym_arguments(as_data(episodes[0].environment))
     env: Any = gymnasium.make(disable_env_checker=True, **arguments)
@@ -466,13 +471,10 @@ def to_minari(episodes: Sequence[Recorded], dataset_id: str, **about: Any) -> An
     ]
     library = "h5py" if given["data_format"] == "hdf5" else "pyarrow"
     load(library, library, "minari")
-    folder = Path(load("minari.storage.local", "minari", "minari").get_dataset_path(dataset_id))
-    was_there = folder.exists()
     try:
         return minari.create_dataset_from_buffers(dataset_id, buffers, **given)
     except BaseException:
-        if not was_there and folder.exists():
-            shutil.rmtree(folder)
+        shutil.rmtree(folder, ignore_errors=True)
         raise
     finally:
         env.close()
@@ -486,18 +488,11 @@ def _labelled(episode: Recorded) -> dict[str, Any]:
 
 
 def _gym_arguments(made_with: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments with which Gymnasium makes an environment again, its ``id`` included.
-
-    Raises:
-        ModelError: There is no id, as the task is registered with this package alone.
-    """
+    """Return the arguments with which Gymnasium makes an environment again, its ``id`` included."""
     name = made_with["task"]
     for id_, task in IDS.items():
         if task == name:
             return {"id": id_, **made_with}
-    if name in tasks():
-        problem = f"the task {name!r} has no id with Gymnasium; there are {', '.join(IDS)}"
-        raise ModelError([problem])
     rest = {key: value for key, value in made_with.items() if key != "task"}
     options = made_with.get("task_options") or {}
     return {"id": MODEL_ID, **rest, "model": name, "task_options": options}

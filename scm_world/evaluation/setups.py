@@ -259,13 +259,12 @@ def prepare(
     for name in env or {}:
         one_of("option of the environment", name, allowed)
     place = EvaluationPlace(task, shared_options(env, trained))
-    place.made  # noqa: B018 # refuses a task that is not there
+    made = place.made  # refuses a task that is not there
     engines = _several("backend", backend)
     for engine in engines:
         if not isinstance(engine, str) or engine not in backends():
             raise UnknownOption("backend", engine, backends())
-    known = protocols_of(place.made if place.name not in tasks() else place.name, engines[0])
-    wanted = chosen(protocols, known)
+    wanted = chosen(protocols, protocols_of(made, engines[0]))
     count = whole_number("n", n, least=1)
     given = (
         int(s) if isinstance(s, str) and s.isdecimal() else s for s in _several("seeds", seeds)

@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.errors import ModelError, ScmWorldError, WrongShape, WrongType, in_one_line
+from scm_world.errors import FunctionFailure, ModelError, WrongShape, WrongType, blamed
 from scm_world.variables import (
     SOFT,
     Categories,
@@ -291,7 +291,8 @@ class Evaluator:
                 return self._derive(variable, values, previous, key)
             case Measured() if variable.mechanism is not None:
                 arguments = self._arguments(variable.all_parents, values, previous)
-                return np.asarray(self._bound(variable)(*arguments))
+                with blamed(f"the function of {variable.name!r}"):
+                    return np.asarray(self._bound(variable)(*arguments))
             case _:
                 if variable.name not in values:
                     raise ModelError(
@@ -305,17 +306,14 @@ class Evaluator:
         arguments = self._arguments(variable.all_parents, values, previous)
         given = {} if variable.noise is None else noise_of(variable, variable, key, values)
         function = self._bound(variable)
-        try:
+        with blamed(f"the function of {variable.name!r}"):
             value = np.asarray(function(*arguments, **given))
-        except ScmWorldError:
-            raise
-        except Exception as error:
-            problem = f"the function of {variable.name!r} raised {in_one_line(error)}"
-            raise ModelError([problem]) from error
         shape = value.shape[value.ndim - len(variable.shape) :]
         if value.dtype.kind not in "biuf" or shape != variable.shape:
             wanted = f"numbers of shape {variable.shape}" if variable.shape else "a number"
-            raise ModelError([f"the function of {variable.name!r} gives {value!r}, not {wanted}"])
+            raise FunctionFailure(
+                f"the function of {variable.name!r} gives {value!r}, not {wanted}"
+            )
         _check_kind(variable, value)
         return value
 

@@ -14,6 +14,7 @@ from scm_world.errors import DAMAGED, InterventionError, ModelError
 from scm_world.graph.scm import SCM
 from scm_world.variables import AnyVariable, Function, Intervention, Mechanism, Variable
 from scm_world.variables.mechanisms import check_portable, check_trusted
+from scm_world.variables.spaces import problems_of
 
 FORMAT = "scm_world/model/2"
 
@@ -82,9 +83,7 @@ def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
         variables = _VARIABLES.validate_json(json.dumps(data["variables"]))
         held = _INTERVENTIONS.validate_json(json.dumps(data.get("interventions", {})))
     except ValidationError as error:
-        raise ModelError(
-            [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
-        ) from None
+        raise ModelError(problems_of(error)) from None
     except DAMAGED as error:  # a field too many, or too few
         raise ModelError([f"not a model: {error}"]) from None
     check_trusted(_functions(variables, held), trusted)  # before anything of theirs is imported

@@ -12,7 +12,7 @@ from pydantic import Field, JsonValue, ValidationError, field_validator
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.tasks import tasks
-from scm_world.variables.spaces import Frozen
+from scm_world.variables.spaces import Frozen, problems_of
 
 KEY = "scm_world"
 """Metadata entry of a policy file that holds a ``PolicyAbout``."""
@@ -29,6 +29,7 @@ FORM = (
     "include",
     "context",
     "keypoints",
+    "pad",
     "normalize_observations",
     "goal_env",
 )
@@ -184,12 +185,7 @@ class PolicyAbout(Frozen):
                 return cls.model_validate_json(given)
             return cls.model_validate(given)
         except ValidationError as error:
-            raise ModelError(
-                [
-                    f"{'.'.join(map(str, one['loc'])) or 'the text'}: {one['msg']}"
-                    for one in error.errors()
-                ]
-            ) from None
+            raise ModelError(problems_of(error)) from None
 
     def check(self, env: ScmWorldEnv, name: str) -> None:
         """Check that an environment has the observations and actions of the training.

@@ -9,7 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import real_numbers, whole_number
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.policies.planning import CrossEntropy
@@ -67,7 +67,7 @@ class Sequence(Blind):
 
     def __init__(self, actions: Any) -> None:
         try:
-            given = np.atleast_2d(np.asarray(actions, dtype=np.float64))
+            given = np.atleast_2d(real_numbers(actions))
         except (TypeError, ValueError):
             given = np.empty((0, 0))
         if given.ndim != 2 or not len(given):

@@ -10,7 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import real_numbers, whole_number
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.graph import SCM, NoiseKey, flatten
@@ -246,11 +246,10 @@ class Equations:
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
         """
-        rows = np.asarray(action, dtype=np.float64) if not self._is_one else None
-        if rows is not None and rows.ndim == 2:
-            given = np.clip(rows, *self.compiled.action_bounds)
-        else:
+        if self._is_one or np.ndim(action) != 2:
             given = self.compiled.clipped(action)
+        else:
+            given = np.clip(real_numbers(action), *self.compiled.action_bounds)
         now = {**self._now(), **self._split(given)}
         for name in self.compiled.actions:
             now[name] = self._taken(name, now, self.index)

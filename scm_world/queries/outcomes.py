@@ -7,7 +7,7 @@ from typing import Any, Literal, final
 import numpy as np
 
 from scm_world._types import Floats, Value
-from scm_world.errors import UnknownOption
+from scm_world.errors import UnknownOption, blamed
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import Equations, System
 from scm_world.tasks.rewards import FRACTION
@@ -126,8 +126,13 @@ def read(outcome: Any, episode: Episode) -> Floats:
 
     Raises:
         UnknownOption: A function gave no finite numbers.
+        FunctionFailure: A function raised an error.
     """
-    return as_numbers(outcome.of(episode) if isinstance(outcome, Outcome) else outcome(episode))
+    if isinstance(outcome, Outcome):
+        return as_numbers(outcome.of(episode))
+    with blamed(f"the outcome {label(outcome)!r}"):
+        value = outcome(episode)
+    return as_numbers(value)
 
 
 def as_numbers(value: Any) -> Floats:

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 Progress = Callable[[int, int], None]
-"""Called after each piece of work with how many are done, and how many there will be."""
+"""Called after each piece of work with how many are done, and how many there will be.
+
+An error that it raises ends the work and reaches the caller as it is: so a caller stops a long job.
+"""
 
 
 Tell = Callable[[str], None]

@@ -9,10 +9,10 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import real_numbers, whole_number
 from scm_world._types import Floats, Integers, Value
 from scm_world.backends.base import ContactPoint
-from scm_world.errors import ActionError
+from scm_world.errors import ActionError, blamed
 from scm_world.policies.scripted import Policy, as_policy
 from scm_world.queries.equations import Equations, System
 from scm_world.queries.local import contacts_of
@@ -79,13 +79,15 @@ def _chosen(policy: Policy, world: System) -> Floats:
 
     Raises:
         ActionError: It did something else to the world, or gave no numbers.
+        FunctionFailure: It raised an error.
     """
     before = world.version, world.index
-    given = policy(world)
+    with blamed(_who(policy, world)):
+        given = policy(world)
     if (world.version, world.index) != before:
         raise ActionError("a policy acts through its action only; put the rest into a plan", given)
     try:
-        return np.array(given, dtype=np.float64)
+        return np.array(real_numbers(given))
     except (TypeError, ValueError):
         raise ActionError("an action is finite numbers", given) from None
 
@@ -93,6 +95,12 @@ def _chosen(policy: Policy, world: System) -> Floats:
 def _pairs(contacts: Iterable[ContactPoint]) -> frozenset[tuple[str, str]]:
     found = (tuple(sorted(contact.bodies)) for contact in contacts)
     return frozenset((one, other) for one, other in found)
+
+
+def _who(policy: Any, world: System) -> str:
+    """Name a policy and the control step in which it is asked."""
+    named = policy if hasattr(policy, "__qualname__") else type(policy)
+    return f"in control step {world.index}, the policy {named.__qualname__!r}"
 
 
 def length(system: System, steps: int | None) -> int:
@@ -345,7 +353,8 @@ class RunningTogether:
     def _look_ahead(self, row: int, step: int) -> None:
         """Ask a policy for all actions that are left."""
         one = self._rows[row]
-        given = one.policy.ahead(one.world, one.world.index, self._steps - step)
+        with blamed(_who(one.policy, one.world)):
+            given = one.policy.ahead(one.world, one.world.index, self._steps - step)
         for command, action in zip(self._commands[step:, row], given, strict=True):
             command[:] = one.world.compiled.clipped(action)
         one.trace.actions[step:] = np.array(given)

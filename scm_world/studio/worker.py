@@ -37,6 +37,7 @@ from scm_world.studio.reading import (
 )
 from scm_world.studio.scene import Shapes, frame, touching
 from scm_world.variables import Draw, Natural, Scale, Shift
+from scm_world.variables.spaces import problems_of
 from scm_world.world import Simulation
 
 FRAMES, NEWS = 60.0, 15.0  # most frames and reports of a second
@@ -210,7 +211,9 @@ class Session:
                 raise UnknownOption("op", message["op"], (*OPS,))
             try:
                 found = OPS[message["op"]](self, **given)
-            except (TypeError, ValidationError) as error:
+            except ValidationError as error:
+                raise UnknownOption("message", message["op"], problems_of(error)) from error
+            except TypeError as error:
                 raise UnknownOption("message", message["op"], (in_one_line(error),)) from error
         except ScmWorldError as error:
             if isinstance(error, EngineFailure):

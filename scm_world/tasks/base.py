@@ -41,12 +41,12 @@ class Observed:
 
 
 def numbers_of(value: Any) -> Floats | None:
-    """Read finite numbers; None if these are none."""
+    """Read finite real numbers; None if these are none."""
     try:
         found = np.asarray(value)
     except ValueError:  # a ragged list
         return None
-    numeric = np.issubdtype(found.dtype, np.number) and np.isfinite(found).all()
+    numeric = found.dtype.kind in "iuf" and np.isfinite(found).all()
     return found.astype(np.float64) if numeric else None
 
 
@@ -230,6 +230,8 @@ class Task(ABC):
         rest: Joint positions at the start of an episode, where the task has a robot.
         raised: Joint positions in which the robot is out of the way.
         policies: Scripted policies of its own, by name.
+        training: Fields of a recipe with which it is learned, such as ``{"steps": 200_000}``;
+            those of an algorithm under its name. The others are the usual ones.
         plan: What there is, as ``arrange`` has it; None where that is always the same.
         absent: Entities that an intervention took away.
         checks_functions: Whether what functions of users give is checked when a world begins.
@@ -258,6 +260,7 @@ class Task(ABC):
     rest: ClassVar[tuple[float, ...]] = ()
     raised: ClassVar[tuple[float, ...]] = ()
     policies: ClassVar[Mapping[str, Callable[[], Any]]] = {}
+    training: ClassVar[Mapping[str, Any]] = {}
     plan: Hashable = None
     checks_functions: ClassVar[bool] = False
     absent: frozenset[str] = frozenset()

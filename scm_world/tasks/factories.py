@@ -6,12 +6,11 @@ import importlib
 import importlib.util
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from scm_world.errors import ModelError, ScmWorldError, UnknownOption, in_one_line
+from scm_world.errors import FunctionFailure, UnknownOption, blamed
 from scm_world.graph import SCM
 from scm_world.tasks.model import is_model
 
@@ -46,7 +45,7 @@ def load_named(reference: str, what: str) -> Any:
 
     Raises:
         UnknownOption: There is no such module or file, or nothing of this name in it.
-        ModelError: The module raised an error.
+        FunctionFailure: The module raised an error.
     """
     home, _, name = reference.rpartition(":")
     if not home or not name:
@@ -73,7 +72,7 @@ def load_named(reference: str, what: str) -> Any:
         try:
             with blamed(home):
                 module = importlib.import_module(home)
-        except ModelError as error:
+        except FunctionFailure as error:
             if isinstance(error.__cause__, ModuleNotFoundError):
                 raise UnknownOption(what, reference, (f"a module: {error.__cause__}",)) from error
             raise
@@ -105,18 +104,3 @@ def refuse_untrusted(task: str, trusted: Sequence[str] | None) -> None:
         return
     allowed = (f"task={task!r}, or trusted={(package,)}, to run what is in there",)
     raise UnknownOption("task that a file names", task, allowed)
-
-
-@contextmanager
-def blamed(reference: str) -> Iterator[None]:
-    """Name the module or function of a user in the errors that it raises.
-
-    Raises:
-        ModelError: It raised an error that is none of this package.
-    """
-    try:
-        yield
-    except ScmWorldError:
-        raise
-    except Exception as error:
-        raise ModelError([f"{reference} raised {in_one_line(error)}"]) from error

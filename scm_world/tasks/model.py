@@ -13,13 +13,13 @@ from numba import njit
 
 from scm_world._types import Floats
 from scm_world.backends import Backend, read_model
-from scm_world.errors import UnknownOption
+from scm_world.errors import UnknownOption, blamed
 from scm_world.geometry import chains
 from scm_world.graph import SCM
 from scm_world.models import Model, ParameterKey, Readout, Row, State
 from scm_world.tasks.base import Observed, Task, Timing
 from scm_world.tasks.composition import Clock, Composition
-from scm_world.tasks.rewards import SUCCESS, declared
+from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
 from scm_world.variables import (
     Action,
     Box,
@@ -37,7 +37,7 @@ from scm_world.variables.mechanisms import Stacked
 CONTROL_DT = 0.02
 """Length of a control step where none is asked for [s], to the next whole physics step."""
 
-REWARD, TERMINATED = "reward", "terminated"
+REWARD = "reward"
 FILES = (".xml", ".mjcf", ".urdf")
 """How the names of files end that are models."""
 START = "start"
@@ -576,9 +576,9 @@ def model_task(source: Any, options: Mapping[str, Any], known: Callable[[], Iter
 
     Raises:
         UnknownOption: It is none of these.
-        ModelError: The function, or its module, raised an error.
+        FunctionFailure: The function, or its module, raised an error.
     """
-    from scm_world.tasks.factories import blamed, load_factory
+    from scm_world.tasks.factories import load_factory
 
     if is_model(source):
         return ModelTask(source, **options)

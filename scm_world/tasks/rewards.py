@@ -17,6 +17,7 @@ from scm_world.variables import Box, Derived, Function, Integers, Linear, Measur
 
 FRACTION = "fractional_success"
 SUCCESS = "success"
+TERMINATED = "terminated"
 FULFILLED = 0.9  # the fraction of the goal that counts as success
 UNIT = Box(0.0, 1.0)
 
@@ -42,6 +43,8 @@ class Common(TypedDict, total=False):
         success: What counts in place of the usual goal: ``(function, "parent", …)``, a function of
             variables of the task that gives a number in [0, 1], or 0 and 1. It becomes
             ``fractional_success``, and more than 0.9 of it is ``success``.
+        terminated: When an episode ends before its time: ``(function, "parent", …)``, a function
+            of variables of the task that gives 0 or 1. It becomes ``terminated``.
     """
 
     weights: str | Mapping[str, float]
@@ -51,6 +54,7 @@ class Common(TypedDict, total=False):
     terms: Iterable[Measured | str]
     joint_positions: Sequence[float] | None
     success: Any
+    terminated: Any
 
 
 def resolve(

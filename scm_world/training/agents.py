@@ -16,12 +16,12 @@ from typing import Any, final
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from scm_world._arguments import one_of
+from scm_world._arguments import missing, one_of
 from scm_world._types import Floats
 from scm_world.curricula import make_vec
 from scm_world.env import IDS
 from scm_world.env.batched.vector_env import fastest
-from scm_world.errors import Diverged, MissingExtra, UnknownOption, UnreadableFile
+from scm_world.errors import Diverged, UnknownOption, UnreadableFile
 from scm_world.output.durable import made, write_durably, write_whole
 from scm_world.policies import save_policy
 from scm_world.queries.progress import Progress, clock
@@ -39,7 +39,7 @@ try:
     from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
     from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 except ImportError as error:
-    raise MissingExtra("stable-baselines3", "train") from error
+    raise missing(error, "stable_baselines3", "stable-baselines3", "train") from error
 
 __all__ = ["Watch", "begin_with", "checkpoints", "device_for", "make_learner", "make_worlds"]
 

@@ -67,8 +67,9 @@ def export_sb3(model: Any, env: Any, path: Path | str, **card: Any) -> Path:
         The path.
 
     Raises:
-        UnknownOption: The environment is none of this package, or shows something else than the
-            model observes; actions are not in [-1, 1]; or the path has another ending.
+        UnknownOption: The model is none; the environment is none of this package, or shows
+            something else than the model observes; actions are not in [-1, 1]; or the path has
+            another ending.
         ModelError: The network is of another kind, or observations are normalised beside it.
         UnwritableFolder: There is no room, or no permission.
 
@@ -76,6 +77,9 @@ def export_sb3(model: Any, env: Any, path: Path | str, **card: Any) -> Path:
         >>> model = stable_baselines3.PPO("MlpPolicy", env).learn(100_000)  # doctest: +SKIP
         >>> export_sb3(model, env, "mine.safetensors")  # doctest: +SKIP
     """
+    library: Any = load("stable_baselines3.common.base_class", "stable-baselines3", "train")
+    if not isinstance(model, library.BaseAlgorithm):
+        raise UnknownOption("model", model, ("a model of Stable-Baselines3, such as a PPO",))
     about = PolicyAbout.in_env(env, card=card)
     space = getattr(env, "single_observation_space", env.observation_space)
     if space != model.observation_space:

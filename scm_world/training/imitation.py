@@ -35,7 +35,6 @@ from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.training.export import mean, scored, words
 from scm_world.training.loop import open_folder, torch_threads
 from scm_world.training.settings import (
-    ENV,
     LESSONS,
     Count,
     Network,
@@ -45,6 +44,7 @@ from scm_world.training.settings import (
     Share,
     TaskName,
     Trials,
+    known_task,
     merged,
     nested,
     observed,
@@ -117,7 +117,7 @@ class Lesson(Frozen):
 
     task: TaskName
     teacher: str = "grasp"
-    env: dict[str, Any] = Field(default_factory=lambda: dict(ENV))
+    env: dict[str, Any] = Field(default_factory=dict)
     protocols: Annotated[tuple[str, ...], Field(min_length=1)] = ("P0", "P1", "P5")
     episodes: Count = 250
     rounds: Annotated[int, Field(ge=0)] = 1
@@ -202,7 +202,9 @@ def lesson(task: str, **changes: Any) -> Lesson:
     """
     fields: dict[str, Any] = Lesson.model_construct(task=task).model_dump(mode="json")
     fields |= LESSONS.get(task, {})
-    known = protocols_of(task)
+    made = make_task(known_task(task))
+    fields["env"] = {**made.training.get("env", {}), **fields["env"]}
+    known = protocols_of(made)
     there = {protocol.name for protocol in known}
     for part in (fields, fields["trials"]) if task not in TASKS else ():
         usual = [name for name in part["protocols"] if name in there]
@@ -646,6 +648,8 @@ def clone(
     policies: list[MlpPolicy] = []
     with locked(folder), torch_threads(1), opened(None, workers) as executor:
         open_folder(folder / "clone.json", "scm_world/clone/1", identity, identity, say)
+        who = lesson.teacher if source is None else source
+        say(f"Learning {lesson}; from {who} on {backend}, seed {number}, in {folder}")
         for round_ in range(lesson.rounds + 1):
             how: dict[str, Any] = {"backend": backend, "seed": number, "round_": round_}
             if source is None:

@@ -27,6 +27,7 @@ from scm_world.training.recipe import Recipe
 
 FORMAT = "scm_world/run/1"
 EVERY = 60.0  # [s] between checkpoints
+STEPS = "time/total_timesteps"  # the column of the learning curves
 LARGEST_SEED = 2**32 - 1  # of Stable-Baselines3
 
 
@@ -101,8 +102,7 @@ def train(
         UnwritableFolder: There is no room; the last checkpoint is still whole.
         Diverged: Weights are not finite any more.
     """
-    for library, module in (("stable-baselines3", "stable_baselines3"), ("torch", "torch")):
-        load(module, library, "train")
+    load("stable_baselines3", "stable-baselines3", "train")
     from scm_world.training import agents
 
     if whole_number("seed", seed, least=0) > LARGEST_SEED:
@@ -135,6 +135,7 @@ def train(
             )
             with locked(folder):
                 open_folder(folder / "run.json", FORMAT, identity, card, say, recipe.may_grow)
+                say(f"Training {recipe}; on {backend}, seed {seed}, in {folder}")
                 if there := agents.checkpoints(folder):
                     watch.resume(model, there[-1])
                     say(f"goes on after {model.num_timesteps:,} steps")
@@ -158,6 +159,7 @@ def _learn(model: Any, watch: Any, left: int, folder: Path, tell: Tell) -> None:
     """Learn; the first Ctrl-C ends it after the present round, and the second one immediately."""
     logger: Any = load("stable_baselines3.common.logger", "stable-baselines3", "train")
     after = f"-{model.num_timesteps}" if model.num_timesteps else ""
+    forget(folder, model.num_timesteps)
     outputs = [
         logger.make_output_format("csv", str(folder), after),
         logger.make_output_format("tensorboard", str(made(folder / "tensorboard"))),
@@ -184,6 +186,20 @@ def _learn(model: Any, watch: Any, left: int, folder: Path, tell: Tell) -> None:
         if is_main:
             signal.signal(signal.SIGINT, before)
         model.logger.close()
+
+
+def forget(folder: Path, steps: int) -> None:
+    """Remove from the learning curves of a run what came after a checkpoint: it comes again."""
+    for path in folder.glob("progress*.csv"):
+        whole, _, _ = read_text(path).rpartition("\n")  # the last line may be cut
+        head, *rows = whole.split("\n")
+        names = head.split(",")
+        place = names.index(STEPS) if STEPS in names else 0
+        kept = [row for row in rows if float(row.split(",")[place] or 0.0) <= steps]
+        if kept:
+            write_whole("\n".join((head, *kept, "")), path)
+        else:
+            path.unlink()
 
 
 @contextmanager

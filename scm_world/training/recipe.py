@@ -24,7 +24,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
 from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.output.reading import read_text
-from scm_world.tasks import TASKS, make_task, tasks
+from scm_world.tasks import TASKS, Task, make_task
 from scm_world.tasks.factories import refuse_untrusted
 from scm_world.training.settings import (
     ALGORITHMS,
@@ -160,7 +160,7 @@ class Recipe(Frozen):
             least = f"at least {self.round:,}: {self.worlds} worlds make so many in one round"
             raise UnknownOption("steps", self.steps, (least,))
         if self.trials.protocols:
-            chosen(self.trials.protocols, _protocols(self.task, self.env))
+            chosen(self.trials.protocols, protocols_of(_made_task(self.task, self.env)))
         return self
 
     def __str__(self) -> str:
@@ -283,8 +283,9 @@ def recipe(task: str, algo: str = "ppo", *, curriculum: Any = None, **changes: A
 
     Args:
         task: Name of a task, also of one after ``scm_world.tasks.register``; a model file, or
-            ``"module:function"`` for a function or class that gives a task. For such tasks nothing
-            is said of the environment, and trials are in P0, A and B as far as there are these.
+            ``"module:function"`` for a function or class that gives a task. What its class has in
+            ``training`` counts more than what is usual. Trials of a task that is not of this
+            package are in P0, A and B, as far as there are these.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
         curriculum: The name of a protocol of the task, such as ``"P10"``: what varies in it varies
             in each episode. Else see ``curriculum_of``; the usual one of the task if None.
@@ -305,23 +306,20 @@ def recipe(task: str, algo: str = "ppo", *, curriculum: Any = None, **changes: A
     """
     known_task(task)
     one_of("algorithm", algo, ALGORITHMS)
-    fields: dict[str, Any] = {"task": task, "algo": algo, "name": "tuned", **tuned(task, algo)}
-    if task not in TASKS:
-        names: tuple[str, ...] = ("P0",)
-        if task not in tasks():
-            fields["env"] = {}
-            there = {protocol.name for protocol in _protocols(task, changes.get("env"))}
-            names = tuple(name for name in ("P0", "A", "B") if name in there)
-        fields["trials"] = merged(fields.get("trials", {}), {"protocols": names})
+    made = _made_task(task, changes.get("env"))
+    fields: dict[str, Any] = {"task": task, "algo": algo, "name": "tuned", **tuned(made, algo)}
+    if type(made) is not TASKS.get(made.name):
+        there = {protocol.name for protocol in protocols_of(made)}
+        names = tuple(name for name in ("P0", "A", "B") if name in there)
+        fields["trials"] = {"protocols": names, **fields.get("trials", {})}
     if curriculum is not None:
         fields["curriculum"] = curriculum
     return _changed(fields, changes)
 
 
-def _protocols(task: str, env: Mapping[str, Any] | None) -> Any:
-    """List the protocols of a task, which is made if it is one of a model."""
-    options = (env or {}).get("task_options") or {}
-    return protocols_of(task if task in tasks() else make_task(task, **options))
+def _made_task(task: str, env: Mapping[str, Any] | None) -> Task:
+    """Make a task with its options in an environment."""
+    return make_task(task, **((env or {}).get("task_options") or {}))
 
 
 def _changed(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> Recipe:
@@ -349,7 +347,7 @@ def _made(fields: Mapping[str, Any]) -> Recipe:
     given = found.get("curriculum")
     is_name = isinstance(given, str) and not (given.isdecimal() or given.endswith(".json"))
     if is_name and isinstance(found.get("task"), str):
-        known = {one.name: one for one in _protocols(found["task"], found.get("env"))}
+        known = {one.name: one for one in protocols_of(_made_task(found["task"], found.get("env")))}
         if given not in known:
             allowed = ("0", "1", "2", *known, "the path of a JSON file", "a Curriculum")
             raise UnknownOption("curriculum", given, allowed)

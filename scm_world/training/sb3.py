@@ -10,14 +10,14 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from scm_world._arguments import one_of
+from scm_world._arguments import missing, one_of
 from scm_world.env.batched import LoopExecutor, ScmWorldVectorEnv
-from scm_world.errors import MissingExtra, UnknownOption
+from scm_world.errors import UnknownOption
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
 except ImportError as error:
-    raise MissingExtra("stable-baselines3", "train") from error
+    raise missing(error, "stable_baselines3", "stable-baselines3", "train") from error
 
 USUAL = ("is_success",)
 """Keys of ``info`` that are passed on by default, where the task has them."""

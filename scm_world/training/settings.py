@@ -11,7 +11,7 @@ from scm_world._arguments import one_of
 from scm_world.curricula import resample
 from scm_world.errors import ScmWorldError, UnknownOption
 from scm_world.evaluation.episodes import METRICS
-from scm_world.tasks import tasks
+from scm_world.tasks import TASKS, Task, tasks
 from scm_world.tasks.model import FILES, is_model
 from scm_world.variables.spaces import Frozen
 
@@ -246,13 +246,6 @@ def refused(what: str, error: ValidationError) -> ScmWorldError:
 
 Fields = Mapping[str, Any]
 
-ENV: Fields = {
-    "action_mode": "delta_joint_positions",
-    "delta_scale": 0.1,
-    "delta_origin": "measured",
-    "frame_skip": 10,
-}
-
 _OFF_POLICY: Fields = {
     "worlds": 64,
     "steps": 1_000_000,
@@ -447,7 +440,7 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
 
 _BY_FEEDBACK: Fields = {
     "teacher": "feedback",
-    "env": {**ENV, **_reacting()},
+    "env": _reacting(),
     "protocols": ("P7", "P10"),
     "episodes": 12_000,
     "rounds": 0,
@@ -469,7 +462,7 @@ LESSONS: Mapping[str, Fields] = {
     "picking": _LIFTED,
     "pick_and_place": {
         **_LIFTED,
-        "env": {**ENV, **_reacting(also=_WALL)},
+        "env": _reacting(also=_WALL),
         "protocols": ("P7", "P10", "P10", "P10"),
         "episodes": 7_000,
         "updates": 45_000,
@@ -478,7 +471,7 @@ LESSONS: Mapping[str, Fields] = {
     },
     "stacking2": {
         **_LIFTED,
-        "env": {**ENV, **_reacting("_1", "_2")},
+        "env": _reacting("_1", "_2"),
         "protocols": ("P5",),
         "episodes": 2_000,
         "noise": 0.02,
@@ -489,13 +482,16 @@ LESSONS: Mapping[str, Fields] = {
         "trials": {"protocols": ("P0", "P5"), "episodes": 20},
     },
 }
-"""What differs from the usual lesson of imitation, by task."""
+"""What differs from the usual lesson of imitation, by task; of the environment also from
+``Task.training``."""
 
 
-def tuned(task: str, algo: str) -> dict[str, Any]:
-    """Return the fields of a recipe that work for a task, as far as we know."""
-    found: dict[str, Any] = {"env": dict(ENV), **COMMON[algo]}
-    for fields in (TUNED.get(task, {}).get(key, {}) for key in (None, algo)):
+def tuned(task: Task, algo: str) -> dict[str, Any]:
+    """Return the fields of a recipe that work for a task, as far as it or we know."""
+    found = dict(COMMON[algo])
+    mine = {name: value for name, value in task.training.items() if name not in ALGORITHMS}
+    ours = TUNED.get(task.name, {}) if type(task) is TASKS.get(task.name) else {}
+    for fields in (mine, task.training.get(algo, {}), ours.get(None, {}), ours.get(algo, {})):
         found |= {
             name: {**found[name], **value} if isinstance(found.get(name), Mapping) else value
             for name, value in fields.items()

@@ -53,6 +53,16 @@ class _Named(ModelMetaclass):
             raise refused_fields(self, error) from None
 
 
+def problems_of(error: ValidationError) -> list[str]:
+    """List what pydantic says of data, each with the place, without its advice."""
+    found = []
+    for one in error.errors():
+        cause, where = one.get("ctx", {}).get("error"), ".".join(map(str, one["loc"]))
+        said = getattr(cause, "problems", (one["msg"].removeprefix("Value error, "),))
+        found += [f"{where}: {each}".removeprefix(": ") for each in said]
+    return found
+
+
 def refused_fields(kind: Any, error: ValidationError) -> ScmWorldError:
     """Return what is wrong with the fields of a declaration, as an error of this package."""
     said: dict[str, list[str]] = {}

@@ -11,7 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import real_numbers, whole_number
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.errors import ActionError, InterventionError, ModelError, UnknownOption
 from scm_world.geometry.clipping import clip_kernel
@@ -83,7 +83,7 @@ class ActionVector:
         """
         low, high = self.action_bounds
         try:
-            given = np.ascontiguousarray(action, dtype=np.float64)
+            given = np.ascontiguousarray(real_numbers(action))
         except (TypeError, ValueError):  # text, or a ragged list
             given = np.full(low.size + 1, np.nan)
         command = np.empty(low.shape)

@@ -7,15 +7,19 @@ a function depends on the types of the function only, and is kept on disk.
 
 from __future__ import annotations
 
+import logging
+import multiprocessing
+import time
 from functools import cache
-from typing import Any
+from typing import Any, final
 
 from numba import njit, types
-from numba.core import cgutils
+from numba.core import cgutils, event
 from numba.core.errors import NumbaError
 from numba.extending import intrinsic
 
 from scm_world._types import Floats, Integers
+from scm_world.variables.mechanisms import PACKAGE
 
 _types: Any = types  # numba is untyped
 _cgutils: Any = cgutils
@@ -26,6 +30,46 @@ _HEAD = (types.int64, VECTOR, _WHERE)
 
 def _read_number(row: Any, where: Any, i: int) -> Any:
     return row[where[i, 0]]
+
+
+LONG = 2.0
+"""Seconds of compiling after which it is said."""
+
+
+@final
+class _Compiling(event.Listener):
+    """Logs once that functions of this package are compiled, where that takes long.
+
+    Numba keeps what it has compiled in its cache, so that it is the first start that takes long.
+    """
+
+    def __init__(self) -> None:
+        self._depth, self._seconds, self._since, self._said = 0, 0.0, 0.0, False
+
+    def on_start(self, one: event.Event) -> None:
+        """Note when the outermost function begins to be compiled."""
+        self._depth += 1
+        if self._depth > 1:
+            return
+        self._since = time.perf_counter()
+        if self._seconds > LONG and not self._said and multiprocessing.parent_process() is None:
+            self._said = True
+            logging.getLogger("scm_world").warning(
+                "scm_world compiles its functions, which takes about 20 seconds at the first "
+                "start; later ones find them in the cache of numba"
+            )
+
+    def on_end(self, one: event.Event) -> None:
+        """Add up the time."""
+        self._depth -= 1
+        home = str(one.data["dispatcher"].py_func.__module__).partition(".")[0]
+        if self._depth == 0 and home == PACKAGE:
+            self._seconds += time.perf_counter() - self._since
+
+
+_events: Any = event  # numba is untyped
+COMPILING = _Compiling()
+_events.register("numba:compile", COMPILING)
 
 
 def _read_vector(row: Any, where: Any, i: int) -> Any:

@@ -7,7 +7,7 @@ row, a batch one of many; both are computed by the same program, so the bits are
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from inspect import signature
@@ -19,7 +19,7 @@ from numba.core.errors import NumbaError
 from numba.extending import is_jitted
 
 from scm_world._types import Floats, Integers, Value
-from scm_world.errors import ModelError, ScmWorldError, in_one_line
+from scm_world.errors import FunctionFailure, ScmWorldError, in_one_line
 from scm_world.graph import SCM
 from scm_world.variables import Integers as WholeNumbers
 from scm_world.variables import Linear, Parent
@@ -102,7 +102,7 @@ class Mechanisms:
         """Compute variables and what they and the memory need, into rows of a matrix.
 
         Raises:
-            ModelError: A function gives something that the variable cannot have.
+            FunctionFailure: A function fails, or gives something that the variable cannot have.
         """
         program = self._programs.get(names)
         if program is None:
@@ -208,8 +208,8 @@ class _Python:
         """Compute, into a row.
 
         Raises:
-            ModelError: The function raised an error or, if it is a user's, gave something else
-                than finite numbers of the declared shape; or numba cannot compile it.
+            FunctionFailure: The function raised an error or, if it is a user's, gave something
+                else than finite numbers of the declared shape; or numba cannot compile it.
         """
         try:
             value = self._function(*self._arguments(row))
@@ -218,27 +218,15 @@ class _Python:
         except Exception as error:
             reason = str(error).strip().splitlines()[-1:] if isinstance(error, NumbaError) else ()
             said = f"cannot be compiled: {reason[0]}" if reason else f"raised {in_one_line(error)}"
-            raise ModelError([f"{self._told(row)} {said}"]) from error
+            raise FunctionFailure(f"{self._told(row)} {said}") from error
         problem = wrong_value(self._variable, value) if self._is_users else ""
         if problem:
-            raise ModelError([f"{self._told(row)} {problem}"])
+            raise FunctionFailure(f"{self._told(row)} {problem}")
         found = np.asarray(value, dtype=np.float64)
         row[self._place] = found.ravel()
 
     def _told(self, row: Floats) -> str:
         return f"in control step {row[self._clock]:.0f}, the function of {self._variable.name!r}"
-
-
-class FunctionFailure(ModelError):
-    """A function of a user failed.
-
-    Attributes:
-        row: In which of several worlds.
-    """
-
-    def __init__(self, problems: Sequence[str], row: int) -> None:
-        self.row = row
-        super().__init__(problems)
 
 
 def wrong_value(variable: Any, value: Any) -> str:
@@ -292,8 +280,9 @@ def _execute(program: list[Any], matrix: Floats, rows: Integers) -> None:
             for row in rows.tolist():
                 try:
                     step(matrix[row])
-                except ModelError as error:
-                    raise FunctionFailure(error.problems, row) from error.__cause__
+                except FunctionFailure as error:
+                    error.row = row
+                    raise
         else:
             run(matrix, rows, *step)
 

@@ -130,7 +130,7 @@ class Simulation(WorldAttributes):
             conventions_name=conventions,
         )
         self.structures = as_structures(shared or kind, self.options)
-        self._started = self._checked = False
+        self._started = self._checked = self._closed = False
         self.noise, self.episode = CompiledNoise(0), 0
         self.version = 0  # counts changes of anything but what physics moves
         self._origin: EngineSnapshot | None = None
@@ -807,12 +807,13 @@ class Simulation(WorldAttributes):
 
     def close(self) -> None:
         """Free the engine. There is no episode any more."""
+        self._closed |= self._started
         self._started = False
         self.backend.close()
 
     def _require_episode(self) -> None:
         if not self._started:
-            raise NotReset
+            raise NotReset(closed=self._closed)
 
     def _require_state(self) -> None:
         """Refuse to continue from a state that the backend has lost.

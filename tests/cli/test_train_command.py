@@ -87,6 +87,10 @@ WRONG = [
     (("pushing", "--set=task=picking"), "the task stands before"),
     (("pushing", "--set=algo=sac"), "give --algo"),
     (("pushing", "--seed=-1"), "seed"),
+    (("pushing", "--backend=muyoco"), "mujoco"),
+    (("pushing", "--device=cudo"), "cuda"),
+    (("pushing", "--start=none.safetensors"), "none.safetensors"),
+    (("pushing", "--set=env.action_mode=fast"), "action_mode"),
 ]
 
 
@@ -99,6 +103,7 @@ def test_what_is_wrong_is_said(
     found = called(*arguments)
     assert found.exit_code == 2
     assert said in found.output.replace("\n", " ")
+    assert "Training" not in found.output
     assert not [*tmp_path.iterdir()]
 
 

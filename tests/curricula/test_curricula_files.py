@@ -69,7 +69,7 @@ def wrapped(inner: Any) -> Any:
         st.builds(at_step, numbers, inner),
         st.builds(at_reset, inner),
         st.builds(lambda n, first, part: every(n + 1, part, first=first), numbers, numbers, inner),
-        st.builds(lambda a, n, k, p: during(range(a, a + n, k + 1), p), *[numbers] * 3, inner),
+        st.builds(lambda a, n, k, p: during(range(a, a + n + 1, k + 1), p), *[numbers] * 3, inner),
         st.builds(lambda parts: together(*parts), several),
         st.builds(lambda parts, n: in_turn(*parts, each=n + 1), several, numbers),
         st.builds(lambda parts: weighted(*[(1.5, part) for part in parts]), several),
@@ -141,6 +141,15 @@ WRONG = [
         '{"format": "scm_world/curriculum/1", "part": {"kind": "during", "period": 0, "part": {}}}',
         "period",
     ),
+    (
+        '{"format": "scm_world/curriculum/1", "part": {"kind": "resample", "what": "a", "mor": 1}}',
+        "no field of Resample is named 'mor'",
+    ),
+    (
+        '{"format": "scm_world/curriculum/1", "part": {"kind": "in_turn", "of": [{}], "each": 0}}',
+        "whole number",
+    ),
+    ('{"format": "scm_world/curriculum/1", "space": 3}', "space"),
 ]
 
 
@@ -151,8 +160,10 @@ def test_what_is_no_curriculum_is_refused(text: str, says: str, tmp_path: Path) 
         Curriculum.from_json(text)
     file = tmp_path / "wrong.json"
     file.write_text(text)
-    with pytest.raises(UnreadableFile, match=says):
+    with pytest.raises(UnreadableFile, match=says) as refused:
         Curriculum.load(file)
+    assert "pydantic" not in str(refused.value)
+    assert "\n" not in str(refused.value)
 
 
 def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:

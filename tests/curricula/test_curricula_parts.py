@@ -351,3 +351,31 @@ def test_a_curriculum_knows_whether_it_acts_within_episodes() -> None:
     found = Curriculum(together(at_step(4, {}), in_turn(every(3, {}, first=5), {}), physics()))
     assert [step for step in range(12) if found.may_act(step)] == [0, 4, 5, 8, 11]
     assert Curriculum(Resample("*.mass")).part.kind == "resample"
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        (lambda: resample([]), "what cannot be"),
+        (lambda: during(range(5, 5), goals()), "episodes cannot be"),
+        (
+            lambda: as_curriculum({"kind": "during", "first": 5, "stop": 5, "part": {}}),
+            "stop cannot",
+        ),
+    ],
+)
+def test_what_would_never_do_anything_is_refused(part: Any, words: str) -> None:
+    """No name at all, and a window without an episode."""
+    with pytest.raises(UnknownOption, match=words):
+        part()
+
+
+@pytest.mark.parametrize(
+    ("pattern", "words"),
+    [("*.weight", r"there are: .*\*\.mass"), ("*.mas", r"did you mean '\*\.mass'")],
+)
+def test_a_pattern_that_fits_nothing_suggests_patterns(pattern: str, words: str) -> None:
+    """And no variable that happens to have a similar name."""
+    with pytest.raises(UnknownVariable, match=words) as refused:
+        under(resample(pattern))
+    assert "robot_height" not in str(refused.value)

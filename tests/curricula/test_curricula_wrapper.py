@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -28,14 +28,22 @@ from scm_world.curricula import (
     goals,
     interpolate,
     looks,
+    make_vec,
     physics,
     poses,
     resample,
     stages,
     together,
 )
+from scm_world.curricula.base import Part
 from scm_world.env.wrappers import MovingAverageAction
-from scm_world.errors import Infeasible, OutOfSpace, UnknownOption, UnreadableFile
+from scm_world.errors import (
+    FunctionFailure,
+    Infeasible,
+    OutOfSpace,
+    UnknownOption,
+    UnreadableFile,
+)
 from scm_world.models.scene import TOLERANCE
 from scm_world.tasks.trifinger.feasibility import overlaps
 
@@ -309,7 +317,43 @@ def test_what_is_no_state_is_refused() -> None:
     ):
         with pytest.raises(UnreadableFile, match="state"):
             env.resume(wrong)
+    with pytest.raises(UnreadableFile, match=r"'stages' is missing; give what state\(\) returned"):
+        env.resume({"a": 1})
     assert env.state() == before
+
+
+class Wild(Part):
+    """A part of a user's own that fails."""
+
+    kind: Literal["wild"] = "wild"
+
+    def acts(self, situation: Any) -> dict[str, Any]:
+        """Fail."""
+        return {}["mass"]  # type: ignore[no-any-return]
+
+
+def test_errors_of_a_user_are_named() -> None:
+    """Of a function, with its name; of a part, with the place; the cause is the error itself."""
+
+    def fragile(situation: Any) -> dict[str, Any]:
+        return {}["mass"]  # type: ignore[no-any-return]
+
+    for curriculum, words in (
+        (follow(fragile), "fragile' of a curriculum raised KeyError: 'mass'"),
+        (Wild(), "control step 0 of episode 0, raised KeyError: 'mass'"),
+    ):
+        with pytest.raises(FunctionFailure, match=words) as refused:
+            under(curriculum).reset(seed=0)
+        assert isinstance(refused.value.__cause__, KeyError)
+
+
+@pytest.mark.parametrize("given", [3, [("do", {})]])
+def test_options_of_a_reset_are_a_dictionary(given: Any) -> None:
+    """With a curriculum as without, in one environment and in many."""
+    many = make_vec("scm_world/Pushing-v0", 2, goals(), backend="fake")
+    for env in (under(goals()), many):
+        with pytest.raises(UnknownOption, match="a dictionary"):
+            env.reset(options=given)
 
 
 def test_functions_see_the_situation() -> None:

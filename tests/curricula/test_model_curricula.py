@@ -14,6 +14,7 @@ from scm_world.curricula import (
     CurriculumEnv,
     at_step,
     everything,
+    goals,
     make_vec,
     physics,
     resample,
@@ -84,3 +85,10 @@ def test_names_that_are_not_there_are_refused() -> None:
     for what in ("pole.mas", "tool_block.mass", "@joints"):
         with pytest.raises(InterventionError):
             under(resample(what)).reset(seed=0)
+
+
+def test_what_a_task_does_not_have_is_refused() -> None:
+    """Goals of a task without goals do nothing."""
+    env = gymnasium.make("scm_world/Model-v0", model=Balance())
+    with pytest.raises(UnknownOption, match="a task with goals"):
+        CurriculumEnv(env, goals("A"))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from envs import MADE, PUSHING, REACHING, make, roll
 
 from scm_world.backends.renderer import goal_pixels
 from scm_world.env.vector import WIDE, bounds, corners
-from scm_world.errors import UnknownOption
+from scm_world.errors import InterventionError, UnknownOption
 from scm_world.geometry import from_rotation_vector, rotation_matrix
 from scm_world.graph import SCM
 from scm_world.tasks.trifinger.cameras import CAMERAS
@@ -264,3 +265,78 @@ def test_layout_names_what_stands_where() -> None:
     assert layout["time_left_for_task"] == slice(0, 1)
     assert layout["tool_block.orientation"] == slice(35, 39)
     assert layout["goal_block.size"] == slice(46, 49)
+
+
+COUNT = "number_of_obstacles"
+
+
+def test_a_shape_that_changes_between_episodes_is_said_when_it_is_made() -> None:
+    """Where a start or a goal draws which bodies there are; not where it sets them."""
+    with pytest.warns(UserWarning, match=rf"{COUNT}, drawn .* decides which bodies exist.*pad="):
+        env = make(REACHING, start={COUNT: "A"})
+    assert len({env.reset(seed=seed)[0].shape for seed in range(4)}) > 1
+    make(REACHING, start={COUNT: 2})
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"normalize_observations": False},
+        {"observation_mode": "full"},
+        {"context": "observation"},
+        {"start": {COUNT: "A", "sensor_noise": 0.1}},
+        {"conventions": "causal_world"},
+    ],
+)
+def test_padding_keeps_one_shape(options: dict[str, Any]) -> None:
+    """Every observation lies in the space of the largest structure; what is missing is 0."""
+    given = {"start": {COUNT: "A"}, **options, "pad": {COUNT: 5}}
+    env = make(REACHING, **given)
+    largest = make(REACHING, **{**options, "start": {**options.get("start", {}), COUNT: 5}})
+    assert env.observation_space.shape == largest.observation_space.shape
+    assert env.unwrapped.layout == largest.unwrapped.layout
+    counts = set()
+    for seed in range(4):
+        seen, _ = env.reset(seed=seed)
+        assert env.observation_space.contains(seen)
+        there = int(env.unwrapped.world[COUNT])
+        counts.add(there)
+        for obstacle in range(5):
+            pose = seen[env.unwrapped.layout[f"obstacle_{obstacle}.orientation"]]
+            assert pose.any() == (obstacle < there)
+    assert len(counts) > 1
+
+
+def test_a_padded_observation_shows_what_is_there_as_ever() -> None:
+    """The numbers of bodies that exist are those without padding; one too many is refused."""
+    padded, plain = make(REACHING, pad={COUNT: 2}), make(REACHING)
+    for env in (padded, plain):
+        env.reset(seed=3)
+        env.unwrapped.do({COUNT: 1})
+    mine, other = (values(env, env.unwrapped.observe()) for env in (padded, plain))
+    for name, numbers in other.items():
+        np.testing.assert_array_equal(mine[name], numbers)
+    assert not any(mine[name].any() for name in mine.keys() - other.keys())
+    assert mine.keys() - other.keys()
+    now = padded.unwrapped.observe_values(padded.unwrapped.world.values())
+    np.testing.assert_array_equal(now, padded.unwrapped.observe())
+    with pytest.raises(InterventionError, match="too small"):
+        padded.unwrapped.do({COUNT: 3})
+    np.testing.assert_array_equal(padded.unwrapped.observe(), now)
+
+
+@pytest.mark.parametrize("executor", ["loop", "native", "processes"])
+def test_padded_worlds_of_a_batch_have_different_bodies(executor: str) -> None:
+    """They are observed like single environments, in every executor."""
+    options = {"backend": "mujoco", "start": {COUNT: "A"}, "pad": {COUNT: 5}}
+    envs: Any = gymnasium.make_vec(REACHING, num_envs=3, executor=executor, **options)
+    seen, _ = envs.reset(seed=1)
+    rows = [seen, envs.step(np.zeros((3, 9), np.float32))[0]]
+    envs.close()
+    alone = make(REACHING, **options)
+    for index in range(3):
+        np.testing.assert_array_equal(rows[0][index], alone.reset(seed=1 + index)[0])
+        np.testing.assert_array_equal(rows[1][index], alone.step(np.zeros(9, np.float32))[0])
+    assert len({int((row[37::11] != 0.0).sum()) for row in rows[0]}) > 1
+    alone.close()

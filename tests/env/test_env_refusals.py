@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from envs import BACKENDS, make
+from envs import BACKENDS, PUSHING, make
 from gymnasium.envs.registration import EnvSpec
 from model_tasks import CARTPOLE
 
@@ -18,6 +18,7 @@ from scm_world.errors import (
     Infeasible,
     ModelError,
     NotReset,
+    SnapshotMismatch,
     UnknownOption,
     UnknownVariable,
 )
@@ -25,10 +26,13 @@ from scm_world.models.camera import Camera
 from scm_world.tasks.rewards import term
 from scm_world.tasks.trifinger.cameras import OVERVIEW
 
+COMPLEX = np.zeros(9, complex)
+
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
+        ({"pad": {"number_of_obstacles": 1}, "keypoints": True}, "pad"),
         ({"observation_mode": "custom", "observe": "joint_positions"}, "a list of names"),
         ({"include": "gravity"}, "a list of names"),
         ({"image_size": 64}, "image_size cannot be 64"),
@@ -60,6 +64,18 @@ def test_options_that_do_not_go_together(options: dict[str, Any], words: str) ->
         (lambda env: env.depth("6"), UnknownOption, "did you mean '60'"),
         (lambda env: env.do({"gravty": 1}), UnknownVariable, "gravity"),
         (lambda env: sw.MovingAverageAction(env, window=2.5), UnknownOption, "whole number"),
+        (lambda env: sw.MovingAverageAction(env).step(COMPLEX), ActionError, "9 finite numbers"),
+        (lambda env: env.step(COMPLEX), ActionError, "9 finite numbers"),
+        (lambda env: env.step(["0.1"] * 9), ActionError, "9 finite numbers"),
+        (lambda env: env.world.step(COMPLEX), ActionError, "9 finite numbers"),
+        (lambda env: env.as_action([1, 2]), ActionError, r"shape \(9,\), got \(2,\)"),
+        (lambda env: env.toward([1, 2]), ActionError, r"shape \(9,\), got \(2,\)"),
+        (lambda env: env.as_action(COMPLEX), ActionError, "9 finite numbers"),
+        (lambda env: env.restore(3), SnapshotMismatch, "3 is no snapshot"),
+        (lambda env: env.world.restore(3), SnapshotMismatch, "3 is no snapshot"),
+        (lambda env: env.reset(options=3), UnknownOption, "a dictionary, do, episode"),
+        (lambda env: env.observe_values({}), UnknownOption, "joint_positions"),
+        (lambda env: env.observe_values(3), UnknownOption, "joint_positions"),
     ],
 )
 def test_calls_that_make_no_sense(
@@ -83,6 +99,37 @@ def test_there_is_nothing_before_the_first_episode_and_after_the_end(backend: st
                 call()
         env.reset(seed=0)
         env.close()
+
+
+def test_after_the_end_it_says_that_it_was_closed() -> None:
+    """Not that it was never reset; a reset begins another episode."""
+    for env in (make().unwrapped, gymnasium.make_vec(PUSHING, num_envs=2, backend="fake")):
+        with pytest.raises(NotReset, match="no episode yet"):
+            env.step(env.action_space.sample())
+        env.reset(seed=0)
+        env.close()
+        with pytest.raises(NotReset, match="was closed") as refused:
+            env.step(env.action_space.sample())
+        assert refused.value.closed
+
+
+@pytest.mark.parametrize(
+    ("achieved", "desired", "words"),
+    [
+        (np.zeros(9), np.zeros(10), r"achieved goal .*\(\.\.\., 10\)"),
+        (np.zeros(10), np.zeros(3), r"desired goal .*\(\.\.\., 10\)"),
+        (np.zeros((2, 10)), np.zeros((3, 10)), r"\(3, 10\); it can be: \(2, 10\)"),
+        ("much", np.zeros(10), "achieved goal"),
+        (np.full(10, np.nan), np.zeros(10), "finite numbers"),
+        (np.zeros(10, complex), np.zeros(10), "finite numbers"),
+    ],
+)
+def test_goals_of_other_shapes_get_no_reward(achieved: Any, desired: Any, words: str) -> None:
+    """They are refused, with the shape that goals have."""
+    env = make(goal_env=True, task_options={"weights": "sparse"})
+    env.reset(seed=0)
+    with pytest.raises(UnknownOption, match=words):
+        env.unwrapped.compute_reward(achieved, desired, {})
 
 
 @pytest.mark.parametrize(

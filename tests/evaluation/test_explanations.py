@@ -18,6 +18,7 @@ from scm_world.errors import (
     UnknownOption,
 )
 from scm_world.evaluation import Evaluation, Protocol, evaluate, why
+from scm_world.evaluation.explanation import Otherwise
 
 
 def test_a_planted_cause_is_found() -> None:
@@ -119,3 +120,22 @@ def test_why_asks_of_which_agent() -> None:
     several = small({"one": "still", "two": "random"}, "P6", n=1)
     with pytest.raises(UnknownOption, match="one, two"):
         why(several, "P6", 0)
+
+
+@pytest.mark.parametrize(
+    ("did", "would", "words"),
+    [
+        (False, True, "it would have succeeded: 1 (+1)"),
+        (True, True, "it would have succeeded, as it did: 1 (+0)"),
+        (True, False, "it would have failed: 0 (-1)"),
+        (False, False, "it would have failed, as it did: 0 (+0)"),
+        (None, None, "it would have scored: 0 (+0)"),
+    ],
+)
+def test_an_explanation_says_whether_anything_is_different(
+    did: bool | None, would: bool | None, words: str
+) -> None:
+    """An episode that succeeded would have done so too: it is not the variable that decides."""
+    scores = float(bool(did)), float(bool(would))
+    other = Otherwise("block.mass", (0.1,), (0.05,), *scores, did, would)
+    assert str(other) == f"with block.mass = 0.05 instead of 0.1 {words}"

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from evaluation_samples import (
 
 from scm_world.errors import (
     EvaluationError,
+    FunctionFailure,
     ScmWorldError,
     UnknownOption,
     UnreadableFile,
@@ -280,15 +282,14 @@ def test_bad_actions_are_told_with_their_place(how: str, workers: int, tmp_path:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_errors_of_a_policy_stay_what_they_are(workers: int) -> None:
-    """Their class, their text, the traceback into the policy, and the place as a note."""
-    with pytest.raises(ZeroDivisionError, match="by the policy") as caught:
+def test_errors_of_a_policy_are_named_with_their_place(workers: int) -> None:
+    """Their class and text, the place, and the traceback into the policy."""
+    with pytest.raises(EvaluationError, match=r"ZeroDivisionError: .*by the policy") as caught:
         small({"bad": Waning("error", 3)}, "P6", n=4, workers=workers)
-    said = "\n".join(caught.value.__notes__) + "".join(
-        str(entry.path) for entry in caught.traceback
-    )
-    assert "agent bad, engine fake, protocol P6, seed 0, episode" in said
-    assert "evaluation_samples.py" in said
+    assert {**caught.value.place, "agent": "bad", "protocol": "P6"} == caught.value.place
+    assert "control step" in caught.value.place
+    whole = "".join(traceback.format_exception(caught.value))
+    assert "evaluation_samples.py" in whole
 
 
 @pytest.mark.parametrize(
@@ -304,10 +305,11 @@ def test_policies_that_do_not_fit_are_refused_at_once(
 
 
 def test_errors_at_the_first_try_name_the_agent(tmp_path: Path) -> None:
-    """A policy that fails at once: its own error, with the name that it has here."""
-    with pytest.raises(ZeroDivisionError) as caught:
+    """A policy that fails at once: what it raised, with the name that it has here."""
+    with pytest.raises(EvaluationError, match=r"agent mine, run 0: .*ZeroDivisionError") as caught:
         small({"mine": lambda observation: 1 / 0}, out=tmp_path / "out")
-    assert caught.value.__notes__ == ["agent mine, run 0, before the first episode"]
+    assert isinstance(caught.value.__cause__, FunctionFailure)
+    assert isinstance(caught.value.__cause__.__cause__, ZeroDivisionError)
     assert not (tmp_path / "out").exists()
 
 

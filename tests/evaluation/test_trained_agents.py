@@ -6,6 +6,7 @@ import pickle
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from evaluation_samples import SHORT
@@ -171,3 +172,20 @@ def test_another_task_needs_as_many_numbers() -> None:
     assert small({"a": policy(env=RELATIVE)}, task="picking").task == "picking"
     with pytest.raises(EvaluationError, match=r"agent a, run 0: .*observes 56 numbers"):
         small({"a": policy(env=RELATIVE)}, task="stacking2")
+
+
+def test_a_model_of_another_observation_is_refused_with_both_shapes() -> None:
+    """One of Stable-Baselines3 says what it observes; it is asked before it acts."""
+
+    class Model:
+        observation_space = gymnasium.spaces.Box(-1.0, 1.0, (37,), np.float32)
+
+        def predict(self, observation: Any, **_: Any) -> Any:
+            return np.zeros(9), None
+
+    form = {"action_mode": "joint_positions", "max_episode_length": 5}
+    how: dict[str, Any] = {"n": 1, "backend": "fake", "env": form}
+    with pytest.raises(EvaluationError, match=r"shape \(37,\), .* shows \(56,\); give the options"):
+        evaluate(Model(), "P0", task="pushing", **how)
+    found = evaluate(Model(), "P0", task="reaching", **how)
+    assert len(found.columns["steps"]) == 1

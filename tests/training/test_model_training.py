@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import pytest
 
 from scm_world.errors import UnknownOption, UnreadableFile
-from scm_world.evaluation import evaluate
+from scm_world.evaluation import evaluate, protocols_of
 from scm_world.policies import load_policy
+from scm_world.tasks import TASKS, register
+from scm_world.tasks.factories import load_factory
+from scm_world.training.imitation import lesson
 from scm_world.training.recipe import Recipe, recipe
 
 TASK = f"{Path(__file__).parents[1] / 'env' / 'model_tasks.py'}:Balance"
+Balance = load_factory(TASK)
 SMALL = {
     "worlds": 2,
     "steps": 256,
@@ -37,6 +42,53 @@ def test_a_recipe_takes_a_model() -> None:
         recipe("pushin")
     with pytest.raises(UnknownOption, match="no_such_module"):
         recipe("no_such_module:task")
+
+
+def test_a_task_has_one_recipe_however_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Registered, or as a function in a file; none has options of the robot."""
+    monkeypatch.setattr("scm_world.tasks._REGISTERED", {})
+    register(type("Named", (Balance,), {"name": "mybalance"}))
+    for algo in ("ppo", "sac", "td3"):
+        mine, other = recipe("mybalance", algo), recipe(TASK, algo)
+        assert mine == other.model_copy(update={"task": "mybalance"})
+        assert mine.env == {}
+    assert protocols_of("mybalance") == protocols_of(TASK)
+    assert recipe("mybalance").trials.protocols == ("P0", "A", "B")
+    assert lesson("mybalance").env == lesson(TASK).env == {}
+    assert lesson("pushing").env["action_mode"] == "delta_joint_positions"
+    monkeypatch.setattr("scm_world.tasks._REGISTERED", {})
+    register(type("Own", (TASKS["reaching"],), {"name": "myreaching"}))
+    assert recipe("myreaching").env == dict(TASKS["reaching"].training["env"])
+
+
+def test_a_class_says_what_its_recipe_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For all algorithms or for one; what is wrong in it is said."""
+    monkeypatch.setattr("scm_world.tasks._REGISTERED", {})
+    given = {"steps": 4_096, "env": {"stack": "cameras"}, "sac": {"worlds": 4}}
+    register(type("Own", (Balance,), {"name": "own", "training": given}))
+    assert (recipe("own").steps, recipe("own").worlds) == (4_096, 64)
+    assert recipe("own", "sac").worlds == 4
+    assert recipe("own", steps=8_192).steps == 8_192
+    register(type("Wrong", (Balance,), {"name": "wrong", "training": {"step": 1}}))
+    with pytest.raises(UnknownOption, match="step of a recipe"):
+        recipe("wrong")
+
+
+@pytest.mark.slow
+def test_ppo_balances_a_pole_from_its_recipe(tmp_path: Path) -> None:
+    """Less than three minutes of one core: episodes of random actions end after half a second."""
+    pytest.importorskip("stable_baselines3")
+    from scm_world.training.loop import train
+
+    task = f"{Path(__file__).parents[2] / 'examples' / 'cartpole.py'}:CartPole"
+    before, made = time.process_time(), recipe(task)
+    trained = train(made, out=tmp_path / "run", threads=1)
+    assert time.process_time() - before < 180.0
+    found = evaluate({"trained": trained.best, "random": "random"}, "P0,A", task=task, n=20)
+    for protocol in ("P0", "A"):
+        lengths = found.only(agent="trained", protocol=protocol).columns["steps"]
+        assert lengths.mean() > 450.0
+    assert found.only(agent="random").columns["steps"].mean() < 50.0
 
 
 @pytest.mark.parametrize("kind", ["Balance", "Falling"])

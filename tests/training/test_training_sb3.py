@@ -183,6 +183,9 @@ def test_models_that_are_no_policy_file_are_refused(tmp_path: Path) -> None:
         export_sb3(model, other, tmp_path / "mine.safetensors")
     with pytest.raises(UnknownOption, match="environment of a policy"):
         export_sb3(model, gymnasium.make("CartPole-v1"), tmp_path / "mine.safetensors")
+    for wrong in (3, env, model.policy):
+        with pytest.raises(UnknownOption, match="a model of Stable-Baselines3"):
+            export_sb3(wrong, env, tmp_path / "mine.safetensors")
     odd = sb3.PPO("MlpPolicy", env, **small(activation_fn=torch.nn.ELU))
     with pytest.raises(ModelError, match="Tanh or ReLU"):
         export_sb3(odd, env, tmp_path / "mine.safetensors")

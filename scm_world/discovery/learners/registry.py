@@ -15,7 +15,7 @@ import numpy as np
 from scm_world._arguments import typed, whole_number
 from scm_world.discovery.data.dataset import Dataset, Level, block
 from scm_world.discovery.learners.found import EstimatedGraph
-from scm_world.errors import MissingExtra, ModelError, UnknownOption
+from scm_world.errors import MissingExtra, ModelError, UnknownOption, blamed
 from scm_world.graph.ancestral import CIRCLE
 from scm_world.tasks.factories import load_named
 from scm_world.variables import Noise
@@ -193,7 +193,8 @@ def learn(
     if "blocks" in known:  # groups that are distinguished are tested separately
         settings = {"blocks": level == "variable", **settings}
     started = time.perf_counter()
-    result = chosen.learn(table, seed=seed, **settings)
+    with blamed(f"the learner {chosen.name!r}"):
+        result = chosen.learn(table, seed=seed, **settings)
     seconds = time.perf_counter() - started
     if not isinstance(result, EstimatedGraph) and not isinstance(table, Dataset):
         raise ModelError([f"the learner {chosen.name!r} has to give an EstimatedGraph"])

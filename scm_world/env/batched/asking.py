@@ -13,7 +13,6 @@ from scm_world._types import Floats
 from scm_world.env.arguments import doubles, finite
 from scm_world.errors import ActionError, UnknownOption
 
-PER_WORLD = ("do", "episode")
 MASK = "reset_mask"
 
 
@@ -59,29 +58,24 @@ def masked(mask: Any, size: int) -> NDArray[np.bool_]:
     return np.array(mask)
 
 
-def options_of(
-    options: Mapping[str, Any] | None, which: NDArray[np.bool_]
-) -> list[dict[str, Any] | None]:
+def options_of(given: Mapping[str, Any], which: NDArray[np.bool_]) -> list[dict[str, Any] | None]:
     """Give each environment that is reset its options.
 
     Args:
-        options: ``"do"`` and ``"episode"``, each one for all, a list, or a mapping by index.
+        given: ``"do"`` and ``"episode"``, each one for all, a list, or a mapping by index.
         which: The environments that are reset, shape (n,).
 
     Raises:
-        UnknownOption: There is no such option, or a wrong number of them.
+        UnknownOption: There is a wrong number of them.
 
     Example:
         >>> options_of({"episode": 2, "do": {1: {"floor_friction": 0.4}}}, np.ones(2, bool))
         [{'episode': 2}, {'episode': 2, 'do': {'floor_friction': 0.4}}]
     """
-    given = {name: value for name, value in (options or {}).items() if name != MASK}
     if not given:
         return [None] * which.size
     found: list[dict[str, Any] | None] = [{} for _ in range(which.size)]
     for name, value in given.items():
-        if name not in PER_WORLD:
-            raise UnknownOption("reset option", name, (*PER_WORLD, MASK))
         wanted = spread(name, value, which.size)
         if _is_by_index(value) and not which[list(wanted)].all():
             raise UnknownOption(f"environments for {name}", [*wanted], ("those that are reset",))

@@ -14,14 +14,14 @@ from scm_world._types import Floats, Integers
 from scm_world.env.batched.buffers import FLAGS, GOALS, TERMS, Buffers
 from scm_world.env.batched.loop import LoopExecutor, check_actions, located
 from scm_world.env.delta import JOINTS
-from scm_world.env.environment import REWARD, TERMINATED, ScmWorldEnv
+from scm_world.env.environment import REWARD, ScmWorldEnv
 from scm_world.env.observer import DictObserver
 from scm_world.env.vector import KEYPOINTS, Vector
-from scm_world.errors import EngineFailure, ScmWorldError
-from scm_world.tasks.rewards import FRACTION, SUCCESS, one_number
+from scm_world.errors import EngineFailure, FunctionFailure, ScmWorldError
+from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED, one_number
 from scm_world.variables.reserved import CONTROL_INDEX, SENSOR_NOISE
 from scm_world.world.batch import Batch, StateTable
-from scm_world.world.mechanisms import FunctionFailure, places
+from scm_world.world.mechanisms import places
 
 
 @final
@@ -72,7 +72,7 @@ class NativeExecutor(LoopExecutor):
                 with suppress(ScmWorldError):
                     self._show(row)
             if isinstance(error, FunctionFailure):
-                raise located(error, error.row) from error.__cause__
+                raise located(error, error.row or 0) from error.__cause__
             raise
         self._are_set[rows] = False
         for table, members in self._batch.tables(rows):

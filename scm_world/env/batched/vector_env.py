@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from scm_world._arguments import one_of, whole_number
-from scm_world.env.arguments import limited, refuse_unknown
+from scm_world.env.arguments import RESETS, limited, refuse_unknown, reset_options
 from scm_world.env.batched.asking import (
     MASK,
     actions_of,
@@ -142,8 +142,9 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
             UnknownOption: Another key, or something of the wrong length.
             InterventionError: The intervention was refused.
         """
-        which = masked((options or {}).get(MASK), self.num_envs)
-        wishes = options_of(options, which)
+        given = reset_options(options, (*RESETS, MASK))
+        which = masked(given.pop(MASK, None), self.num_envs)
+        wishes = options_of(given, which)
         self.executor.reset(which, seeds_of(seed, self.num_envs), wishes)
         self._begun |= which
         self._ended &= ~which
@@ -297,8 +298,10 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
                 environment that goes there.
 
         Raises:
-            SnapshotMismatch: It is one of another task or backend, or of another number.
+            SnapshotMismatch: It is none, or one of another task or backend, or of another number.
         """
+        if not isinstance(snapshot, VectorSnapshot | Mapping):
+            raise SnapshotMismatch(f"{snapshot!r} is no snapshot; give what snapshot() returned")
         if isinstance(snapshot, VectorSnapshot):
             if len(snapshot.worlds) != self.num_envs:
                 there, here = len(snapshot.worlds), self.num_envs

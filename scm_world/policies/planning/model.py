@@ -12,7 +12,7 @@ import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
-from scm_world.errors import ActionError, ModelError, UnknownOption
+from scm_world.errors import ActionError, ModelError, UnknownOption, blamed
 from scm_world.tasks import Task
 from scm_world.work.processes import cores
 from scm_world.world import Simulation, WorldSnapshot
@@ -179,10 +179,8 @@ class Score:
         given = [values[name] for name in self.names]
         if self.sums and shape is not None:
             given = [value.reshape(*shape, -1).sum(axis=-1) for value in given]
-        try:
+        with blamed("the score of a plan"):
             found = np.asarray(self.function(*given), dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ModelError([f"the score of a plan cannot be computed: {error}"]) from error
         if not np.isfinite(found).all():
             names = ", ".join(self.names)
             raise ModelError([f"the score of a plan is not finite; it is a function of {names}"])

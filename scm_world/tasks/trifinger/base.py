@@ -18,6 +18,7 @@ from scm_world.tasks.composition import Clock, Composition, Entity
 from scm_world.tasks.rewards import (
     FRACTION,
     SUCCESS,
+    TERMINATED,
     Common,
     declared,
     further_terms,
@@ -100,6 +101,8 @@ class TriFingerTask(Task):
             one another as it likes, under the conventions of the predecessor.
         start: Where the robot begins, shape (9,) [rad].
         success: What counts in place of the usual goal, if anything; see ``Common``.
+        terminated: What ends an episode before its time, if anything; see ``Common``.
+        training: See ``Task``.
     """
 
     action_modes = tuple(ACTIONS)
@@ -120,6 +123,15 @@ class TriFingerTask(Task):
     unchecked: ClassVar[tuple[str, ...]] = ()
     rest: ClassVar[tuple[float, ...]] = hardware.REST
     success: Any = None
+    terminated: Any = None
+    training: ClassVar[Mapping[str, Any]] = {
+        "env": {
+            "action_mode": "delta_joint_positions",
+            "delta_scale": 0.1,
+            "delta_origin": "measured",
+            "frame_skip": 10,
+        }
+    }
 
     def __init__(self, **common: Unpack[Common]) -> None:
         unknown = sorted(common.keys() - Common.__annotations__.keys())
@@ -127,8 +139,9 @@ class TriFingerTask(Task):
             raise UnknownOption(f"option of {self.name}", unknown[0], self.arguments())
         self.terms = further_terms(common.get("terms", ()), self.default_weights, self.ready_terms)
         self.weights = resolve(self.default_weights, self.paper_weights, common, self.terms)
-        if common.get("success") is not None:
-            self.success = common["success"]
+        for option in (SUCCESS, TERMINATED):
+            if common.get(option) is not None:
+                setattr(self, option, common[option])  # type: ignore[literal-required]
         given = common.get("joint_positions")
         joints = numbers_of(self.rest if given is None else given)
         if joints is None or joints.shape != (hardware.N_JOINTS,):
@@ -193,7 +206,8 @@ class TriFingerTask(Task):
             if self.success is not None:
                 own = {FRACTION: declared(FRACTION, self.success), SUCCESS: succeeded()}
                 readouts = [own.get(one.name, one) for one in readouts]
-            variables: list[Variable] = [*made.variables(), *readouts]
+            ends = () if self.terminated is None else (declared(TERMINATED, self.terminated),)
+            variables: list[Variable] = [*made.variables(), *readouts, *ends]
             if not self.absent:
                 return made, variables
             variables = _computable(variables)

@@ -24,7 +24,7 @@ from gymnasium.vector import AutoresetMode
 
 from scm_world.env.batched import ScmWorldVectorEnv
 from scm_world.env.batched.vector_env import EXECUTORS
-from scm_world.errors import ActionError, NotReset, UnknownOption
+from scm_world.errors import ActionError, NotReset, SnapshotMismatch, UnknownOption
 
 HERE = [executor for executor in EXECUTORS if executor != "processes"]
 MODES = [mode.value for mode in AutoresetMode]
@@ -189,6 +189,7 @@ def test_what_cannot_be_reset_is_refused() -> None:
         ({"options": {"reset_mask": [True] * SIZE}}, "reset_mask"),
         ({"options": {"reset_mask": mask[:2]}}, "reset_mask"),
         ({"options": {"goal": 1}}, "reset option"),
+        ({"options": 3}, "a dictionary"),
         ({"options": {"do": [None]}}, "length 4"),
         ({"options": {"do": {9: {}}}}, "from 0 to 3"),
         ({"options": {"do": {1: {}}, "reset_mask": mask | [1, 0, 0, 0] > 0}}, "that are reset"),
@@ -205,7 +206,7 @@ def test_what_cannot_be_stepped_is_refused() -> None:
         envs.step(actions(1)[0])
     for one in (envs, twin):
         one.reset(seed=0)
-    for wrong in (np.zeros(9), np.zeros((SIZE, 8)), "push"):
+    for wrong in (np.zeros(9), np.zeros((SIZE, 8)), "push", np.zeros((SIZE, 9), complex)):
         with pytest.raises(ActionError):
             envs.step(wrong)
     bad = actions(1)[0]
@@ -230,3 +231,14 @@ def test_what_is_done_takes_no_step_where_nothing_resets_it() -> None:
         envs.step(actions(1)[0])
     envs.reset(options={"reset_mask": truncated})
     envs.step(actions(1)[0])
+
+
+def test_what_is_no_snapshot_is_refused() -> None:
+    """Of many, or of one of them; all are as they were."""
+    envs, twin = make(), make()
+    for one in (envs, twin):
+        one.reset(seed=0)
+    for wrong in (3, [1, 2], {1: 3}):
+        with pytest.raises(SnapshotMismatch, match="no snapshot"):
+            envs.restore(wrong)
+    check_alike(envs, twin, 2)
