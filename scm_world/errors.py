@@ -42,8 +42,8 @@ from __future__ import annotations
 import difflib
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Self
 
 __all__ = [
     "ActionError",
@@ -175,6 +175,11 @@ class FunctionFailure(ModelError):
         self.problems = (problem,)
         Exception.__init__(self, problem)  # it is one sentence, and not about a declaration
 
+    @classmethod
+    def of(cls, name: str, error: Exception) -> Self:
+        """Return the one that names who raised an error."""
+        return cls(f"{name} raised {in_one_line(error)}")
+
 
 class blamed:  # noqa: N801 # used like the functions of ``contextlib``
     """Name a function, module or policy of a user in the errors that it raises.
@@ -182,7 +187,7 @@ class blamed:  # noqa: N801 # used like the functions of ``contextlib``
     Errors of this package pass through as they are.
 
     Args:
-        name: Begins the message.
+        name: Begins the message; or a function that gives it, where this is done often.
 
     Raises:
         FunctionFailure: Another error was raised, which is its cause.
@@ -194,7 +199,7 @@ class blamed:  # noqa: N801 # used like the functions of ``contextlib``
         scm_world.errors.FunctionFailure: the policy 'mine' raised KeyError: 'speed'
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str | Callable[[], str]) -> None:
         self.name = name
 
     def __enter__(self) -> None:
@@ -203,7 +208,8 @@ class blamed:  # noqa: N801 # used like the functions of ``contextlib``
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         """Name it in an error."""
         if isinstance(error, Exception) and not isinstance(error, ScmWorldError):
-            raise FunctionFailure(f"{self.name} raised {in_one_line(error)}") from error
+            name = self.name() if callable(self.name) else self.name
+            raise FunctionFailure.of(name, error) from error
 
 
 class ImpossibleObservation(ModelError):

@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.errors import FunctionFailure, ModelError, WrongShape, WrongType, blamed
+from scm_world.errors import FunctionFailure, ModelError, ScmWorldError, WrongShape, WrongType
 from scm_world.variables import (
     SOFT,
     Categories,
@@ -291,8 +291,7 @@ class Evaluator:
                 return self._derive(variable, values, previous, key)
             case Measured() if variable.mechanism is not None:
                 arguments = self._arguments(variable.all_parents, values, previous)
-                with blamed(f"the function of {variable.name!r}"):
-                    return np.asarray(self._bound(variable)(*arguments))
+                return self._called(variable, arguments, {})
             case _:
                 if variable.name not in values:
                     raise ModelError(
@@ -305,9 +304,7 @@ class Evaluator:
     ) -> Value:
         arguments = self._arguments(variable.all_parents, values, previous)
         given = {} if variable.noise is None else noise_of(variable, variable, key, values)
-        function = self._bound(variable)
-        with blamed(f"the function of {variable.name!r}"):
-            value = np.asarray(function(*arguments, **given))
+        value = self._called(variable, arguments, given)
         shape = value.shape[value.ndim - len(variable.shape) :]
         if value.dtype.kind not in "biuf" or shape != variable.shape:
             wanted = f"numbers of shape {variable.shape}" if variable.shape else "a number"
@@ -316,6 +313,20 @@ class Evaluator:
             )
         _check_kind(variable, value)
         return value
+
+    def _called(self, variable: Any, arguments: list[Value], given: Mapping[str, Any]) -> Value:
+        """Call the function of a variable.
+
+        Raises:
+            FunctionFailure: It raised an error.
+        """
+        function = self._bound(variable)
+        try:
+            return np.asarray(function(*arguments, **given))
+        except ScmWorldError:
+            raise
+        except Exception as error:
+            raise FunctionFailure.of(f"the function of {variable.name!r}", error) from error
 
     def _arguments(
         self, parents: Iterable[Parent], values: Values, previous: Values

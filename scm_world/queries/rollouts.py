@@ -82,7 +82,7 @@ def _chosen(policy: Policy, world: System) -> Floats:
         FunctionFailure: It raised an error.
     """
     before = world.version, world.index
-    with blamed(_who(policy, world)):
+    with blamed(lambda: _who(policy, world)):
         given = policy(world)
     if (world.version, world.index) != before:
         raise ActionError("a policy acts through its action only; put the rest into a plan", given)
@@ -353,7 +353,7 @@ class RunningTogether:
     def _look_ahead(self, row: int, step: int) -> None:
         """Ask a policy for all actions that are left."""
         one = self._rows[row]
-        with blamed(_who(one.policy, one.world)):
+        with blamed(lambda: _who(one.policy, one.world)):
             given = one.policy.ahead(one.world, one.world.index, self._steps - step)
         for command, action in zip(self._commands[step:, row], given, strict=True):
             command[:] = one.world.compiled.clipped(action)
