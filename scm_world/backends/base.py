@@ -150,27 +150,6 @@ class Backend(ABC):
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step."""
 
-    @property
-    def stages(self) -> int:
-        """How often forces are evaluated in a physics step: 1, or 4 of Runge-Kutta."""
-        return 1
-
-    def push(self, body: str, force: Floats, torque: Floats) -> None:
-        """Act on a body during the next call of ``step``, which must have one physics step.
-
-        For measurements: no snapshot has it, and what follows cannot be replayed. Restore a
-        snapshot from before it afterwards.
-
-        Args:
-            body: Its name in the scene.
-            force: On its center of mass, shape (3,) [N].
-            torque: Shape (3,) [N m].
-
-        Raises:
-            UnknownOption: There is no such body, or the backend has none.
-        """
-        raise UnknownOption("body that can be pushed", body, ())
-
     @abstractmethod
     def snapshot(self) -> EngineSnapshot:
         """Save everything. Restoring it continues bit for bit, in this process or another."""
@@ -349,10 +328,6 @@ class BackendWrapper(Backend, ABC):
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step."""
         return self.engine.contacts()
-
-    def push(self, body: str, force: Floats, torque: Floats) -> None:
-        """Act on a body during the next physics step."""
-        self.engine.push(body, force, torque)
 
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""

@@ -79,7 +79,8 @@ def discover(
 
     Without --learner the one-step graph of a system is recovered by paired experiments. With it,
     and for families, learners run over budgets and seeds, and a table, a picture and a report are
-    written. After Ctrl-C (exit code 130) the same command resumes.
+    written. Exits 1 if an effect is found that no edge declares. After Ctrl-C (exit code 130) the
+    same command resumes.
     Example: scm-world discover er2:20 --learner do_order,gies
 
     Args:
@@ -87,7 +88,7 @@ def discover(
             size (er2:20, servo:10; er2:20:3 hides three more), the JSON file of an SCM, or several
             with commas between them.
         probes: Number of states to experiment in.
-        strict: Exit 1 if the SHD is not 0.
+        strict: Exit 1 unless the declared graph is recovered, edge by edge.
         learner: Learners to benchmark, with commas; see 'scm-world list'. A custom one is
             module:function or file.py:function.
         baselines: Trivial ones beside learners from data.
@@ -123,6 +124,7 @@ def discover(
 
     from scm_world.discovery import discover as discovered
     from scm_world.discovery.plots import draw_graphs
+    from scm_world.queries.verification import failed
 
     elsewhere = {"--executor": executor, "--workers": workers, "--address": address}
     for name, value in elsewhere.items():
@@ -156,7 +158,7 @@ def discover(
         draw_graphs(report, draft / "graphs.png")
     if report.probes < report.planned:
         raise typer.Exit(console.INTERRUPTED)
-    raise typer.Exit(int(strict and report.score.shd > 0))
+    raise typer.Exit(int(failed([report.outcome], strict=strict)))
 
 
 def _edge_table(report: DiscoveryReport, names: Sequence[str]) -> None:
@@ -209,6 +211,8 @@ def _numbers(report: DiscoveryReport) -> Iterator[tuple[str, str, bool | None]]:
     score, complete = report.score, report.probes == report.planned
     version = report.versions.get(report.backend, "")
     states = f"{report.probes}" if complete else f"{report.probes} of {report.planned}: interrupted"
+    good = {"confirmed": True, "refuted": False}
+    yield "outcome", report.outcome, good.get(report.outcome)
     yield from counted(report.provenance)
     yield "backend", f"{report.backend} {version}, preset {report.preset}", None
     if report.arguments:
@@ -327,23 +331,27 @@ def verify(
     seed: options.Seed = 0,
     preset: options.Preset = None,
     out: options.Out = None,
+    strict: bool = False,
     option: options.Option = None,
     resolution: options.Resolution = None,
 ) -> None:
     """Check the declared causal graph of a system against its physics.
 
-    Exits 1 unless every declared edge is seen and nothing else. 'all' takes small variants of
-    tasks with many blocks. Ctrl-C gives the result so far (exit code 130).
+    It is confirmed (every declared edge was seen, and nothing else), not refuted (some edges were
+    never seen, which is no proof of them) or refuted. Exits 1 if it is refuted. 'all' takes small
+    variants of tasks with many blocks. Ctrl-C gives the result so far (exit code 130).
     Example: scm-world verify pushing --both
 
     Args:
         both: On MuJoCo and Bullet; compare.
         probes: Largest number of probe states.
         held_out: Further ones, in which effects without an edge are looked for.
+        strict: Exit 1 unless the graph is confirmed.
     """
     from scm_world.discovery.plots import draw_verification
     from scm_world.queries import SCM
     from scm_world.queries.agreement import Agreement
+    from scm_world.queries.verification import failed
     from scm_world.queries.verify import LEAST, verify_engines
     from scm_world.queries.verify import verify as verified
     from scm_world.tasks import TASKS
@@ -389,12 +397,12 @@ def verify(
         reports = one.verifications if isinstance(one, Agreement) else (one,)
         reports = tuple(report.model_copy(update=about) for report in reports)
         for report in reports:
-            console.say(f"Verification of {report.task} on {report.backend}")
+            console.say(report.title)
             console.facts(report.rows())
             console.say("")
         if isinstance(one, Agreement):
             one = one.model_copy(update={"verifications": reports})
-            console.say(f"Agreement of {' and '.join(one.backends)} on {one.task}")
+            console.say(one.title)
             console.facts(one.rows())
         else:
             one = reports[0]
@@ -407,19 +415,21 @@ def verify(
             break
     if len(found) > 1:
         rows: list[tuple[object, ...]] = []
-        good = {True: Text("yes", "green"), False: Text("no", "bold red")}
+        colors = {"confirmed": "green", "not refuted": "yellow", "refuted": "bold red"}
         for one, reports in found:
             for report in reports:
                 seen = f"{len(report.fired)} of {len(report.declared)}"
                 cells = (report.probes, seen, len(report.undeclared), f"{report.floor:g}")
                 time = f"{report.seconds:.1f}"
-                rows.append((report.task, report.backend, *cells, time, good[report.passed]))
+                said = Text(report.outcome, colors[report.outcome])
+                rows.append((report.task, report.backend, *cells, time, said))
             if isinstance(one, Agreement):
                 share = f"same sign: {100 * one.share:.1f} %"
                 time = f"{one.seconds:.1f}"
-                rows.append((one.task, "both", "", share, "", "", time, good[one.passed]))
+                said = Text(one.outcome, colors[one.outcome])
+                rows.append((one.task, "both", "", share, "", "", time, said))
         heads = ("task", "backend", "probe states", "seen", "undeclared", "noise floor", "seconds")
-        console.table((*heads, "passed"), rows, title="All verifications")
+        console.table((*heads, "outcome"), rows, title="All verifications")
     if interrupted:
         raise typer.Exit(console.INTERRUPTED)
-    raise typer.Exit(int(not all(one.passed for one, _ in found)))
+    raise typer.Exit(int(failed([one.outcome for one, _ in found], strict=strict)))

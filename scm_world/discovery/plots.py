@@ -160,6 +160,7 @@ def _key(marker: str, label: str, color: str, *, hollow: bool = False, size: flo
 
 SHADES = ("#1f6fb4", "#f28e2b", "#4c9a6a", "#9a6fb0")
 GOOD, BAD = "#4c9a6a", "#d62728"
+OUTCOMES = {"confirmed": GOOD, "not refuted": SHADES[1], "refuted": BAD}
 LISTED = 26  # lines of names that fit
 
 
@@ -173,10 +174,9 @@ def draw_verification(found: Verification | Agreement, path: Location | str) -> 
     both = isinstance(found, Agreement)
     reports = found.verifications if isinstance(found, Agreement) else (found,)
     figure = blank()
-    color, verdict = (GOOD, "passed") if found.passed else (BAD, "not passed")
     title: Any = {"fontsize": 18, "weight": "bold"}
     figure.text(0.02, 0.945, f"Verification of {reports[0].task}", color=INK, **title)
-    figure.text(0.98, 0.945, verdict, ha="right", color=color, **title)
+    figure.text(0.98, 0.945, found.outcome, ha="right", color=OUTCOMES[found.outcome], **title)
     words = "     ".join(
         f"{one.backend} {one.versions.get(one.backend, '')}: floor {one.floor:g}, "
         f"{len(one.undeclared)} undeclared, {len(one.never_fired)} never seen, "

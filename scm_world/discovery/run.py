@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, final
@@ -21,11 +22,11 @@ from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
-from scm_world.queries.verification import by_provenance, counted
+from scm_world.queries.verification import Outcome, by_provenance, counted, outcome
 from scm_world.world import Simulation
 
 REPORT = "scm_world/discovery/1"
-CHECKPOINT = "scm_world/discovery-progress/2"
+CHECKPOINT = "scm_world/discovery-progress/3"
 
 
 @final
@@ -79,12 +80,19 @@ class DiscoveryReport:
     provenance: dict[str, tuple[int, int, int]] = field(default_factory=dict)
     arguments: tuple[str, ...] = ()
 
+    @property
+    def outcome(self) -> Outcome:
+        """``"refuted"`` if an effect without an edge was found, ``"confirmed"`` if the graph is."""
+        missed = bool(self.score.missed) or self.probes < self.planned
+        return outcome(wrong=bool(self.score.undeclared), unseen=missed)
+
     def as_dict(self) -> dict[str, Any]:
         """Return the report as plain data."""
         return {
             "format": REPORT,
             "task": self.task,
             "arguments": list(self.arguments),
+            "outcome": self.outcome,
             "backend": self.backend,
             "preset": self.preset,
             "seed": self.seed,
@@ -120,9 +128,10 @@ class DiscoveryReport:
         s = self.score
         counts = "; ".join(f"{name} {text}" for name, text, _ in counted(self.provenance))
         return (
-            f"{self.task} on {self.backend}: {counts}; precision {s.precision:.3f}, "
-            f"recall {s.recall:.3f}, F1 {s.f1:.3f}, SHD over all edges {s.shd}; {self.probes} "
-            f"probe states, {self.rollouts} rollouts, floor {self.floor:g}"
+            f"{self.task} on {self.backend}: {self.outcome}; {counts}; "
+            f"precision {s.precision:.3f}, recall {s.recall:.3f}, F1 {s.f1:.3f}, "
+            f"SHD over all edges {s.shd}; {self.probes} probe states, {self.rollouts} rollouts, "
+            f"floor {self.floor:g}"
         )
 
 
@@ -141,7 +150,7 @@ def discover(
 
     The threshold follows from the measured floor: the largest difference that is left after
     something was done and undone. It may be interrupted (Ctrl-C); the report then covers the
-    probe states that were finished.
+    probe states that were finished. A world that was given is afterwards as it was.
 
     Args:
         system: A world, the name of a task, or a causal model without physics.
@@ -174,7 +183,8 @@ def discover(
         return _report(system, series, seed, ("model", "none", "none", ""), started)
     world = Simulation(system, **options) if isinstance(system, str) else system
     try:
-        series = _experiments(world, probes, seed, progress, found, checkpoint)
+        with world.unchanged():
+            series = _experiments(world, probes, seed, progress, found, checkpoint)
         backend = world.backend
         about = (world.task.name, backend.name, world.options.preset)
         engine = f"{backend.name} {backend.version}"
@@ -252,7 +262,7 @@ def _report(
         probes=series.done,
         planned=series.planned,
         rollouts=effects.rollouts,
-        bound=series.done * (len(effects.undone) or len(model)),
+        bound=series.done * sum(effects.changed[name] > 0 for name in series.targets),
         floor=effects.floor,
         threshold=effects.threshold,
         inert=max(inert, default=0.0),
@@ -298,7 +308,7 @@ class Checkpoint:
                 states={(str(c), str(e), int(lag)): int(n) for c, e, lag, n in data["states"]},
                 floor=float(data["floor"]),
                 exact=paired.effects.exact,
-                undone=set(map(str, data["undone"])),
+                changed=Counter({str(name): int(n) for name, n in data["changed"].items()}),
                 rollouts=int(data["rollouts"]),
                 refused={str(name): int(n) for name, n in data["refused"].items()},
             )
@@ -319,7 +329,7 @@ class Checkpoint:
             "largest": [[*key, size] for key, size in effects.largest.items()],
             "states": [[*key, count] for key, count in effects.states.items()],
             "floor": effects.floor,
-            "undone": sorted(effects.undone),
+            "changed": effects.changed,
             "rollouts": effects.rollouts,
             "refused": effects.refused,
             "memory": paired.memory(),

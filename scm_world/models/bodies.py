@@ -105,7 +105,6 @@ class Geom:
         vertices: Corners of the convex hull of a mesh [m].
         friction: Sliding coefficient.
         slippery: Whether it asks for contacts without friction.
-        special: Whether its contacts have a softness, margin or priority of their own.
     """
 
     name: str
@@ -117,7 +116,6 @@ class Geom:
     vertices: tuple[Vector, ...] = ()
     friction: float = 1.0
     slippery: bool = False
-    special: bool = False
 
 
 @final
@@ -216,7 +214,6 @@ class ModelBodies:
         places: Where the parameters of the model stand in here; those that are missing have no
             meaning to this description.
         missing: What acts in the model and has no words here, one sentence each.
-        product: Whether a contact has the product of two frictions, instead of the larger one.
     """
 
     bodies: tuple[Body, ...]
@@ -229,7 +226,6 @@ class ModelBodies:
     timestep: float
     places: Mapping[ParameterKey, Place] = field(default_factory=dict, repr=False)
     missing: tuple[str, ...] = ()
-    product: bool = False
 
     def with_parameters(self, values: Mapping[ParameterKey, Any]) -> ModelBodies:
         """Give the same bodies with other values of some parameters, which have a place here.

@@ -14,13 +14,10 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from scm_world._types import Integers
 from scm_world.errors import ModelError
 from scm_world.models.bodies import ModelBodies
 from scm_world.models.scene import (
-    ControlMode,
     ParameterKey,
-    Parameters,
     Scene,
     State,
     StateLayout,
@@ -190,19 +187,6 @@ class Model:
         if self.describe is None:
             raise ModelError([f"{self.name!r} does not describe its bodies; read it from a file"])
         return self.describe(self)
-
-    def described(
-        self, parameters: Parameters, mode: ControlMode, backend: str
-    ) -> tuple[ModelBodies, Integers]:
-        """Describe the bodies with these parameters, alike for all backends.
-
-        Returns:
-            The description, and where each of its coordinates stands in the state vector.
-        """
-        plain = {
-            k: np.asarray(parameters[k]).tolist() for k in self.bodies.places if k in parameters
-        }
-        return self.bodies.with_parameters(plain), np.arange(self.layout.size)
 
     @cached_property
     def body_names(self) -> tuple[str, ...]:

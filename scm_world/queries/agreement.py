@@ -19,12 +19,14 @@ from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.progress import Progress, part
 from scm_world.queries.verification import (
+    Outcome,
     Report,
     Row,
     Verification,
     arrow,
     listed,
     named,
+    outcome,
     written,
 )
 from scm_world.tasks import Task
@@ -286,11 +288,20 @@ class Agreement(Report):
         return tuple((e.cause, e.effect, e.lag) for e in self.edges() if e.same is False)
 
     @property
-    def passed(self) -> bool:
-        """Whether both verifications passed and signs agree: ``SAME`` of them, ``SURE`` surely."""
-        verified = all(found.passed for found in self.verifications)
-        agree = self.share >= SAME and self.surely >= SURE
-        return verified and agree and not self.interrupted
+    def outcome(self) -> Outcome:
+        """The verdict on both backends.
+
+        ``"refuted"`` if one verification is, or fewer than ``SAME`` of the signs agree;
+        ``"confirmed"`` if both verifications are and ``SURE`` of the signs agree surely.
+        """
+        both = [found.outcome for found in self.verifications]
+        unseen = "not refuted" in both or self.surely < SURE or self.interrupted
+        return outcome(wrong="refuted" in both or self.share < SAME, unseen=unseen)
+
+    @property
+    def title(self) -> str:
+        """The first line of the report."""
+        return f"Agreement of {' and '.join(self.backends)} on {self.task}: {self.outcome}"
 
     def rows(self) -> tuple[Row, ...]:
         """List the numbers, what they mean, and whether they are good."""
@@ -317,12 +328,10 @@ class Agreement(Report):
             (f"effects on {second} by those on {first}, causes", listed(sizes), None),
             *([("interrupted", "yes", False)] if self.interrupted else []),
             ("seconds", f"{self.seconds:.1f}", None),
-            ("passed", "yes" if self.passed else "no", self.passed),
         )
 
     def __str__(self) -> str:
-        title = f"Agreement of {' and '.join(self.backends)} on {self.task}"
-        return "\n\n".join([*map(str, self.verifications), written(title, self.rows())])
+        return "\n\n".join([*map(str, self.verifications), written(self.title, self.rows())])
 
 
 def _row(share: Share, good: bool) -> Row:

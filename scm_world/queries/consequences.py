@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
@@ -98,7 +99,7 @@ def consequences(
 ) -> Consequences:
     """Intervene at the start of an episode, and compare it with the same one without that.
 
-    The idle action is taken in both; noise is the same.
+    The idle action is taken in both; noise is the same. A world is afterwards as it was.
 
     Args:
         system: A world, or equations.
@@ -118,9 +119,16 @@ def consequences(
     """
     if space not in (None, *SPACES):
         raise UnknownOption("space", space, SPACES)
-    is_world = isinstance(system, World)
     steps = steps if system.graph.is_temporal else 0
-    stepped: Any = asked(system)[1]
+    with system.unchanged() if isinstance(system, World) else nullcontext():
+        return _compared(asked(system)[1], request, steps, seed, space)
+
+
+def _compared(
+    stepped: Any, request: Mapping[str, Any], steps: int, seed: int, space: SpaceName | None
+) -> Consequences:
+    """Run both episodes in one system, from one snapshot."""
+    is_world = isinstance(stepped, World)
     stepped.reset(seed=seed)
     start, before = stepped.snapshot(), stepped.values()
     scenes = [stepped.scene()] if is_world else []

@@ -14,6 +14,8 @@ from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.variables import Measured
 
 SHOWN = 10  # edges that are written out in a table
+NAMED = 3  # variables that are named in a headline
+Outcome = Literal["confirmed", "not refuted", "refuted"]
 Row = tuple[str, str, bool | None]
 """What a number means, the number, and whether it is good; None where it is neither."""
 
@@ -122,29 +124,30 @@ class Unstable(Report):
 
 
 @final
-class Law(Report):
-    """What an engine makes of a declared value; see ``queries.laws``.
+class Unseen(Report):
+    """A declared edge that moved its child in no probe state.
 
     Attributes:
-        variable: Its name.
-        law: Which one.
-        declared: Values of its components that act in what was measured.
-        found: The values that would explain what was measured.
-        error: Largest relative difference of both.
-        passed: Whether that is within the tolerance; None where there is no law.
-        reason: Why it failed, or why there is none.
+        cause: The variable that was changed, or could not be.
+        effect: The variable that did not respond.
+        lag: 0 or 1.
+        states: In how many probe states the cause was changed.
+        reason: Why nothing was seen, as far as the experiments tell.
     """
 
-    variable: str
-    law: str
-    declared: tuple[float, ...] = ()
-    found: tuple[float, ...] = ()
-    error: float | None = None
-    passed: bool | None = None
-    reason: str = ""
+    cause: str
+    effect: str
+    lag: int
+    states: int
+    reason: str
+
+    @property
+    def key(self) -> EdgeKey:
+        """Cause, effect and lag."""
+        return self.cause, self.effect, self.lag
 
     def __str__(self) -> str:
-        return f"{self.variable} ({self.law}): {self.reason}"
+        return f"{arrow(self.key)}: {self.reason}"
 
 
 @final
@@ -158,8 +161,8 @@ class Verification(Report):
         backend: Its name.
         preset: Its numerical settings.
         seed: Of the experiments.
-        generated: Whether the graph follows from structure: then an edge that never fired is a
-            finding (the mass of what falls freely moves nothing), and no failure.
+        generated: Whether the graph follows from structure: then physics may have nothing to show
+            of an edge (the mass of what falls freely moves nothing).
         probes: Probe states that were used.
         held_out: Further ones, of another seed and without the task's scenarios, in which effects
             without an edge were looked for; of a generated graph, what never fired and what is
@@ -180,15 +183,14 @@ class Verification(Report):
         settable: How many variables ``do`` accepts.
         untried: Those of them for which no feasible value was found in any probe state.
         fired: Declared edges that were seen.
-        never_fired: Declared edges that were not.
+        unseen: Declared edges that were not, with the reasons.
         undeclared: Effects without an edge.
         colors: Edges from a color to something that moves, declared or seen.
-        laws: What the engine makes of the values of parameters; see ``queries.laws``.
         seconds: Wall time.
         versions: Of everything that decides the result.
     """
 
-    format: Literal["scm_world/verification/1"] = "scm_world/verification/1"
+    format: Literal["scm_world/verification/2"] = "scm_world/verification/2"
     task: str
     arguments: tuple[str, ...] = ()
     backend: str
@@ -209,12 +211,16 @@ class Verification(Report):
     settable: int
     untried: tuple[str, ...]
     fired: tuple[Fired, ...]
-    never_fired: tuple[EdgeKey, ...]
+    unseen: tuple[Unseen, ...]
     undeclared: tuple[Undeclared, ...]
     colors: tuple[EdgeKey, ...]
-    laws: tuple[Law, ...] = ()
     seconds: float
     versions: dict[str, str]
+
+    @property
+    def never_fired(self) -> tuple[EdgeKey, ...]:
+        """List the declared edges that were not seen."""
+        return tuple(edge.key for edge in self.unseen)
 
     @property
     def declared(self) -> tuple[EdgeKey, ...]:
@@ -240,21 +246,60 @@ class Verification(Report):
         return tuple(accumulate(new))
 
     @property
-    def passed(self) -> bool:
-        """Whether nothing but declared edges was seen, all of them, and undoing leaves no trace.
+    def unresponsive(self) -> tuple[str, ...]:
+        """Variables that changed under none of their declared causes, some of which were varied.
 
-        Of a generated graph, edges may be left that were never seen.
+        Nothing speaks for such a declaration, so they are named before everything else.
         """
-        unseen = self.never_fired and not self.generated
-        broken = [law for law in self.laws if law.passed is False]
-        wrong = (self.undeclared, unseen, self.colors, self.unstable, self.shared_noise, broken)
-        return self.floor == 0.0 and not self.interrupted and not any(wrong)
+        responded = {edge.effect for edge in self.fired}
+        tried = {edge.effect: None for edge in self.unseen if edge.states}
+        return tuple(name for name in tried if name not in responded)
+
+    @property
+    def outcome(self) -> Outcome:
+        """The verdict on the declared graph.
+
+        ``"refuted"`` if something was seen that it excludes: an effect without an edge, a
+        difference without a cause, noise in common, or a trace that undoing leaves. Otherwise
+        ``"confirmed"`` if every declared edge was seen and nothing was interrupted, and
+        ``"not refuted"`` if not.
+        """
+        wrong = (self.undeclared, self.colors, self.unstable, self.shared_noise)
+        return outcome(
+            wrong=self.floor > 0.0 or any(wrong), unseen=bool(self.unseen) or self.interrupted
+        )
+
+    @property
+    def headline(self) -> str:
+        """The outcome in a sentence: which variables never changed, what was wrong, what is left.
+
+        Example:
+            >>> from scm_world.queries import verify
+            >>> verify("reaching", backend="fake", probes=1, held_out=0).headline[:70]
+            'not refuted: joint_torques never changed under any of its declared cau'
+        """
+        counts = (
+            (len(self.undeclared), "effects without an edge"),
+            (len(self.colors), "colors that move something"),
+            (len(self.unstable), "variables that differ by themselves"),
+            (len(self.shared_noise), "pairs of variables with noise in common"),
+        )
+        names, more = self.unresponsive[:NAMED], len(self.unresponsive) - NAMED
+        also, its = f" and {more} more" if more > 0 else "", "its" if len(names) == 1 else "their"
+        said = [f"{', '.join(names)}{also} never changed under any of {its} declared causes"]
+        said = said * bool(names) + [f"{number} {what}" for number, what in counts if number]
+        said += ["undoing leaves a trace"] * (self.floor > 0.0)
+        if self.unseen:
+            said.append(f"{len(self.unseen)} of {len(self.declared)} edges were never seen")
+        elif self.outcome == "confirmed":
+            said.append(f"all {len(self.declared)} edges were seen, and no other effect")
+        said += ["interrupted"] * self.interrupted
+        return f"{self.outcome}: {'; '.join(said)}"
 
     def rows(self) -> tuple[Row, ...]:
         """List the numbers, what they mean, and whether they are good."""
         states = f"{self.probes} of at most {self.planned}"
         states += f", {self.held_out} held out" if self.held_out else ""
-        unseen = not self.never_fired or (None if self.generated else False)
         least = min((edge.states for edge in self.fired), default=0)
         more: list[Row] = [("each seen one in at least", f"{least} states", None)]
         if self.seen_held_out is not None:
@@ -272,7 +317,7 @@ class Verification(Report):
             ("settable variables", str(self.settable), None),
             ("never feasible", listed(self.untried), None),
             *more,
-            ("never seen", listed(map(arrow, self.never_fired)), unseen),
+            ("never seen", self._reasons(), None),
             ("undeclared effects", listed(map(str, self.undeclared)), not self.undeclared),
             ("differs by itself", listed(map(str, self.unstable)), not self.unstable),
             (
@@ -281,13 +326,43 @@ class Verification(Report):
                 not self.shared_noise,
             ),
             ("colors that move something", listed(map(arrow, self.colors)), not self.colors),
-            *law_rows(self.laws),
             ("seconds", f"{self.seconds:.1f}", None),
-            ("passed", "yes" if self.passed else "no", self.passed),
         )
 
+    def _reasons(self) -> str:
+        """Count the unseen edges and list them by cause, of what never changed first."""
+        silent = {*self.unresponsive}
+        effects: dict[tuple[str, str], list[str]] = {}
+        for edge in sorted(self.unseen, key=lambda edge: edge.effect not in silent):
+            effects.setdefault((edge.cause, edge.reason), []).append(edge.effect)
+        lines = [
+            f"{cause} -> {', '.join(dict.fromkeys(names))}: {reason}"
+            for (cause, reason), names in effects.items()
+        ]
+        return "\n".join([str(len(self.unseen)), *listed(lines).split("\n")[1:]])
+
+    @property
+    def title(self) -> str:
+        """The first line of the report."""
+        return f"Verification of {self.task} on {self.backend}: {self.headline}"
+
     def __str__(self) -> str:
-        return written(f"Verification of {self.task} on {self.backend}", self.rows())
+        return written(self.title, self.rows())
+
+
+def outcome(*, wrong: bool, unseen: bool) -> Outcome:
+    """Return the outcome of experiments with a graph.
+
+    Args:
+        wrong: Whether something was seen that the graph excludes.
+        unseen: Whether something that it declares was not seen.
+    """
+    return "refuted" if wrong else "not refuted" if unseen else "confirmed"
+
+
+def failed(outcomes: Iterable[Outcome], *, strict: bool) -> bool:
+    """Check whether a command exits 1: something is refuted or, if strict, not confirmed."""
+    return not {*outcomes} <= ({"confirmed"} if strict else {"confirmed", "not refuted"})
 
 
 def by_provenance(
@@ -321,20 +396,6 @@ def counted(provenance: Mapping[str, tuple[int, int, int]]) -> list[Row]:
         for by, (seen, all_, others) in provenance.items()
         if all_ or others
     ]
-
-
-def law_rows(laws: tuple[Law, ...]) -> tuple[Row, ...]:
-    """Count laws, and write out those that do not hold."""
-    if not laws:
-        return ()
-    broken = [law for law in laws if law.passed is False]
-    held = len({law.variable for law in laws if law.passed})
-    none = {law.variable for law in laws} - {law.variable for law in laws if law.passed is not None}
-    return (
-        ("laws that hold", str(held), None),
-        ("laws broken", listed(broken), not broken),
-        ("parameters without a law", str(len(none)), None),
-    )
 
 
 def named(key: EdgeKey) -> dict[str, Any]:

@@ -8,22 +8,25 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, final
 
+import networkx as nx
+
 from scm_world._arguments import whole_number
 from scm_world.errors import UnknownOption
-from scm_world.graph import SCM
+from scm_world.graph import SCM, Edge
+from scm_world.models import Model
 from scm_world.queries.agreement import SEEDS, Agreement, Sign, compare_signs
 from scm_world.queries.experiments.effects import EdgeKey, Effects, Series
 from scm_world.queries.experiments.joint import JointExperiments
 from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired
-from scm_world.queries.experiments.probes import Probe
+from scm_world.queries.experiments.probes import Pair, Probe
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.laws import check_laws
 from scm_world.queries.progress import Progress
 from scm_world.queries.verification import (
     Fired,
     Undeclared,
+    Unseen,
     Unstable,
     Verification,
     by_provenance,
@@ -73,8 +76,8 @@ def verify(
     the graph shows without them.
 
     A graph that was generated from a model says what can act on what; some of its edges may never
-    show. So its search ends when nothing new is seen any more, and in the held-out states only
-    what was never seen, or seen without an edge, is looked for.
+    show, and stay unseen. So its search ends when nothing new is seen any more, and in the held-out
+    states only what was never seen, or seen without an edge, is looked for.
 
     A causal model without a backend is its own physics: each mechanism is evaluated with one
     variable changed. A declared parent that its mechanism ignores never shows. An effect without
@@ -90,14 +93,19 @@ def verify(
         found: Called before that with all edges observed so far: (cause, effect, lag).
         options: Arguments of ``World``, such as ``backend``, unless ``system`` is one.
 
+    Returns:
+        The report. Its ``outcome`` is ``"confirmed"``, ``"not refuted"`` where declared edges are
+        left that no probe state showed, with the reasons, or ``"refuted"``. A world that was given
+        is afterwards as it was.
+
     Raises:
         UnknownOption: ``probes`` or ``least`` is not a positive whole number, ``held_out`` is not
             a whole number, there are options for a world that is made, or a name does not exist.
 
     Example:
         >>> found = verify("reaching", backend="fake", probes=1)
-        >>> found.floor, found.undeclared, found.passed  # without physics nothing moves
-        (0.0, (), False)
+        >>> found.floor, found.undeclared, found.outcome  # without physics nothing moves
+        (0.0, (), 'not refuted')
     """
     whole_number("number of probes", probes, least=1)
     whole_number("least number of probes", least, least=1)
@@ -105,7 +113,8 @@ def verify(
     if isinstance(system, Simulation | SCM):
         if options:
             raise UnknownOption("option for a world that is made", next(iter(options)), ())
-        return _verified(system, probes, least, held_out, seed, progress, found)
+        with system.unchanged() if isinstance(system, Simulation) else contextlib.nullcontext():
+            return _verified(system, probes, least, held_out, seed, progress, found)
     world = Simulation(system, **options)
     try:
         return _verified(world, probes, least, held_out, seed, progress, found)
@@ -309,7 +318,7 @@ def _verified(
         floor=effects.floor,
         threshold=effects.threshold,
         settable=len(paired.targets),
-        untried=tuple(sorted(set(paired.targets) - effects.undone)) if world else (),
+        untried=tuple(sorted(name for name in paired.targets if not effects.changed[name])),
         fired=tuple(
             Fired(
                 **named(key),
@@ -319,7 +328,7 @@ def _verified(
             )
             for key in sorted(observed & set(declared))
         ),
-        never_fired=tuple(sorted(set(declared) - observed)),
+        unseen=_unseen(world, model, effects, observed),
         undeclared=tuple(undeclared),
         colors=tuple(
             sorted(
@@ -328,7 +337,69 @@ def _verified(
                 if edge[0].endswith("color") and edge[1] in measured
             )
         ),
-        laws=check_laws(world, seed=seed) if world else (),
         seconds=time.perf_counter() - started,
         versions=versions(world.engine if world else ""),
     )
+
+
+def _unseen(
+    world: Simulation | None, model: SCM, effects: Effects, observed: set[EdgeKey]
+) -> tuple[Unseen, ...]:
+    """List the declared edges that were not seen, each with the reason."""
+    found = []
+    for edge in sorted(model.edges, key=lambda edge: edge.key):
+        if edge.key not in observed:
+            states = effects.changed[edge.cause]
+            reason = _reason(world, edge, effects, observed)
+            found.append(Unseen(**named(edge.key), states=states, reason=reason))
+    return tuple(found)
+
+
+def _reason(world: Simulation | None, edge: Edge, effects: Effects, observed: set[EdgeKey]) -> str:
+    """Say why an edge was not seen, as far as the experiments tell."""
+    states, size = effects.changed[edge.cause], effects.largest.get(edge.key, 0.0)
+    if not states:
+        refused = ": every other value that was tried was refused" * (edge.cause in effects.refused)
+        return f"no probe state had another value of {edge.cause}{refused}"
+    if size > 0.0:
+        return f"the largest difference, {size:.1g}, does not stand out from rounding and noise"
+    if world is None:
+        return f"no difference, though {edge.cause} was changed in {states} of the units"
+    apart = _apart(world.structure, edge, effects.touched) if edge.when == "contact" else None
+    if apart is not None:
+        return apart
+    entity, acted = edge.cause.partition(".")[0], {cause for cause, _, lag in observed if lag}
+    for action in world.compiled.actions:
+        if action.partition(".")[0] == entity and action not in acted:
+            return f"no command of {action} acted: each was cut to a limit, or drives nothing"
+    return f"no difference, though {edge.cause} was changed in {states} of the probe states"
+
+
+def _apart(structure: Any, edge: Edge, touched: set[Pair]) -> str | None:
+    """Name the bodies that never touched, so that an edge by contact could not act.
+
+    Args:
+        structure: A model says which body each of its joints and shapes belongs to.
+        edge: By contact.
+        touched: The pairs of bodies that touched in some probe state.
+    """
+    if not touched:
+        return "nothing touched in any probe state"
+    if not isinstance(structure, Model):
+        return None
+    bodies = structure.bodies
+    rows = {joint.name: joint.body for joint in bodies.joints}
+    rows |= {geom.name: geom.body for geom in bodies.geoms}
+    rows |= {body.name: number for number, body in enumerate(bodies.bodies)}
+    one, other = (rows.get(name.partition(".")[0]) for name in (edge.cause, edge.effect))
+    if one is None or other is None:
+        return None
+    first, second = bodies.bodies[one].name, bodies.bodies[other].name
+    if not any(first in pair for pair in touched):
+        return f"{first} touched nothing in any probe state"
+    trees = nx.Graph([[bodies.roots[rows[name]] for name in pair] for pair in touched])
+    trees.remove_nodes_from([0])  # what is fixed passes nothing on
+    trees.add_nodes_from([bodies.roots[one], bodies.roots[other]])
+    if bodies.roots[one] and not nx.has_path(trees, bodies.roots[one], bodies.roots[other]):
+        return f"{first} and {second} touched in no probe state, nor through other bodies"
+    return None

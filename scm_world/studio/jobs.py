@@ -66,6 +66,7 @@ def _experiment(spec: str, kind: str, probes: int, seed: int, pipe: Connection) 
                 report = discover(world, progress=progress, **common)
                 score = report.score
                 facts: dict[str, Any] = {
+                    "outcome": report.outcome,
                     "probe states": report.probes,
                     "precision": score.precision,
                     "recall": score.recall,
@@ -76,7 +77,8 @@ def _experiment(spec: str, kind: str, probes: int, seed: int, pipe: Connection) 
                 missed, extra = score.missed, score.undeclared
             else:
                 checked = verify(world, progress=progress, least=min(16, probes), **common)
-                facts = {name: said for name, said, _ in checked.rows()}
+                facts = {"outcome": checked.headline}
+                facts |= {name: said for name, said, _ in checked.rows()}
                 missed = checked.never_fired
                 extra = tuple((u.cause, u.effect, u.lag) for u in checked.undeclared)
             pipe.send(

@@ -130,23 +130,27 @@ class Simulation(WorldAttributes):
             conventions_name=conventions,
         )
         self.structures = as_structures(shared or kind, self.options)
-        self._started = self._checked = self._closed = False
-        self.noise, self.episode = CompiledNoise(0), 0
+        self._checked = self._closed = False
         self.version = 0  # counts changes of anything but what physics moves
         self._origin: EngineSnapshot | None = None
         self._origin_static: Values = {}
-        self._lost = ""
-        self._index = 0
-        self._offset = 0  # by how much interventions have moved control_index
-        self._base: StepBase | None = None
         self._earlier: CarriedOut | None = None
-        compiled = self.structures.natural(None)
-        self._values = PresentValues(compiled)
-        self._adopt_model(compiled.model)
+        self._have_no_episode()
         if isinstance(self.variables_space, Subset):
             # Where variables decide which bodies there are, some may be named that are not there.
             may_come = len(self.structures.head) > 0
-            check_subset(self.variables_space, compiled.model.variables, may_come=may_come)
+            check_subset(self.variables_space, self.model.variables, may_come=may_come)
+
+    def _have_no_episode(self) -> None:
+        """Be as a world is that was never reset."""
+        self._started, self._lost = False, ""
+        self.noise, self.episode = CompiledNoise(0), 0
+        self._index = 0
+        self._offset = 0  # by how much interventions have moved control_index
+        self._base: StepBase | None = None
+        compiled = self.structures.natural(None)
+        self._values = PresentValues(compiled)
+        self._adopt_model(compiled.model)
         self.structure = compiled.structure(compiled.model.solve(only=compiled.static_names))
 
     @property
@@ -719,6 +723,36 @@ class Simulation(WorldAttributes):
         self.noise, self.episode = CompiledNoise(snapshot.seed), snapshot.episode
         self._base = base
         self.structures.checked[snapshot] = found
+
+    @contextmanager
+    def unchanged(self) -> Iterator[None]:
+        """Go back to the present afterwards, bit for bit, also after an error or Ctrl-C.
+
+        A world without an episode has none afterwards. One whose backend has lost the state still
+        needs a reset or a snapshot.
+
+        Example:
+            >>> world = Simulation("pushing", backend="fake")
+            >>> world.reset(seed=5)
+            >>> with world.unchanged():
+            ...     world.reset(seed=0)
+            ...     world.step(np.zeros(9))
+            >>> world.noise.seed, world.index
+            (5, 0)
+        """
+        started, lost = self._started, self._lost
+        noise = self.noise, self.episode, self._index, self._offset
+        before = self.snapshot() if started and not lost else None
+        try:
+            yield
+        finally:
+            if before is not None:
+                self.restore(before)
+            elif not started:
+                self._have_no_episode()
+            else:
+                self._lost, self._base = lost, None
+                self.noise, self.episode, self._index, self._offset = noise
 
     def _known(self, snapshot: WorldSnapshot) -> CheckedSnapshot | None:
         """Give what is known of a snapshot that has been checked with this engine."""

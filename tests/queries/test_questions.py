@@ -194,7 +194,7 @@ def test_both_are_verified_and_discovered(system: Any) -> None:
     """Their edges are those that were declared, with the results of the same types."""
     found = verify(system, probes=20)
     assert isinstance(found, Verification)
-    assert found.passed
+    assert found.outcome == "confirmed"
     assert {("prey", "predator", 1), ("prey", "total", 0)} <= set(found.declared)
     assert discover(system, probes=8).score.shd == 0
 
@@ -406,7 +406,7 @@ def test_a_parent_that_a_mechanism_ignores_never_fires() -> None:
     found = verify(model, probes=20)
     assert found.never_fired == (("b", "c", 0),)
     assert found.undeclared == ()
-    assert not found.passed
+    assert found.outcome == "not refuted"
 
 
 @pytest.mark.parametrize("plan", PLANS, ids=repr)

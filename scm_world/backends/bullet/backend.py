@@ -151,7 +151,6 @@ class BulletBackend(Backend):
         self._light = True  # whether the base itself holds the present, and not the spare
         self._reported: list[float] = []  # what cannot be set, after the last step
         self._resting: list[float] | None = None  # state of the base, once it was asked for
-        self._pushes: list[tuple[str, list[float], list[float]]] = []  # of the next physics step
         self._saved: SavedState | None = None  # of the base
 
     @property
@@ -221,7 +220,7 @@ class BulletBackend(Backend):
         origin = Instant(structure, parameters, kind.settle(structure, scene.state))
         with self._all_or_nothing():
             self._other(structure).canonicalize(origin)
-        self._present, self._light, self._pushes = origin, False, []
+        self._present, self._light = origin, False
         self._reported = [0.0] * int((~structure.layout.can_be_set).sum())
         self._commit()
 
@@ -361,10 +360,7 @@ class BulletBackend(Backend):
             return
         self._commit()
         client, history = self._last(), self._lived()
-        pushes, self._pushes = self._pushes, []
         try:
-            for push in pushes:
-                client.push(*push)
             reported = client.stepped(mode, numbers, substeps)
         except Exception as error:
             client.close()  # torques that were not stepped would count twice
@@ -373,11 +369,6 @@ class BulletBackend(Backend):
         history.rows.extend((MODES.index(mode), substeps, *numbers))
         history.substeps += substeps
         self._reported, self._resting, self._saved = reported, None, None
-
-    def push(self, body: str, force: Floats, torque: Floats) -> None:
-        """Act on a body during the next physics step."""
-        self._now().carrier(body)  # or there is no such body
-        self._pushes.append((body, force.tolist(), torque.tolist()))
 
     def _commit(self) -> None:
         """Make the present the world that everything after it starts from."""
@@ -436,7 +427,7 @@ class BulletBackend(Backend):
             self._before.update(edit)
         self._present, self._light = record.present, record.light
         self._reported, self._resting = record.reported, record.resting
-        self._lost, self._saved, self._pushes = True, None, []
+        self._lost, self._saved = True, None
         try:
             self._recall(record.saved)
             self._return()

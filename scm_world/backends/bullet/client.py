@@ -249,19 +249,6 @@ class Client(ABC):
         """Say which parameters were changed without an effect; see ``Backend.remarks``."""
         return ()
 
-    def push(self, body: str, force: Sequence[float], torque: Sequence[float]) -> None:
-        """Act on a body during the next physics step; see ``Backend.push``."""
-        engine, handle, (multibody, link) = self.engine, self.handle, self.carrier(body)
-        if link < 0:
-            center, _ = engine.getBasePositionAndOrientation(multibody, physicsClientId=handle)
-        else:
-            center = engine.getLinkState(
-                multibody, link, computeForwardKinematics=1, physicsClientId=handle
-            )[0]
-        frame = engine.WORLD_FRAME
-        engine.applyExternalForce(multibody, link, force, center, frame, physicsClientId=handle)
-        engine.applyExternalTorque(multibody, link, torque, frame, physicsClientId=handle)
-
     def gravity(self) -> Floats:
         """Ask the engine for gravity, shape (3,) [m/s²]."""
         physics = self.engine.getPhysicsEngineParameters(physicsClientId=self.handle)

@@ -157,7 +157,6 @@ class MujocoBackend(Backend):
     _now: Realization
     _touches: Touches | None
     slot: BatchSlot | None = None
-    _pushed = False
 
     def __getattr__(self, name: str) -> Any:
         if name == "_now":
@@ -254,26 +253,12 @@ class MujocoBackend(Backend):
         self._touches = None
         try:
             mujoco.mj_step(now.model, now.data, substeps)
-            if self._pushed:
-                now.data.xfrc_applied[:], self._pushed = 0.0, False
         except (mujoco.FatalError, mujoco.UnexpectedError) as error:
             now.recover()
             raise EngineFailure(f"MuJoCo: {error}", self.name) from error
         problem = now.problem()
         if problem:
             raise EngineFailure(problem, self.name)
-
-    @property
-    def stages(self) -> int:
-        """How often forces are evaluated in a physics step."""
-        return 4 if self._now.staged else 1
-
-    def push(self, body: str, force: Floats, torque: Floats) -> None:
-        """Act on a body during the next physics step."""
-        self._return()
-        number, self._pushed = self._now.number(body), True
-        self._now.data.xfrc_applied[number, :3] = force
-        self._now.data.xfrc_applied[number, 3:] = torque
 
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step.

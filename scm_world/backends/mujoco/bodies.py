@@ -170,10 +170,6 @@ def _joint(mj: mujoco.MjModel, joint: int, name: str, start: int) -> Joint:
     )
 
 
-SOLREF, SOLIMP = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)
-"""What MuJoCo gives contacts that say nothing."""
-
-
 def _geom(mj: mujoco.MjModel, geom: int, name: str) -> Geom:
     kind, numbers = _SHAPES[int(mj.geom_type[geom])]
     corners: tuple[Vector, ...] = ()
@@ -186,10 +182,6 @@ def _geom(mj: mujoco.MjModel, geom: int, name: str) -> Geom:
             n = int(mj.mesh_graph[graph])
             vertices = vertices[mj.mesh_graph[graph + 2 + n : graph + 2 + 2 * n]]
         corners = tuple(map(_vector, vertices))
-    usual = np.array_equal(mj.geom_solref[geom], SOLREF) and np.array_equal(
-        mj.geom_solimp[geom], SOLIMP
-    )
-    usual &= not (mj.geom_margin[geom] or mj.geom_gap[geom] or mj.geom_priority[geom])
     return Geom(
         name,
         kind,
@@ -200,7 +192,6 @@ def _geom(mj: mujoco.MjModel, geom: int, name: str) -> Geom:
         corners,
         float(mj.geom_friction[geom, 0]),
         bool(mj.geom_condim[geom] == 1),
-        not usual,
     )
 
 

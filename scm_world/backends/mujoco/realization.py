@@ -368,23 +368,19 @@ class Realization(ABC):
     # --- model ---------------------------------------------------------------------------------
 
     def inertia(self, body: str) -> Floats:
-        """Copy the principal moments of inertia of a body, shape (3,) [kg m²]."""
-        moments: Floats = self.model.body_inertia[self.number(body)].copy()
-        return moments
-
-    def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """Say which changes of parameters have no effect, and why."""
-        return ()
-
-    def number(self, body: str) -> int:
-        """Find a body.
+        """Copy the principal moments of inertia of a body, shape (3,) [kg m²].
 
         Raises:
             UnknownOption: There is no such body.
         """
         if body not in self._bodies:
             raise UnknownOption("body", body, self._bodies)
-        return self._bodies.index(body)
+        moments: Floats = self.model.body_inertia[self._bodies.index(body)].copy()
+        return moments
+
+    def remarks(self, before: Parameters) -> tuple[str, ...]:
+        """Say which changes of parameters have no effect, and why."""
+        return ()
 
     def fingerprint(self) -> tuple[Any, ...]:
         """Return a digest of the model without its structure: models of one digest are alike."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, final
@@ -65,7 +66,8 @@ class Effects:
         floor: Noise floor: the largest difference after something was done and undone.
         floors: The same of each target by itself, after it was changed and put back.
         exact: Whether any difference counts, rounding too, where no edge is declared.
-        undone: Targets that were changed and put back.
+        changed: In how many probe states each variable got another value.
+        touched: Pairs of bodies that pressed on each other in a probe state.
         rollouts: Control steps simulated in an experiment of their own.
         refused: Targets for which no feasible value was found, with how often.
         unstable: By how much a variable differed though nothing had been changed, or after another
@@ -82,7 +84,8 @@ class Effects:
     floor: float = 0.0
     floors: dict[str, float] = field(default_factory=dict)
     exact: bool = False
-    undone: set[str] = field(default_factory=set)
+    changed: Counter[str] = field(default_factory=Counter)
+    touched: set[tuple[str, str]] = field(default_factory=set)
     rollouts: int = 0
     refused: dict[str, int] = field(default_factory=dict)
     unstable: dict[tuple[str, str], float] = field(default_factory=dict)
@@ -154,7 +157,8 @@ class Effects:
         self.floor = max(self.floor, other.floor)
         for name, size in other.floors.items():
             self.floors[name] = max(size, self.floors.get(name, 0.0))
-        self.undone |= other.undone
+        self.changed += other.changed
+        self.touched |= other.touched
         self.shared_noise |= other.shared_noise
         for (name, after), size in other.unstable.items():
             self.see_unstable(name, size, after)
@@ -193,7 +197,8 @@ class Effects:
             settings=dict(self.settings),
             floors=dict(self.floors),
             states=dict(self.states),
-            undone=set(self.undone),
+            changed=Counter(self.changed),
+            touched=set(self.touched),
             refused=dict(self.refused),
             unstable=dict(self.unstable),
             apart=dict(self.apart),
@@ -225,6 +230,7 @@ class Series:
     Attributes:
         effects: What was seen in the probe states that are finished.
         done: How many these are.
+        targets: The variables that are set.
     """
 
     def __init__(
@@ -237,6 +243,7 @@ class Series:
     ) -> None:
         self._paired, self.planned, self._progress = paired, planned, progress
         self.effects: Effects = paired.effects
+        self.targets: tuple[str, ...] = paired.targets
         self.done = done
 
     def run(

@@ -53,6 +53,7 @@ class PairedEquations:
             effects.shared_noise |= shared_noise(model, unit, first)
         for cause in model:
             other = _another(model[cause], unit[cause], unit, noise, number)
+            effects.changed[cause] += gap(other, unit[cause]) > 0.0
             _compare(model, cause, {**unit, cause: other}, first, unit, at, effects, lag=0)
             other = _another(model[cause], first[cause], first, noise, number)
             for lag in range(1, longest + 1):

@@ -28,7 +28,7 @@ from scm_world.queries.experiments.effects import (
     Response,
     gap,
 )
-from scm_world.queries.experiments.probes import Probe
+from scm_world.queries.experiments.probes import Probe, touching_pairs
 from scm_world.variables import (
     Box,
     Categories,
@@ -169,6 +169,7 @@ class Paired:
         at_first = self._engine_values()
         self._at_once, self._earlier = self._before.values, self._world.previous()
         self._memory = self._advanced(probe.action)
+        self.effects.touched |= touching_pairs(self._world)
         self._after = _Kept(self._world)
         self._later = self._after.values
         self._reported = self._engine_values()
@@ -429,7 +430,7 @@ class Paired:
         self._world.restore(self._probe.snapshot)
         self._world.do({target: value})
         self._world.do({target: self._at_once[target]})
-        self.effects.undone.add(target)
+        self.effects.changed[target] += 1
         self._advanced(self._probe.action)
         moved, now = self._after.differing(self._world), self._world.current()[0]
         self.effects.floors.setdefault(target, 0.0)
@@ -458,6 +459,7 @@ class Paired:
             self._see_later(name, action)
         except EngineFailure:
             return
+        self.effects.changed[name] += bool((action[where] != present).any())
         taken = np.array(self._world.current()[0][name])
         self._see_memory(name, {name: taken})
         for reader, causes in self._readers[0].items():
@@ -470,6 +472,8 @@ class Paired:
 
         No experiment in the world can do this; it is done in the model of the readouts.
         """
+        present = self._at_once[cause]
+        self.effects.changed[cause] += any(gap(v, present) > 0.0 for v in self._pool[cause])
         others = [name for name, causes in self._readers[0].items() if cause in causes]
         for value in self._pool[cause]:
             known = {**self._at_once, cause: value}

@@ -2,7 +2,8 @@
 
 A task may know where causes show; see ``Task.scenarios``. Of any other system, states are drawn:
 where episodes begin, where random actions lead, anywhere that can be, and where bodies touch, with
-parameters as they are and with others. All choices are drawn from keyed noise: probe i of a seed is
+parameters as they are and with others. In every second one, no number of the action is cut to a
+limit. All choices are drawn from keyed noise: probe i of a seed is
 the same, regardless of earlier probes.
 """
 
@@ -37,6 +38,8 @@ LONGEST = 60  # control steps of random actions before a probe state
 TRIED = 60  # states in which bodies may touch
 WORLD = "world"  # the body that everything fixed belongs to
 MOVING = 0.75  # of the pairs that touch are of two other bodies, where there are such
+HALVINGS = 30  # of a range of commands, until one of them is found that no limit cuts
+TINY = 1e-9  # share of that range, which makes a difference there
 KEPT = 10  # for how many control steps an action is kept at most
 JITTER = 0.2  # how far, as a fraction, a parameter without a space is moved
 SHARE = 0.5  # of the parameters that have other values, in the probes where some have
@@ -148,7 +151,7 @@ def onward_touching(world: Simulation, dice: Dice) -> tuple[dict[str, Value], No
     for action in _way(world, dice, LONGEST):
         here = world.snapshot()
         world.step(action)
-        for pair in _touching(world):
+        for pair in touching_pairs(world):
             before.setdefault(pair, here)
     if before:
         world.restore(_one_of(before, dice))
@@ -172,7 +175,7 @@ def touching(world: Simulation, dice: Dice) -> tuple[dict[str, Value], None]:
         except (InterventionError, EngineFailure):
             continue
         else:
-            for pair in _touching(world):
+            for pair in touching_pairs(world):
                 found.setdefault(pair, states)
         finally:
             world.restore(here)
@@ -187,7 +190,7 @@ def _way(world: Simulation, dice: Dice, steps: int) -> Iterator[Floats]:
         yield _within(world, shares[step // kept])
 
 
-def _touching(world: Simulation) -> set[Pair]:
+def touching_pairs(world: Simulation) -> set[Pair]:
     """Name the pairs of bodies that press on each other now."""
     pressing = (contact for contact in world.backend.contacts() if contact.force > 0.0)
     return {(min(contact.bodies), max(contact.bodies)) for contact in pressing}
@@ -334,6 +337,44 @@ def _at_random(world: Simulation, extra: None, dice: Dice) -> Floats:
     return _within(world, dice.of("probe action", world.compiled.n_actions))
 
 
+def _uncut(world: Simulation, extra: None, dice: Dice) -> Floats:
+    """Draw an action each number of which acts: it is not cut to a limit of its actuator.
+
+    A servo exerts its largest force for most commands: they have one and the same effect, bit for
+    bit. So for each number, the range is halved between two commands with different effects, until
+    there is one at which a tiny change of it makes a difference.
+    """
+    action, (low, high) = _at_random(world, extra, dice), action_range(world)
+    here = world.snapshot()
+
+    def reached(place: int, number: float) -> bytes | None:
+        world.restore(here)
+        changed = action.copy()
+        changed[place] = number
+        try:
+            world.step(changed)
+        except EngineFailure:
+            return None
+        return world.vector.tobytes()
+
+    for place in range(len(action)):
+        ends, number = [low[place], high[place]], float(action[place])
+        tiny = TINY * (ends[1] - ends[0])
+        first, last = (reached(place, end) for end in ends)
+        for _ in range(HALVINGS if first != last else 0):
+            found = reached(place, number)
+            if found == first:
+                ends[0] = number
+            elif found == last or reached(place, number + tiny) == found:
+                ends[1], last = number, found
+            else:
+                action[place] = number
+                break
+            number = 0.5 * (ends[0] + ends[1])
+    world.restore(here)
+    return action
+
+
 def _at_rest(world: Simulation, extra: None, dice: Dice) -> Floats:
     """Return the idle action."""
     return world.task.idle(world)
@@ -359,7 +400,12 @@ def _kinds(world: Simulation, *, settled: bool) -> tuple[Scenario, ...]:
     """List what is tried in a system of which the task says nothing."""
     if not settled:
         return AT_START, _ANYWHERE, _OTHERWISE
+    kinds: tuple[Scenario, ...]
     if any(edge.when == "contact" for edge in world.model.edges):
-        first = (AT_START, _TOUCHING, _ON_TOUCHING, _ANYWHERE)
-        return *first, _TOUCH_OTHERWISE, _ON_OTHERWISE, _TOUCHING, _ON_TOUCHING
-    return AT_START, _ONWARD, _ANYWHERE, _ON_OTHERWISE, _ONWARD, _OTHERWISE
+        kinds = (AT_START, _TOUCHING, _ON_TOUCHING, _ANYWHERE)
+        kinds += (_TOUCH_OTHERWISE, _ON_OTHERWISE, _TOUCHING, _ON_TOUCHING)
+    else:
+        kinds = AT_START, _ONWARD, _ANYWHERE, _ON_OTHERWISE, _ONWARD, _OTHERWISE
+    return tuple(
+        replace(kind, act=_at_random if number % 2 else _uncut) for number, kind in enumerate(kinds)
+    )

@@ -13,7 +13,6 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.geometry.hulls import Hull
 from scm_world.models.scene import (
-    ControlMode,
     ParameterKey,
     Parameters,
     Scene,
@@ -89,11 +88,6 @@ class TriFingerStructure:
     def realization(self, backend: str) -> Any:
         """Return how the robot is realised on a backend, or drawn."""
         return _realization("published" if self.published and backend == "bullet" else backend)
-
-    def described(self, parameters: Parameters, mode: ControlMode, backend: str) -> tuple[Any, Any]:
-        """Describe all bodies; see ``description``."""
-        module = import_module("scm_world.tasks.trifinger.description")
-        return module.described(self, parameters, mode, backend)  # type: ignore[no-any-return]
 
     def hull(self, block: str) -> Hull | None:
         """Give the shape of a block that is no box; None for a box."""
