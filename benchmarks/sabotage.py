@@ -6,14 +6,16 @@ Each sabotage changes the engine, a mechanism, a readout or the noise of a syste
 stays as it is. ``verify`` then has 40 probe states: at most 32, and 8 held out; of causal models
 without a backend 40 units.
 
-Criterion, fixed before the first run: a sabotage is *caught* if the report has not passed, and one
-of its complaints names what was sabotaged. A complaint is an undeclared effect, a declared edge
-that was never seen, something that differs by itself, noise in common, or a law of a parameter
-that does not hold. It names a sabotage if each of the regular expressions in ``names`` matches one
-of its variables. So a catch for another reason does not count. Every honest system has to pass
-with every seed that is used, or it is a false alarm. The mutation score is the share that is
-caught of those that change the graph or a law (``visible``); the target is 95 %. What lies beyond
-what 40 states can show is kept in the list and marked, with the reason in ``why``.
+Criterion: a sabotage is *caught* if the report does not confirm the graph, and one of its
+complaints names what was sabotaged. A complaint is an undeclared effect, something that differs by
+itself, noise in common, or a declared edge that was never seen although the honest system shows it
+with the same seed and budget. It names a sabotage if each of the regular expressions in ``names``
+matches one of its variables. So a catch for another reason does not count. No honest system may be
+refuted with any seed that is used, or it is a false alarm. The mutation score is the share that is
+caught of those that change the graph (``visible``); the target is 95 %. What lies beyond what 40
+states can show is kept in the list and marked, with the reason in ``why``. So is a parameter with
+another meaning, which changes no edge: ``test`` names the test of an adapter that fails then, as
+``tests/physics/test_wrong_values.py`` checks.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ import re
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -57,8 +60,9 @@ class Sabotage:
         system: The honest system, a key of ``HONEST``.
         names: Regular expressions: a complaint has to have a variable for each.
         make: Makes the sabotaged system.
-        visible: Whether it changes the graph or a law in states that can be reached.
+        visible: Whether it changes the graph in states that can be reached.
         why: What it does, or why it cannot be seen.
+        test: Test in ``tests/physics`` that fails with it, where the graph stays as it is.
     """
 
     name: str
@@ -68,6 +72,7 @@ class Sabotage:
     make: Callable[[], Any]
     visible: bool = True
     why: str = ""
+    test: str = ""
 
 
 class Sabotaged(BackendWrapper):
@@ -740,6 +745,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "balls, mujoco",
         (r"one\.mass",),
         lambda: model(BALLS, write=told(("one", "mass"), lambda v: 10.0 * v)),
+        visible=False,
+        test="test_balls_rest_on_their_radius_with_their_weight",
     ),
     Sabotage(
         "mass inverted",
@@ -747,6 +754,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "cart, bullet",
         (r"cart\.mass",),
         lambda: model(CART, "bullet", write=told(("cart", "mass"), lambda v: 1.0 / v)),
+        visible=False,
+        test="test_joints_move_as_in_plain_mujoco",
     ),
     Sabotage(
         "mass of the block times ten",
@@ -754,6 +763,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "pushing, mujoco",
         (r"tool_block\.mass",),
         lambda: task("pushing", write=told(("tool_block", "mass"), lambda v: 10.0 * v)),
+        visible=False,
+        test="test_weight",
     ),
     Sabotage(
         "gravity upward",
@@ -761,6 +772,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "balls, bullet",
         ("gravity",),
         lambda: model(BALLS, "bullet", write=told(("", "gravity"), lambda v: -v)),
+        visible=False,
+        test="test_balls_rest_on_their_radius_with_their_weight",
     ),
     Sabotage(
         "gravity of the task doubled",
@@ -768,6 +781,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "pushing, bullet",
         ("gravity",),
         lambda: task("pushing", "bullet", write=told(("world", "gravity"), lambda v: 2.0 * v)),
+        visible=False,
+        test="test_free_fall",
     ),
     Sabotage(
         "floor and wall swapped",
@@ -796,6 +811,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "cart, bullet",
         (r"push\..*",),
         lambda: model(CART, "bullet", before=lambda e, c, m: -c),
+        visible=False,
+        test="test_joints_move_as_in_plain_mujoco",
     ),
     Sabotage(
         "damping times three",
@@ -803,6 +820,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "cart, mujoco",
         (r"hinge\.damping",),
         lambda: model(CART, write=told(("hinge", "damping"), lambda v: 3.0 * v)),
+        visible=False,
+        test="test_joints_move_as_in_plain_mujoco",
     ),
     Sabotage(
         "friction of the floor doubled",
@@ -810,6 +829,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "pushing, mujoco",
         ("floor_friction",),
         lambda: task("pushing", write=told(("floor", "friction"), lambda v: 2.0 * v)),
+        visible=False,
+        test="test_stopping_distance",
     ),
     Sabotage(
         "friction of the block halved",
@@ -817,6 +838,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "pushing, bullet",
         (r"tool_block\.friction",),
         lambda: task("pushing", "bullet", write=told(("tool_block", "friction"), lambda v: v / 2)),
+        visible=False,
+        test="test_stopping_distance",
     ),
     Sabotage(
         "the block is a fifth larger",
@@ -831,6 +854,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "balls, bullet",
         (r"one\.size",),
         lambda: model(BALLS, "bullet", write=told(("one", "size"), lambda v: 0.8 * v)),
+        visible=False,
+        test="test_balls_rest_on_their_radius_with_their_weight",
     ),
     Sabotage(
         "friction of the fingers doubled",
@@ -838,7 +863,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "pushing, mujoco",
         ("finger_friction",),
         lambda: task("pushing", write=told(("robot", "friction"), lambda v: 2.0 * v)),
-        why="there is no law for what slides along a finger",
+        visible=False,
+        why="no edge changes, and no test measures what slides along a finger",
     ),
     Sabotage(
         "restitution doubled",
@@ -846,6 +872,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "pushing, bullet",
         ("restitution",),
         lambda: task("pushing", "bullet", write=told(("world", "restitution"), lambda v: 2.0 * v)),
+        visible=False,
+        test="test_rebound",
     ),
     Sabotage(
         "friction of the floor wears",
@@ -1086,26 +1114,31 @@ SABOTAGES: tuple[Sabotage, ...] = (
 )
 
 
-def complaints(report: Verification, *, unseen: bool = True) -> Iterable[set[str]]:
-    """Give the variables that each complaint of a report names, edges never seen among them."""
+def complaints(report: Verification, honest: Verification | None = None) -> Iterable[set[str]]:
+    """Give the variables that each complaint of a report names.
+
+    Args:
+        report: Of a sabotaged system.
+        honest: Of the same one without sabotage: edges that only it has seen are named, too.
+    """
     for edge in report.undeclared:
         yield {*edge.cause.split(" & "), edge.effect}
-    if unseen and not report.generated:
-        yield from ({cause, effect} for cause, effect, _ in report.never_fired)
+    if honest is not None:
+        seen = {edge.key for edge in honest.fired}
+        yield from ({cause, effect} for cause, effect, _ in seen.intersection(report.never_fired))
     yield from ({one.variable, one.after} for one in report.unstable)
     yield from ({*pair} for pair in report.shared_noise)
-    for law in getattr(report, "laws", ()):
-        if law.passed is False:
-            yield {law.variable}
 
 
-def caught(report: Verification, names: tuple[str, ...], *, unseen: bool = True) -> bool:
-    """Tell whether a report has not passed, and names what was sabotaged."""
+def caught(
+    report: Verification, names: tuple[str, ...], honest: Verification | None = None
+) -> bool:
+    """Tell whether a report does not confirm the graph, and names what was sabotaged."""
 
     def matches(variables: set[str]) -> bool:
         return all(any(re.fullmatch(n, v) for v in variables) for n in names)
 
-    return not report.passed and any(map(matches, complaints(report, unseen=unseen)))
+    return report.outcome != "confirmed" and any(map(matches, complaints(report, honest)))
 
 
 def verified(
@@ -1118,13 +1151,19 @@ def verified(
     return verify(system, seed=seed, probes=probes, held_out=held_out)
 
 
-def tried(one: Sabotage, seed: int) -> tuple[Verification, bool]:
+@cache
+def verified_honestly(system: str, seed: int) -> Verification:
+    """Verify a system without sabotage with the budget of the study."""
+    return verified(HONEST[system], seed)
+
+
+def tried(one: Sabotage, seed: int) -> tuple[Verification, Verification | None, bool]:
     """Verify a sabotaged system: with few states, and with all if that does not suffice."""
     report = verified(one.make, seed, *FIRST)
-    if caught(report, one.names, unseen=False):
-        return report, True
-    report = verified(one.make, seed)
-    return report, caught(report, one.names)
+    if caught(report, one.names):
+        return report, None, True
+    report, honest = verified(one.make, seed), verified_honestly(one.system, seed)
+    return report, honest, caught(report, one.names, honest)
 
 
 CLASSES = {
@@ -1136,14 +1175,24 @@ CLASSES = {
 }
 
 
+def tested_by(row: dict[str, Any]) -> str:
+    """Name the test of an adapter that sees a sabotage."""
+    return f"no edge changes; seen by `{row['test']}`" if row["test"] else ""
+
+
 def tables(found: dict[str, Any]) -> str:
     """Write the results as tables in Markdown."""
     rows, honest = found["sabotages"], found["honest"]
-    passed = sum(row["passed"] for row in honest)
-    alarms = len(honest) - passed
+    confirmed, refuted = (
+        sum(row["outcome"] == outcome for row in honest) for outcome in ("confirmed", "refuted")
+    )
+    tested, systems = sum(bool(row["test"]) for row in rows), len({row["system"] for row in honest})
     lines = [
-        f"Systems without sabotage: {passed} of {len(honest)} runs passed "
-        f"({len({row['system'] for row in honest})} systems, seeds 0 to 2): {alarms} false alarms.",
+        f"Systems without sabotage: {len(honest)} runs ({systems} systems, seeds 0 to 2), of which "
+        f"{confirmed} were confirmed and {refuted} refuted: {refuted} false alarms.",
+        "",
+        f"Of {len(rows)} sabotages, {tested} change what a parameter means and no edge. `verify` "
+        "does not see them; tests of the adapters do.",
         "",
         "| class | sabotages | visible | caught of these |",
         "|---|---|---|---|",
@@ -1161,7 +1210,7 @@ def tables(found: dict[str, Any]) -> str:
         lines += [
             f"| {row['name']} | {row['system']} | {row['seed']} | "
             f"{'yes' if row['caught'] else '**no**' if row['visible'] else 'no'} | "
-            f"{row['probes']} | {row['seconds']:.0f} | {row['why']} |"
+            f"{row['probes']} | {row['seconds']:.0f} | {row['why']}{tested_by(row)} |"
             for row in rows
             if row["kind"] == kind
         ]
@@ -1193,20 +1242,21 @@ def main() -> None:
         given.out.write_text(json.dumps(known, indent=1) + "\n")
         print(row, flush=True)
 
-    for system, make in HONEST.items():
+    for system in HONEST:
         for seed in range(given.seed, given.seed + given.honest_seeds):
             if re.search(given.only, f"honest: {system}"):
-                report = verified(make, seed)
+                report = verified_honestly(system, seed)
                 said = [sorted(names) for names in complaints(report)]
-                row = {"system": system, "seed": seed, "passed": report.passed, "complaints": said}
+                row = {"system": system, "seed": seed, "outcome": report.outcome}
+                row |= {"unseen": len(report.unseen), "complaints": said}
                 write("honest", {**row, "seconds": round(report.seconds, 1)}, "system", "seed")
     for one in SABOTAGES:
         if re.search(given.only, f"{one.kind}: {one.name}, {one.system}"):
-            report, is_caught = tried(one, given.seed)
+            report, honest, is_caught = tried(one, given.seed)
             about = {k: v for k, v in asdict(one).items() if k not in ("make", "names")}
             row = {**about, "seed": given.seed, "caught": is_caught}
-            row |= {"passed": report.passed, "probes": report.probes + report.held_out}
-            said = [sorted(names) for names in complaints(report)]
+            row |= {"outcome": report.outcome, "probes": report.probes + report.held_out}
+            said = [sorted(names) for names in complaints(report, honest)]
             row |= {"complaints": said[:3], "seconds": round(report.seconds, 1)}
             write("sabotages", row, "name", "seed")
     if given.out.parent == HERE:

@@ -15,7 +15,7 @@ ON_FLOOR = SIZE / 2
 
 def cube(index: int = 0, *, mass: float = 0.06, friction: float = 0.7):
     """Describe the parameters of a cube."""
-    name = f"block_{index}"
+    name = f"block_{index}" if index else "tool_block"
     return {
         (name, "size"): [SIZE] * 3,
         (name, "mass"): mass,
@@ -96,7 +96,7 @@ def test_creep(lab) -> None:
 def test_tipping(lab) -> None:
     """A block three times as high as wide tips at a slope of 1:3, within 2 % or 3 %."""
     bound = 0.02 if lab.precise else 0.03
-    tall = {("block_0", "size"): [0.03, 0.03, 0.09], ("block_0", "friction"): 1.0}
+    tall = {("tool_block", "size"): [0.03, 0.03, 0.09], ("tool_block", "friction"): 1.0}
     for factor, tips in ((1 - bound, False), (1 + bound, True)):
         lab.place([0.0, 0.0, 0.045], {**tall, ("floor", "friction"): 0.9})
         lab.wait(0.3)
@@ -117,6 +117,16 @@ def test_momentum(lab, left: float, right: float) -> None:
     assert velocities[0, 0] < 0.6  # they met
     momentum = left * velocities[0] + right * velocities[1]
     np.testing.assert_allclose(momentum, [left * 0.7 - right * 0.3, 0.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("mass", [0.03, 0.2])
+def test_weight(lab, mass: float) -> None:
+    """A block at rest is as high as half its size, and the floor carries its mass times g."""
+    lab.place([-0.1, 0.0, ON_FLOOR], cube(mass=mass))
+    state = lab.wait(0.5)
+    carried = [c.force for c in lab.backend.contacts() if "tool_block" in c.bodies]
+    assert sum(carried) == pytest.approx(mass * GRAVITY, rel=0.01)
+    assert state.positions[0, 2] == pytest.approx(ON_FLOOR, rel=0.01)
 
 
 def test_a_tower_stands(lab) -> None:

@@ -37,8 +37,8 @@ def test_lift(lab, size: float, mass: float, friction: float) -> None:
     """A squeezed block goes up by 0.1 m and slips by less than 0.5 mm/s while it is held."""
     joints = inverse(around(size, (0.03,) * 3, 0.12), HEIGHT, hardware.REST).joint_positions
     parameters = {
-        ("block_0", "size"): [size] * 3,
-        ("block_0", "mass"): mass,
+        ("tool_block", "size"): [size] * 3,
+        ("tool_block", "mass"): mass,
         ("robot", "friction"): friction,
     }
     lab.place([0.0, 0.0, size / 2], parameters, joints=joints, height=HEIGHT)
@@ -58,6 +58,6 @@ def test_lift(lab, size: float, mass: float, friction: float) -> None:
             offsets.append(state.positions[0] - tips.mean(axis=0))
     assert state.positions[0, 2] - size / 2 == pytest.approx(0.1, abs=0.01)
     touching = {body for contact in lab.backend.contacts() for body in contact.bodies}
-    assert touching == {"block_0", *(hardware.link_name(f, 3) for f in hardware.FINGERS)}
+    assert touching == {"tool_block", *(hardware.link_name(f, 3) for f in hardware.FINGERS)}
     slip = np.linalg.norm(offsets[-1] - offsets[-26]) / (25 * PERIOD)
     assert slip < 5e-4

@@ -24,7 +24,7 @@ QUICK = [
 
 @pytest.mark.parametrize("one", [BY_NAME[name] for name in QUICK], ids=lambda one: one.name)
 def test_a_sabotage_is_caught(one: Sabotage) -> None:
-    """The report names what was sabotaged, and has not passed."""
+    """The report names what was sabotaged, and does not confirm the graph."""
     report = verify(one.make(), probes=6, held_out=6, seed=1)
     assert caught(report, one.names), str(report)
 
@@ -34,7 +34,19 @@ def test_an_honest_system_is_not_suspected(system: str) -> None:
     """With other seeds than those of the study."""
     report = verify(HONEST[system](), probes=6, held_out=4, seed=17)
     assert not [*complaints(report)], str(report)
-    assert report.passed
+    assert report.outcome != "refuted"
+
+
+def test_a_cut_edge_is_named_where_the_honest_system_shows_it() -> None:
+    """A motor that is not connected refutes nothing; its edges are listed as never seen."""
+    one = BY_NAME["the motor is not connected"]
+    honest, report = (
+        verify(make(), probes=16, held_out=4) for make in (HONEST[one.system], one.make)
+    )
+    assert honest.outcome == "confirmed"
+    assert report.outcome == "not refuted"
+    assert not caught(report, one.names)
+    assert caught(report, one.names, honest)
 
 
 def test_two_colors_together_are_named_together() -> None:
@@ -63,4 +75,4 @@ def test_every_system_is_known_and_every_class_has_sabotages() -> None:
     assert len(BY_NAME) == len(SABOTAGES)
     assert {one.kind for one in SABOTAGES} == {"effect", "cut", "meaning", "readout", "time"}
     assert all(one.system in HONEST for one in SABOTAGES)
-    assert all(one.why for one in SABOTAGES if not one.visible)
+    assert all(one.why or one.test for one in SABOTAGES if not one.visible)
