@@ -96,6 +96,48 @@ def test_missing_edges_are_marked_and_strict_fails() -> None:
     assert "…" not in result.output
 
 
+LEAKING = """
+import scm_world as sw
+
+
+def step(parameters, state, action, noise):
+    return {"x": 0.5 * state["x"] + parameters["leak"], "still": 1.0}
+
+
+def make(*parents):
+    return sw.StepTask(
+        step,
+        parameters=[sw.Exogenous(name="leak", default=0.5, bounds=sw.Box(0.0, 1.0))],
+        states=[
+            sw.Measured(name="x", default=1.0, parents=parents),
+            sw.Measured(name="still", default=1.0, parents=("still",)),
+        ],
+    )
+
+
+def unseen():
+    return make("x", "leak")
+
+
+def refuted():
+    return make("x")
+"""
+
+
+@pytest.mark.usefixtures("_undrawn")
+@pytest.mark.parametrize("command", ["discover", "verify"])
+def test_exit_codes_tell_outcomes_apart(command: str) -> None:
+    """Edges that were never seen exit 0, strictly 1; an effect without an edge always 1."""
+    Path("leaking.py").write_text(LEAKING)
+    few = ("--probes", "2")
+    codes = [
+        call(command, f"leaking.py:{name}", *few, *more).exit_code
+        for name in ("unseen", "refuted")
+        for more in ((), ("--strict",))
+    ]
+    assert codes == [0, 1, 1, 1]
+
+
 @pytest.mark.parametrize("finished", [0, 1])
 def test_an_interrupted_discovery_reports_what_it_has(
     finished: int, monkeypatch: pytest.MonkeyPatch
