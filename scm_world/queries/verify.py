@@ -357,22 +357,21 @@ def _unseen(
 
 def _reason(world: Simulation | None, edge: Edge, effects: Effects, observed: set[EdgeKey]) -> str:
     """Say why an edge was not seen, as far as the experiments tell."""
-    states, size = effects.changed[edge.cause], effects.largest.get(edge.key, 0.0)
+    cause, states = edge.cause, effects.changed[edge.cause]
     if not states:
-        refused = ": every other value that was tried was refused" * (edge.cause in effects.refused)
-        return f"no probe state had another value of {edge.cause}{refused}"
-    if size > 0.0:
-        return f"the largest difference, {size:.1g}, does not stand out from rounding and noise"
-    if world is None:
-        return f"no difference, though {edge.cause} was changed in {states} of the units"
-    apart = _apart(world.structure, edge, effects.touched) if edge.when == "contact" else None
-    if apart is not None:
-        return apart
-    entity, acted = edge.cause.partition(".")[0], {cause for cause, _, lag in observed if lag}
-    for action in world.compiled.actions:
-        if action.partition(".")[0] == entity and action not in acted:
+        refused = ": every other value that was tried was refused" * (cause in effects.refused)
+        return f"no probe state had another value of {cause}{refused}"
+    if world is not None and edge.when == "contact":
+        apart = _apart(world.structure, edge, effects.touched)
+        if apart is not None:
+            return apart
+    acted = {name for name, _, lag in observed if lag}
+    for action in () if world is None else world.compiled.actions:
+        if action.partition(".")[0] == cause.partition(".")[0] and action not in acted:
             return f"no command of {action} acted: each was cut to a limit, or drives nothing"
-    return f"no difference, though {edge.cause} was changed in {states} of the probe states"
+    beyond = " beyond rounding and noise" * (effects.largest.get(edge.key, 0.0) > 0.0)
+    where = "units" if world is None else "probe states"
+    return f"no difference{beyond}, though {cause} was changed in {states} of the {where}"
 
 
 def _apart(structure: Any, edge: Edge, touched: set[Pair]) -> str | None:
