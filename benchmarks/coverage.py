@@ -40,7 +40,6 @@ from scm_world.evaluation.statistics.intervals import metrics_of
 from scm_world.output.durable import write_durably
 from scm_world.queries.estimates import caution, difference
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.identification import adjusted_effect, frontdoor_effect
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "docs" / "benchmarks" / "coverage.md"
@@ -239,64 +238,12 @@ def effects() -> Iterator[Row]:
                 yield f"`effect`, {'paired' if paired else 'unpaired'}", text, n, one
 
 
-def observational() -> Iterator[Row]:
-    """Effects that are estimated without an intervention."""
-
-    def linear(rng: Rng, n: int) -> tuple[Floats, Floats, Floats]:
-        z = rng.uniform(-2.0, 2.0, n)
-        x = z + rng.normal(size=n)
-        return x, z, 2.0 * x + 3.0 * z + rng.normal(size=n)
-
-    def sine(rng: Rng, n: int) -> tuple[Floats, Floats, Floats]:
-        z = rng.uniform(-2.0, 2.0, n)
-        x = np.sin(3.0 * z) + 0.7 * rng.normal(size=n)
-        return x, z, 2.0 * x + 3.0 * np.sin(3.0 * z) + rng.normal(size=n)
-
-    def uneven(rng: Rng, n: int) -> tuple[Floats, Floats, Floats]:
-        z = rng.uniform(-2.0, 2.0, n)
-        x = z + rng.normal(size=n)
-        return x, z, 2.0 * x + 3.0 * z + (0.3 + np.abs(x)) * rng.normal(size=n)
-
-    def product(rng: Rng, n: int) -> tuple[Floats, Floats, Floats]:
-        z, w = rng.uniform(-2.0, 2.0, (2, n))
-        x = z + w + rng.normal(size=n)
-        y = 2.0 * x + 1.5 * np.sin(2.0 * z) * np.sin(2.0 * w) * x + z + rng.normal(size=n)
-        return x, np.column_stack([z, w]), y
-
-    for text, case in (
-        ("Linear confounding.", linear),
-        ("Sine confounding.", sine),
-        ("Noise that grows with the treatment.", uneven),
-        ("An effect that follows a product of two sines.", product),
-    ):
-        for n in (100, 200, 500):
-
-            def adjusted(rng: Rng, case: Any = case, n: int = n) -> tuple[bool, bool]:
-                x, z, y = case(rng, n)
-                found = adjusted_effect(x, z, y, (0.0, 1.0))
-                return found.low <= 2.0 <= found.high, False
-
-            yield "`adjusted_effect`", text, n, adjusted
-    for n in (100, 300):
-
-        def front(rng: Rng, n: int = n) -> tuple[bool, bool]:
-            u = rng.normal(size=n)
-            x = u + rng.normal(size=n)
-            m = np.tanh(x) + 0.5 * rng.normal(size=n)
-            found = frontdoor_effect(x, m, 2.0 * (m + u) + rng.normal(size=n), (0.0, 1.0))
-            return found.low <= 2.0 * math.tanh(1.0) <= found.high, False
-
-        yield "`frontdoor_effect`", "A hidden common cause.", n, front
-
-
 PARTS = {
     "Over training runs": over_runs,
     "Over episodes": over_episodes,
     "Effects of interventions": effects,
-    "Effects from observational data": observational,
     "Over episodes that may fail": over_rare_failures,
 }
-COSTLY = "`frontdoor_effect`"
 
 
 def measure(samples: int, parts: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
@@ -305,14 +252,13 @@ def measure(samples: int, parts: Sequence[str]) -> dict[str, list[dict[str, Any]
     found: dict[str, list[dict[str, Any]]] = {part: [] for part in PARTS if part in parts}
     asked = [(number, *row) for number, row in enumerate(rows) if row[0] in parts]
     for number, part, (what, of, n, one) in track(asked, "coverage"):
-        count = max(2, samples // 10) if what == COSTLY else samples
         rng = np.random.default_rng([7, number])
-        hits = np.array([one(rng) for _ in range(count)])
+        hits = np.array([one(rng) for _ in range(samples)])
         unseen = float((~hits[:, 0] & ~hits[:, 1]).mean())
         covered, said = hits.mean(axis=0).tolist()
         found[part].append(
             {
-                "interval": what, "of": of.rstrip("."), "units": n, "samples": count,
+                "interval": what, "of": of.rstrip("."), "units": n, "samples": samples,
                 "covers": covered, "cautioned": said, "missed unseen": unseen,
                 "holds": covered >= LEAST or (said > 0.0 and unseen <= MOST_UNSEEN),
             }
@@ -328,8 +274,8 @@ def page(found: dict[str, list[dict[str, Any]]], about: dict[str, Any]) -> str:
         "# Coverage of intervals",
         "",
         "How often do intervals of 95 % contain the truth? `python -m benchmarks.coverage` draws",
-        f"samples whose truth is known: {max(row['samples'] for row in rows):,} for each row, a",
-        "tenth of that for front doors. The standard error of a share near 0.95 is 0.007.",
+        f"samples whose truth is known: {max(row['samples'] for row in rows):,} for each row.",
+        "The standard error of a share near 0.95 is 0.007.",
         "",
         "The criterion was fixed before: an interval *holds* if it contains the truth in 0.93 of",
         "the samples. Where a sample can show that its interval is too short, the package says so:",

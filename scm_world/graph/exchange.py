@@ -10,6 +10,7 @@ import csv
 import io
 import json
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -44,10 +45,11 @@ def to_digraph(source: SCM | nx.DiGraph, view: View = "lagged") -> nx.MultiDiGra
             ``"two_slice"``: each variable now and, if there are lags, at earlier steps; ``name`` is
             now, ``name@-1`` one step ago. A parameter keeps its value, so its past is called
             ``name@=-1`` and has an edge to ``name``. Edges within the past are copies of those
-            that end now.
+            that end now. Causes before the first slice that several nodes have in common are
+            unobserved nodes ``past_1@-2``, … with ``observed="no"``, as DoWhy marks them.
 
     Raises:
-        UnknownOption: There is no such view.
+        UnknownOption: There is no such view, or the source is no graph.
         ModelError: The edges have no direction, or a lag is no whole number from 0.
 
     Example:
@@ -92,6 +94,9 @@ def _of_model(model: SCM) -> nx.MultiDiGraph:
 
 
 def _of_networkx(source: nx.DiGraph) -> nx.MultiDiGraph:
+    if not isinstance(source, nx.Graph):
+        allowed = ("a model (SCM)", "a directed graph of networkx")
+        raise UnknownOption("graph", source, allowed)
     if not source.is_directed():
         raise ModelError(["the edges of the graph have no direction"])
     graph = nx.MultiDiGraph()
@@ -149,26 +154,79 @@ def _held(graph: nx.MultiDiGraph) -> list[str]:
     ]
 
 
+def window_of(graph: nx.MultiDiGraph) -> nx.DiGraph:
+    """Return the present and as many slices before it as the longest lag, with their common past.
+
+    Two nodes are d-separated exactly where they are in a graph unrolled without end: this is its
+    latent projection. Nodes are those of ``slices_of``; ``("past", 1)``, … are unobserved.
+
+    Source:
+        Verma and Pearl, *Equivalence and synthesis of causal models*, UAI 1990, for projections;
+        a clique of bidirected edges separates as one common cause does.
+    """
+    past = _past_of(graph)
+    made = slices_of(graph, past + 1)
+    for number, effects in enumerate(_with_common_past(graph, past), start=1):
+        made.add_node(("past", number), observed="no")
+        made.add_edges_from((("past", number), effect) for effect in effects)
+    return made
+
+
+def _with_common_past(graph: nx.MultiDiGraph, past: int) -> list[list[tuple[str, int]]]:
+    """List the largest sets of nodes of which each two have a cause before slice ``-past``."""
+    place = {name: number for number, name in enumerate(graph)}
+    edges = np.zeros((past + 1, len(place), len(place)), dtype=np.float32)  # lag, cause, effect
+    for cause, effect, lag in graph.edges(keys=True):
+        edges[lag, place[cause], place[effect]] = 1.0
+    for name in _held(graph) if past else ():
+        edges[1, place[name], place[name]] = 1.0
+    # common[d][x, y]: x and the y of d steps before have an ancestor in common, or are in line
+    common = np.zeros_like(edges)
+    common[0] = np.eye(len(place))
+
+    def shared(apart: int) -> NDArray[np.float32]:
+        return common[apart] if apart >= 0 else common[-apart].T
+
+    known = -1.0
+    while known != (known := float(common.sum(dtype=np.float64))):
+        for apart, lag in product(range(past + 1), repeat=2):  # the later of the two steps back
+            common[apart][edges[lag].T @ shared(apart - lag) > 0.0] = 1.0
+        common[0] = np.maximum(common[0], common[0].T)
+    nodes = [(name, slice_) for slice_ in range(-past, 1) for name in graph]
+    before = np.zeros((past, len(nodes), len(place)), dtype=np.float32)  # steps, effect, cause
+    for row, (name, slice_) in enumerate(nodes):
+        for steps in range(1, -slice_ + 1):
+            before[steps - 1, row] = edges[past + slice_ + steps, :, place[name]]
+    joined = np.zeros((len(nodes), len(nodes)), dtype=bool)
+    for first, second in product(range(past), repeat=2):
+        joined |= before[first] @ shared(second - first) @ before[second].T > 0.0
+    pairs = nx.Graph((nodes[i], nodes[j]) for i, j in np.argwhere(np.triu(joined, 1)).tolist())
+    return sorted(sorted(clique) for clique in nx.find_cliques(pairs))
+
+
 def _sliced(graph: nx.MultiDiGraph) -> nx.MultiDiGraph:
     held, past = _held(graph), _past_of(graph)
 
     def named(node: tuple[str, int]) -> str:
         name, slice_ = node
+        if slice_ > 0:
+            return f"past_{slice_}@-{past + 1}"
         return f"{name}@{'=' if name in held else ''}{slice_}" if slice_ else name
 
-    unrolled, made = slices_of(graph, past + 1), nx.MultiDiGraph()
-    for node in sorted(unrolled, key=lambda node: -node[1]):  # the present first
-        made.add_node(named(node), **graph.nodes[node[0]])
-    for cause, effect, data in unrolled.edges(data=True):
+    window, made = window_of(graph), nx.MultiDiGraph()
+    for node in sorted(window, key=lambda node: (node[1] > 0, abs(node[1]))):  # the present first
+        made.add_node(named(node), **(graph.nodes[node[0]] if node[1] <= 0 else window.nodes[node]))
+    for cause, effect, data in window.edges(data=True):
         when = {"when": data["when"]} if "when" in data else {}
         made.add_edge(named(cause), named(effect), 0, lag=0, **when)
     return made
 
 
 def _bare(graph: nx.MultiDiGraph) -> nx.DiGraph:
-    """Return names and pairs alone; refuse a cycle."""
+    """Return names, pairs and what is unobserved alone; refuse a cycle."""
     made = nx.DiGraph()
     made.add_nodes_from(graph)
+    made.add_nodes_from(_latents(graph), observed="no")
     made.add_edges_from(graph.edges())
     if not nx.is_directed_acyclic_graph(made):
         cycle = [cause for cause, _ in nx.find_cycle(made)]
@@ -176,6 +234,11 @@ def _bare(graph: nx.MultiDiGraph) -> nx.DiGraph:
         what = f"only acyclic graphs can be written so, and there is {path}"
         raise ModelError([f"{what}; try view='two_slice'"])
     return made
+
+
+def _latents(graph: nx.DiGraph) -> list[str]:
+    """List the unobserved nodes."""
+    return [name for name, observed in graph.nodes(data="observed") if observed == "no"]
 
 
 # --- spaces in words ------------------------------------------------------------------------------
@@ -267,7 +330,8 @@ def _dagitty(graph: nx.MultiDiGraph) -> str:
     bare = _bare(graph)
     if odd := [name for name in bare if '"' in name or "\\" in name]:
         raise ModelError([f"dagitty cannot write the name {name!r}" for name in odd])
-    nodes = [f'"{name}"' for name in bare]
+    latents = _latents(bare)
+    nodes = [f'"{name}"' + " [latent]" * (name in latents) for name in bare]
     edges = [f'"{cause}" -> "{effect}"' for cause, effect in bare.edges]
     return "\n".join(["dag {", *nodes, *edges, "}"])
 
@@ -338,6 +402,9 @@ def write_graph(
 def to_dowhy(source: SCM | nx.DiGraph, *, view: View = "two_slice") -> nx.DiGraph:
     """Return the graph that ``dowhy.CausalModel(graph=…)`` and ``dowhy.gcm`` take.
 
+    Unobserved nodes have ``observed="no"``: in two slices, the common causes of the earlier past.
+    ``dowhy.gcm`` knows none, so it takes graphs of one instant.
+
     Raises:
         ModelError: The view has a cycle.
         UnknownOption: There is no such view.
@@ -348,21 +415,23 @@ def to_dowhy(source: SCM | nx.DiGraph, *, view: View = "two_slice") -> nx.DiGrap
 
 
 def to_pgmpy(source: SCM | nx.DiGraph, *, view: View = "two_slice") -> Any:
-    """Write a graph as a ``pgmpy.base.DAG``; its ``edges()`` make any Bayesian network of pgmpy.
+    """Write a graph as a ``pgmpy.base.DAG``, with its ``latents``.
+
+    Its ``edges()`` make any Bayesian network of pgmpy.
 
     Raises:
         MissingExtra: pgmpy is not installed.
         ModelError: The view has a cycle.
         UnknownOption: There is no such view.
     """
-    graph, made = to_dowhy(source, view=view), load("pgmpy.base", "pgmpy").DAG()
-    made.add_nodes_from(graph)
-    made.add_edges_from(graph.edges)
+    graph, dag = to_dowhy(source, view=view), load("pgmpy.base", "pgmpy").DAG
+    made = dag(list(graph.edges), latents=set(_latents(graph)))
+    made.add_nodes_from(set(graph) - set(made))
     return made
 
 
 def to_causal_learn(source: SCM | nx.DiGraph, *, view: View = "two_slice") -> Any:
-    """Write a graph as a ``causallearn.graph.GeneralGraph``.
+    """Write a graph as a ``causallearn.graph.GeneralGraph``; unobserved nodes are ``LATENT``.
 
     Raises:
         MissingExtra: causal-learn is not installed.
@@ -372,7 +441,10 @@ def to_causal_learn(source: SCM | nx.DiGraph, *, view: View = "two_slice") -> An
     graph = to_dowhy(source, view=view)
     general = load("causallearn.graph.GeneralGraph", "causal-learn").GeneralGraph
     node = load("causallearn.graph.GraphNode", "causal-learn").GraphNode
+    latent = load("causallearn.graph.NodeType", "causal-learn").NodeType.LATENT
     nodes = {name: node(name) for name in graph}
+    for name in _latents(graph):
+        nodes[name].set_node_type(latent)
     made = general(list(nodes.values()))
     for cause, effect in graph.edges:
         made.add_directed_edge(nodes[cause], nodes[effect])

@@ -8,7 +8,7 @@ from typing import Any
 import networkx as nx
 
 from scm_world.errors import UnknownVariable
-from scm_world.graph.exchange import slices_of, to_digraph
+from scm_world.graph.exchange import slices_of, to_digraph, window_of
 from scm_world.graph.scm import SCM
 
 Node = str | tuple[str, int]
@@ -74,8 +74,7 @@ def d_separated(
     """Return whether ``given`` blocks every path between ``x`` and ``y``.
 
     In a model with lagged edges a plain name means the present slice and ``(name, -1)`` the one
-    before. As many earlier slices as the model has variables, times the longest lag, are
-    looked at too, so that what a common past connects is seen to be connected.
+    before. What a common past connects, however long ago, is connected.
 
     Raises:
         UnknownVariable: A node is not in the model.
@@ -83,14 +82,13 @@ def d_separated(
     Source:
         Pearl, *Causality*, 2nd ed., section 1.2.3; computed by networkx.
     """
-    longest = max((edge.lag for edge in model.edges), default=0)
-    graph = unrolled(model, longest * (len(model) + 1) + 1)
+    graph = window_of(to_digraph(model))
 
     def nodes(chosen: Iterable[Node]) -> set[Any]:
         found: set[Any] = set()
         for node in (chosen,) if isinstance(chosen, str) else chosen:
             full = (node, 0) if isinstance(node, str) else node
-            if full not in graph or full[1] < -1:
+            if full not in graph or not -1 <= full[1] <= 0:
                 raise UnknownVariable(str(node), list(model))
             found.add(full)
         return found

@@ -8,16 +8,7 @@ from scm_world.queries.differences import ButFor, Divergence, EpisodeDifference,
 from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.estimates import Effect
-from scm_world.queries.identification import (
-    AdjustmentCheck,
-    Identification,
-    ObservationalEffect,
-    adjusted_effect,
-    check_backdoor,
-    frontdoor_effect,
-    identify,
-    nature_graph,
-)
+from scm_world.queries.identification import Identification, identify, nature_graph
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.live import LiveEpisode
 from scm_world.queries.outcomes import Outcome
@@ -31,7 +22,6 @@ from scm_world.queries.world import World
 
 __all__ = [
     "SCM",
-    "AdjustmentCheck",
     "Agreement",
     "At",
     "ButFor",
@@ -47,7 +37,6 @@ __all__ = [
     "Identification",
     "Laboratory",
     "LiveEpisode",
-    "ObservationalEffect",
     "On",
     "Outcome",
     "Plan",
@@ -57,13 +46,10 @@ __all__ = [
     "Setting",
     "Verification",
     "World",
-    "adjusted_effect",
     "but_for",
-    "check_backdoor",
     "compare",
     "consequences",
     "do",
-    "frontdoor_effect",
     "identify",
     "load_episode",
     "nature_graph",

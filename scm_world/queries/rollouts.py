@@ -12,7 +12,7 @@ import numpy as np
 from scm_world._arguments import real_numbers, whole_number
 from scm_world._types import Floats, Integers, Value
 from scm_world.backends.base import ContactPoint
-from scm_world.errors import ActionError, blamed
+from scm_world.errors import ActionError, UnknownOption, blamed
 from scm_world.policies.scripted import Policy, as_policy
 from scm_world.queries.equations import Equations, System
 from scm_world.queries.local import contacts_of
@@ -70,7 +70,13 @@ class Trace:
 
 
 def as_names(record: Iterable[str]) -> tuple[str, ...]:
-    """Read the names of variables; a text is one name."""
+    """Read the names of variables; a text is one name.
+
+    Raises:
+        UnknownOption: It is neither.
+    """
+    if not isinstance(record, Iterable):
+        raise UnknownOption("names", record, ("a name", "names of variables"))
     return (record,) if isinstance(record, str) else tuple(record)
 
 

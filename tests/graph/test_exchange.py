@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.graph import SCM, unrolled
 from scm_world.graph import exchange as ex
 from scm_world.graph.exchange import space_lines, to_digraph, write_graph
+from scm_world.queries import identify
 from scm_world.tasks import TASKS, make_task
 from scm_world.variables import Affine, Box, Either, Exogenous, Measured, Parent, Switch
 from scm_world.world import Simulation
@@ -106,7 +108,7 @@ def test_a_summary_loses_lags() -> None:
 
 
 def test_two_slices_are_those_of_the_model() -> None:
-    """The nodes and edges are those of ``scm_world.graph.unrolled``."""
+    """But for the unobserved past, they are those of ``scm_world.graph.unrolled``."""
     model = SCM(
         [
             Exogenous(name="gain"),
@@ -118,8 +120,47 @@ def test_two_slices_are_those_of_the_model() -> None:
     graph = unrolled(model, 2)
     expected = nx.relabel_nodes(graph, {n: names[n[0]] if n[1] < 0 else n[0] for n in graph})
     found = ex.to_dowhy(model)
+    past = [name for name, seen in found.nodes(data="observed") if seen == "no"]
+    assert [sorted(found.successors(name)) for name in past] == [["gain@=-1", "x@-1", "y@-1"]]
+    found.remove_nodes_from(past)
     assert set(found.nodes) == set(expected.nodes)
     assert set(found.edges) == set(expected.edges)
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_two_slices_separate_what_a_long_past_separates(seed: int) -> None:
+    """D-separation in them is that in a graph of very many slices, which can hide nothing."""
+    rng = np.random.default_rng(seed)
+    names, longest = "abcd"[: rng.integers(2, 5)], int(rng.integers(1, 3))
+    graph = nx.MultiDiGraph()
+    for name in names:
+        graph.add_node(name, role="parameter" if rng.random() < 0.2 else "state")
+    for cause, effect, lag in product(names, names, range(longest + 1)):
+        if (lag or cause < effect) and rng.random() < 0.25:
+            graph.add_edge(cause, effect, lag, lag=lag)
+    window = ex.window_of(graph)
+    long = ex.slices_of(graph, 60)
+    nodes = [node for node in window if node[1] <= 0]
+    for _ in range(30):
+        x, y, *rest = (nodes[i] for i in rng.permutation(len(nodes)))
+        given = set(rest[: rng.integers(0, len(rest) + 1)])
+        separated = nx.is_d_separator(long, {x}, {y}, given)
+        assert nx.is_d_separator(window, {x}, {y}, given) == separated, (x, y, given)
+
+
+def test_libraries_learn_of_the_unobserved_past() -> None:
+    """Two effects of one cause two steps ago have it in common, unobserved, in every format."""
+    model = nx.DiGraph([("z", "z", {"lag": 1}), ("z", "x", {"lag": 1}), ("z", "y", {"lag": 1})])
+    found = ex.to_dowhy(model)
+    assert found.nodes["past_1@-2"] == {"observed": "no"}
+    assert set(found.successors("past_1@-2")) == {"x@-1", "y@-1", "z@-1"}
+    assert identify(model, "x@-1", "y").backdoor == ("z@-1",)
+    assert identify(model, "x@-1", "y", observed=["x@-1", "y"]).backdoor is None
+    assert '"past_1@-2" [latent]' in write_graph(model, format="dagitty").splitlines()
+    general = pytest.importorskip("causallearn.graph.GeneralGraph")
+    made = ex.to_causal_learn(model)
+    assert isinstance(made, general.GeneralGraph)
+    assert str(made.get_node("past_1@-2").get_node_type()) == "LATENT"
 
 
 # --- text ----------------------------------------------------------------------------------------
@@ -178,6 +219,9 @@ def test_what_a_format_cannot_hold_is_refused() -> None:
         ex.to_dowhy(loop, view="lagged")
     with pytest.raises(UnknownOption, match="no view is named 'unrolled'"):
         to_digraph(loop, "unrolled")  # type: ignore[arg-type]
+    for other in ("pushing", {"x": ["y"]}, None):
+        with pytest.raises(UnknownOption, match="a directed graph of networkx"):
+            to_digraph(other)  # type: ignore[arg-type] # that is the point
     with pytest.raises(UnknownOption, match="did you mean 'graphml'"):
         write_graph(loop, format="graphm")
 
@@ -216,6 +260,8 @@ def test_pgmpy_has_the_same_edges(graph: nx.MultiDiGraph) -> None:
     made = ex.to_pgmpy(graph)
     assert isinstance(made, base.DAG)
     assert set(made.edges) == set(ex.to_dowhy(graph).edges)
+    assert set(made) == set(ex.to_dowhy(graph))
+    assert made.latents == {name for name in made if name.startswith("past_")}
 
 
 @pytest.mark.parametrize(

@@ -141,3 +141,25 @@ def test_a_common_past_connects_the_previous_slice() -> None:
     assert not d_separated(model, [("b", -1)], [("c", -1)])
     assert d_separated(model, ["b"], ["c"], given=[("a", -1)])
     assert {slice_ for _, slice_ in unrolled(model, 3)} == {-2, -1, 0}
+
+
+def test_a_common_past_is_found_however_long_ago_it_was() -> None:
+    """Loops of three and of four steps that one cause drives meet again eleven steps ago."""
+    loops = [("a0", "a1"), ("a1", "a2"), ("a2", "a0"), ("b0", "b1"), ("b1", "b2"), ("b2", "b3")]
+    loops += [("b3", "b0"), ("u", "a0"), ("u", "b3")]
+    weights = {name: [c for c, e in loops if e == name] for name in sorted({e for _, e in loops})}
+    model = SCM(
+        [
+            Exogenous(name="u", distribution=Normal(), per="step"),
+            *(
+                Derived(
+                    name=name,
+                    parents=tuple(Parent(cause, 1) for cause in causes),
+                    mechanism=Linear(weights=(0.9,) * len(causes)),
+                )
+                for name, causes in weights.items()
+            ),
+        ]
+    )
+    apart = [d_separated(model, [f"a{i}"], [f"b{j}"]) for i in range(3) for j in range(4)]
+    assert not any(apart)
