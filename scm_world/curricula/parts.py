@@ -37,8 +37,7 @@ from scm_world.variables import (
 from scm_world.variables.checks import check_draw, check_region
 from scm_world.variables.kinds import SPACES, AsMechanism, SpaceName
 from scm_world.variables.mechanisms import Linear
-from scm_world.variables.spaces import Frozen
-from scm_world.variables.subsets import refuse_infinite
+from scm_world.variables.spaces import Frozen, refuse_infinite
 from scm_world.world.compiled_task import CompiledTask
 
 

@@ -17,6 +17,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._arguments import whole_number
 from scm_world.discovery.data import Dataset, Design, collect
 from scm_world.discovery.data.dataset import Column
 from scm_world.discovery.data.truth import observed_part
@@ -83,7 +84,7 @@ def servo(n: int, seed: int = 0, hidden: int = 0) -> Servos:
     Source:
         Ormaniec et al., *Standardizing structural causal models*, ICLR 2025, for scaled weights.
     """
-    rng = np.random.default_rng([seed, n, hidden, 11])
+    rng = np.random.default_rng([whole_number("seed", seed, least=0), n, hidden, 11])
     upper = np.zeros((hidden + n, hidden + n), dtype=bool)  # forces, then arms in causal order
     upper[hidden:, hidden:] = np.diag(np.ones(n - 1, dtype=bool), 1)
     for j in range(2, n if n >= 8 else 0):

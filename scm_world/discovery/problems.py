@@ -76,7 +76,7 @@ def random_model(name: str, seed: int = 0) -> SCM:
     if family not in FAMILIES or not re.fullmatch(r"[0-9]+", size) or not 2 <= int(size) <= MOST:
         shown = tuple(f"{known}:N" for known in FAMILIES)
         raise UnknownOption("family of models", name, (*shown, f"with N from 2 to {MOST}"))
-    return FAMILIES[family](int(size), seed)
+    return FAMILIES[family](int(size), whole_number("seed", seed, least=0))
 
 
 def _erdos_renyi(n: int, seed: int, kind: str = "linear", number: int = 1) -> SCM:
@@ -634,7 +634,7 @@ def problem(name: str | SCM, *, seed: int = 0, view: TaskView | None = None) -> 
         >>> problem("er2:5").truth.names
         ('x0', 'x1', 'x2', 'x3', 'x4')
     """
-    view = view or TaskView()
+    view, seed = view or TaskView(), whole_number("seed", seed, least=0)
     if isinstance(name, SCM):
         return SCMProblem(problem_label(name, view), name)
     if name.partition(":")[0] in FAMILIES:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scm_world._arguments import load
+from scm_world._arguments import load, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 
@@ -107,12 +107,13 @@ def dci(codes: ArrayLike, factors: ArrayLike, *, trees: int = 50, seed: int = 0)
         Eastwood and Williams, *A framework for the quantitative evaluation of disentangled
         representations*, ICLR 2018.
     """
+    number = whole_number("seed", seed, least=0)
     ensemble = load("sklearn.ensemble", "scikit-learn", "discovery")
     z, truth = _checked(codes, factors)
     half = len(z) // 2
     importances, foretold = [], []
     for factor in truth.T:
-        forest: Any = ensemble.RandomForestRegressor(trees, random_state=seed)
+        forest: Any = ensemble.RandomForestRegressor(trees, random_state=number)
         forest.fit(z[:half], factor[:half])
         importances.append(forest.feature_importances_)
         foretold.append(forest.predict(z[half:]))

@@ -366,7 +366,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             InterventionError: The intervention was refused.
             ModelError: A custom reward term is no number.
         """
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else whole_number("seed", seed, least=0))
         asked_for = reset_options(options, RESETS)
         request = self._acts(asked_for.get("do"))
         number = asked_for.get("episode")

@@ -10,6 +10,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Value, Values
 from scm_world.errors import (
     ClosesCycle,
@@ -550,8 +551,8 @@ class SCM:
         """Draw from the model.
 
         Args:
-            n: How many episodes.
-            seed: Of the noise.
+            n: How many episodes, at least 1.
+            seed: Of the noise, a whole number that is not negative.
             first: Number of the first episode: ``draw(1, first=i)`` is row i of a larger draw.
             steps: For a model with lagged edges, how many control steps.
 
@@ -560,15 +561,17 @@ class SCM:
 
         Raises:
             ModelError: The model has lagged edges and ``steps`` is not given.
+            UnknownOption: An argument is not a whole number, or too small.
         """
-        noise = Noise(seed)
+        noise, n = Noise(seed), whole_number("n", n, least=1)
+        first = whole_number("first", first, least=0)
         if steps is None:
             if self.is_temporal:
                 raise ModelError(["the model has lagged edges: say how many steps to sample"])
             return self.solve(key=NoiseKey(noise, first, 0, n))
         slices: list[dict[str, Value]] = []
-        before = self.begin(key=NoiseKey(noise, first, 0, n)) if steps else {}
-        for step in range(steps):
+        before = self.begin(key=NoiseKey(noise, first, 0, n))
+        for step in range(whole_number("steps", steps, least=1)):
             if slices:
                 before = self.remembered(slices[-1], before)
             slices.append(self.solve(previous=before, key=NoiseKey(noise, first, step, n)))

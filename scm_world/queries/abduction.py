@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, final
 
 import numpy as np
@@ -24,7 +25,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world._types import Integers as Numbers
-from scm_world.errors import ImpossibleObservation, ModelError, UnknownOption
+from scm_world.errors import ImpossibleObservation, InterventionError, ModelError, UnknownOption
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier, first_value, noise_of
 from scm_world.queries.equations import Layout
@@ -47,6 +48,7 @@ from scm_world.variables import (
     Shift,
     Table,
 )
+from scm_world.variables.checks import coerce
 
 DRAWS = 1000
 """How many draws of its noise there are for each unit, where it does not follow exactly."""
@@ -61,7 +63,8 @@ class Counterfactuals(Mapping[str, Floats]):
     """What units that were observed would have been, under an intervention.
 
     As a mapping it gives the expected values: of one unit shape ``(*shape)``, of a table of units
-    ``(rows, *shape)``; with lagged edges the control step comes before the shape.
+    ``(rows, *shape)``; with lagged edges the control step comes before the shape. Categories have
+    no order and no mean: they are given where all draws agree, else ask for a ``probability``.
 
     Attributes:
         factual: What the units may have been, by variable: one value for each draw of what was not
@@ -84,7 +87,12 @@ class Counterfactuals(Mapping[str, Floats]):
     model: SCM
 
     def __getitem__(self, name: str) -> Floats:
-        return self._mean(self.counterfactual[name])
+        found = self.counterfactual[name]
+        weights = self.weights.reshape(self.weights.shape + (1,) * (found.ndim - 2))
+        first = np.take_along_axis(found, weights.argmax(axis=1, keepdims=True), axis=1)
+        if ((found != first) & (weights > 0.0)).any():
+            self._refuse_categories(name)
+        return self._mean(found)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.counterfactual)
@@ -103,7 +111,13 @@ class Counterfactuals(Mapping[str, Floats]):
         return np.asarray(1.0 / (mass**2).sum(axis=1))
 
     def difference(self, name: str) -> Floats:
-        """Give the expected difference from what was: the effect on each unit."""
+        """Give the expected difference from what was: the effect on each unit.
+
+        Raises:
+            UnknownOption: The variable is categorical.
+            UnknownVariable: There is no such variable.
+        """
+        self._refuse_categories(name)
         return self._mean(self.counterfactual[name] - self.factual[name])
 
     def interval(self, name: str, level: float = 0.95) -> tuple[Floats, Floats]:
@@ -114,8 +128,13 @@ class Counterfactuals(Mapping[str, Floats]):
         Args:
             name: Of the variable.
             level: Between the two quantiles.
+
+        Raises:
+            UnknownOption: The variable is categorical, or the level is no number between 0 and 1.
+            UnknownVariable: There is no such variable.
         """
-        if not 0.0 < level < 1.0:
+        self._refuse_categories(name)
+        if isinstance(level, bool) or not isinstance(level, Real) or not 0.0 < level < 1.0:
             raise UnknownOption("level", level, ("a number between 0 and 1",))
         found = self.counterfactual[name]
         order = np.argsort(found, axis=1)
@@ -130,12 +149,31 @@ class Counterfactuals(Mapping[str, Floats]):
         return low, high
 
     def probability(self, name: str, value: Any) -> Floats:
-        """Give the probability of a value or a label under the intervention, for each unit."""
-        bounds = self.model.declared(name).bounds
-        if isinstance(value, str) and isinstance(bounds, Categories):
-            value = bounds.numbers(value)
-        found = self.counterfactual[name] == np.asarray(value)
-        return self._mean(found.astype(float))
+        """Give the probability of a value or a label under the intervention, for each unit.
+
+        Raises:
+            UnknownOption: The variable has no such value or label.
+            UnknownVariable: There is no such variable.
+        """
+        variable = self.model.declared(name)
+        bounds = variable.bounds if isinstance(variable.bounds, Categories) else None
+        try:
+            number = coerce(variable, value)
+        except InterventionError:
+            number = None
+        if number is None or (bounds is not None and not bounds.contains(number)):
+            allowed = (f"a number of dtype {variable.dtype}, shape {variable.shape}",)
+            if bounds is not None:
+                allowed = tuple(map(repr, (*bounds.labels, *bounds.members)))
+            raise UnknownOption(f"value of {name}", value, allowed)
+        found = self.counterfactual[name] == number
+        whole = tuple(range(found.ndim - number.ndim, found.ndim))
+        return self._mean(found.all(axis=whole).astype(float))
+
+    def _refuse_categories(self, name: str) -> None:
+        if self.model.declared(name).dtype == "categorical":
+            allowed = (f"a probability, as in probability({name!r}, value)",)
+            raise UnknownOption("mean or quantile of categories", name, allowed)
 
     def _mean(self, values: Floats) -> Floats:
         weights = self.weights.reshape(self.weights.shape + (1,) * (values.ndim - 2))

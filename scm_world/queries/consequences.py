@@ -30,7 +30,7 @@ class Consequence:
         right_after: Right after it.
         after: At the end.
         without: At the end, without the intervention.
-        difference: Largest difference of a component between these two.
+        difference: Largest difference of a component between these two; of categories 0 or 1.
     """
 
     unit: str
@@ -159,7 +159,9 @@ def _compared(
             continue
         difference = gap(after[name], without[name])
         moved = difference > 0.0 or gap(right_after[name], before[name]) > 0.0
-        unit = models[1].declared(name).unit
+        variable = models[1].declared(name)
+        if variable.dtype == "categorical":
+            difference = float(difference > 0.0)
         values = before[name], right_after[name], after[name], without[name]
-        rows[name] = Consequence(unit, name in follow, moved, *values, difference)
+        rows[name] = Consequence(variable.unit, name in follow, moved, *values, difference)
     return Consequences(audit, steps, rows, tuple(scenes), stepped.engine if is_world else "")

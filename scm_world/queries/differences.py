@@ -12,7 +12,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode
-from scm_world.queries.outcomes import as_outcome, read
+from scm_world.queries.outcomes import as_outcome, is_category, read
 from scm_world.variables import Draw, Natural
 
 NOISY = ("sensor_noise", "actuator_noise")
@@ -26,7 +26,7 @@ class Divergence:
 
     Attributes:
         first: The first instant at which it does.
-        largest: The largest difference of a component.
+        largest: The largest difference of a component; 1 where categories differ.
         at: The instant of that.
         final: The difference at the end, shape of the variable.
     """
@@ -97,7 +97,7 @@ def compare(
     both = [name for name in one.names if name in set(other.names)]
     wanted = both if names is None else list(names)
     first, second = one.replay(), other.replay()
-    found = {name: _divergence(one[name], other[name], tolerance) for name in wanted}
+    found = {name: _divergence(one, other, name, tolerance) for name in wanted}
     apart = {name: d for name, d in found.items() if d is not None}
     contacts = tuple(
         (step, pair, which)
@@ -111,16 +111,19 @@ def compare(
     return EpisodeDifference(ordered, contacts, tuple(alone))
 
 
-def _divergence(one: Any, other: Any, tolerance: float) -> Divergence | None:
-    if np.shape(one) != np.shape(other):
+def _divergence(first: Episode, second: Episode, name: str, tolerance: float) -> Divergence | None:
+    one, other = np.asarray(first[name], float), np.asarray(second[name], float)
+    if one.shape != other.shape:
         return Divergence(0, float("inf"), 0, np.asarray(np.inf))
-    apart = np.abs(np.asarray(one, float) - np.asarray(other, float)).reshape(len(one), -1)
+    if any(is_category(world, name) for _, world in first.trace.declarations):
+        one, other = (one != other).astype(float), np.zeros_like(one)
+    apart = np.abs(one - other).reshape(len(one), -1)
     sizes = apart.max(axis=1, initial=0.0)
     if not (sizes > tolerance).any():
         return None
     at = int(np.argmax(sizes))
     return Divergence(
-        int(np.argmax(sizes > tolerance)), float(sizes[at]), at, np.asarray(one[-1]) - other[-1]
+        int(np.argmax(sizes > tolerance)), float(sizes[at]), at, np.asarray(one[-1] - other[-1])
     )
 
 

@@ -196,7 +196,7 @@ class Equations:
 
     def reset(self, *, seed: int, episode: int = 0) -> None:
         """Begin an episode, or several: ``episode`` is then the number of the first one."""
-        self.noise = Noise(whole_number("seed", seed, least=0))
+        self.noise = Noise(seed)
         self.episode = whole_number("episode", episode, least=0)
         self._models = [self.model] * (int(self._groups.max()) + 1)
         self.index, self._before = 0, {}

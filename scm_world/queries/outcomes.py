@@ -13,6 +13,8 @@ from scm_world.queries.equations import Equations, System
 from scm_world.tasks.rewards import FRACTION
 from scm_world.variables.spaces import Frozen
 
+ORDERLESS = ("final", "first", "path")
+"""The summaries that categories have."""
 HOWS = ("final", "mean", "max", "min", "sum", "first", "change", "path")
 Given = "str | Outcome | Callable[[Episode], Any]"
 
@@ -98,6 +100,11 @@ def as_outcome(given: Any) -> Any:
         given,
         ("the name of a variable", "Outcome(name, how)", "a function of the episode"),
     )
+
+
+def is_category(world: Any, name: str) -> bool:
+    """Return whether a variable of a system has categories, whose numbers have no order or mean."""
+    return name in world.model and world.model.declared(name).dtype == "categorical"
 
 
 def usual_outcomes(world: System) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import Equations, System
 from scm_world.queries.estimates import Effect, effect_of
 from scm_world.queries.live import LiveEpisode
-from scm_world.queries.outcomes import Outcome, usual_outcomes
+from scm_world.queries.outcomes import Outcome, as_outcome, is_category, usual_outcomes
 from scm_world.queries.plans import Plan, numbered
 from scm_world.queries.progress import Progress, part
 from scm_world.queries.rollouts import Unit, as_names, length
@@ -39,6 +39,19 @@ class Questions(ABC):
     @abstractmethod
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
         """Add something to what is given in every episode."""
+
+    def _averaged(self, outcome: Any) -> System:
+        """Return a system that knows what is declared; refuse an outcome without a mean.
+
+        Raises:
+            UnknownOption: The outcome is a category.
+        """
+        system, wanted = self._asked()[1], as_outcome(outcome)
+        if isinstance(wanted, Outcome) and is_category(system, wanted.name):
+            event = f"lambda episode: episode.final({wanted.name!r}) == …"
+            allowed = ("a number", f"a function whose mean is a probability, as {event}")
+            raise UnknownOption("outcome of an effect", outcome, allowed)
+        return system
 
     def rollout(
         self,
@@ -175,8 +188,12 @@ class Questions(ABC):
 
         Returns:
             Mean and 95 % interval of the difference, and by how much pairing pays.
+
+        Raises:
+            UnknownOption: The outcome is a category, which has no mean: ask for the probability of
+                one, with a function.
         """
-        count = whole_number("n", n, least=2)
+        system, count = self._averaged(outcome), whole_number("n", n, least=2)
         treated, control = (
             self.sample(count, plan, outcomes=(outcome,), first=first, progress=share, **setting)
             for plan, first, share in (
@@ -184,7 +201,7 @@ class Questions(ABC):
                 (versus, 0 if paired else count, part(progress, count, 2 * count)),
             )
         )
-        return effect_of(self._asked()[1], outcome, treated, control, paired=paired)
+        return effect_of(system, outcome, treated, control, paired=paired)
 
     def direct_effect(
         self,
@@ -225,6 +242,7 @@ class Questions(ABC):
             arms = ({**given, **mediators} for given in (do, versus or {}))
             both: dict[str, Any] = {**setting, "n": n, "progress": progress}
             return self.effect(outcome, do=next(arms), versus=next(arms), **both)
+        self._averaged(outcome)
         names, (twins, system) = as_names(mediators), self._asked()
         if not isinstance(system, Equations) or system.model.is_temporal:
             allowed = ("values of mediators by name, such as {'m': 1.0}: the controlled effect",)
@@ -268,7 +286,7 @@ class Questions(ABC):
         """
         if len(values) < 2:
             raise UnknownOption("values", values, ("two or more values of the variable",))
-        count = whole_number("n", n, least=2)
+        system, count = self._averaged(outcome), whole_number("n", n, least=2)
         control, *others = (
             self.sample(
                 count,
@@ -279,7 +297,7 @@ class Questions(ABC):
             )
             for index, value in enumerate(values)
         )
-        return tuple(effect_of(self._asked()[1], outcome, one, control) for one in others)
+        return tuple(effect_of(system, outcome, one, control) for one in others)
 
     def effect_by(
         self,
@@ -309,6 +327,7 @@ class Questions(ABC):
         Returns:
             For each group the ends of the covariate, and the effect.
         """
+        system, covariate = self._averaged(outcome), as_outcome(by)
         count = whole_number("n", n, least=2 * whole_number("bins", bins, least=1))
         treated, control = (
             self.sample(count, plan, outcomes=(outcome, by), progress=share, **setting)
@@ -321,11 +340,15 @@ class Questions(ABC):
         if place.ndim != 1:
             allowed = ("one number for each unit, such as Outcome(name, 'first', 0)",)
             raise UnknownOption("by", by, allowed)
+        kinds = len(np.unique(place))
+        category = isinstance(covariate, Outcome) and is_category(system, covariate.name)
+        if category and kinds > bins:
+            raise UnknownOption("bins", bins, (f"{kinds} or more: categories have no order",))
         groups = _alike(place, bins)
         return tuple(
             (
                 (float(place[group].min()), float(place[group].max())),
-                effect_of(self._asked()[1], outcome, treated, control, rows=group),
+                effect_of(system, outcome, treated, control, rows=group),
             )
             for group in groups
         )

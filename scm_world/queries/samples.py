@@ -16,7 +16,15 @@ from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import Equations, System
-from scm_world.queries.outcomes import Outcome, as_numbers, as_outcome, column, read
+from scm_world.queries.outcomes import (
+    ORDERLESS,
+    Outcome,
+    as_numbers,
+    as_outcome,
+    column,
+    is_category,
+    read,
+)
 from scm_world.queries.parallel import Result, paths, run_units
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
@@ -207,11 +215,15 @@ def sample(
         progress: Called after each episode.
 
     Raises:
-        UnknownOption: An intervention would begin when the episode has ended.
+        UnknownOption: An intervention would begin when the episode has ended, or an outcome
+            averages categories.
     """
     count = whole_number("n", n, least=1)
     given = (outcomes,) if isinstance(outcomes, str | Outcome) else outcomes
     wanted = [as_outcome(outcome) for outcome in given]
+    for one in wanted:
+        if isinstance(one, Outcome) and one.how not in ORDERLESS and is_category(world, one.name):
+            raise UnknownOption(f"summary of the categories of {one.name!r}", one.how, ORDERLESS)
     names = tuple(dict.fromkeys(one.name for one in wanted if isinstance(one, Outcome)))
     done = 0
 

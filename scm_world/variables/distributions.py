@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import Annotated, Any, Literal, Self, final
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from scm_world._types import Floats, Value, Values
 from scm_world.variables.spaces import (
@@ -16,6 +16,7 @@ from scm_world.variables.spaces import (
     Frozen,
     Integers,
     Rotations,
+    refuse_infinite,
 )
 
 
@@ -266,8 +267,14 @@ def Empirical(sample: Any) -> Discrete:  # noqa: N802
     return Discrete(np.ravel(np.asarray(sample, dtype=float)))
 
 
+def _finite(source: Any) -> Any:
+    refuse_infinite("distribution", source)
+    return source
+
+
 Distribution = Annotated[
     Box | Integers | Categories | Either | Rotations | Normal | Cylinder | Continuous | Discrete,
     Field(discriminator="kind"),
+    AfterValidator(_finite),
 ]
 """Anything one can draw from; a space stands for the uniform distribution over it."""

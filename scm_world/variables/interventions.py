@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.variables.distributions import Distribution
@@ -42,6 +42,8 @@ def _without_bundle(data: dict[str, Any], *names: str) -> dict[str, Any]:
 class Hard(Frozen):
     """Set a variable to a value, independently of its parents."""
 
+    model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
+
     kind: Literal["hard"] = "hard"
     value: Number
 
@@ -58,6 +60,8 @@ class Shift(Frozen):
         Shift(kind='shift', by=0.1)
     """
 
+    model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
+
     kind: Literal["shift"] = "shift"
     by: Number
 
@@ -68,6 +72,8 @@ class Shift(Frozen):
 @final
 class Scale(Frozen):
     """Multiply what a variable would have been. Its parents remain causes."""
+
+    model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
 
     kind: Literal["scale"] = "scale"
     by: Number

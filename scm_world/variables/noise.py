@@ -15,6 +15,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world.variables.distributions import Distribution
 
@@ -33,6 +34,9 @@ class Noise:
     Args:
         seed: Any whole number that is not negative.
 
+    Raises:
+        UnknownOption: The seed is not one.
+
     Attributes:
         key: The 64 bits by which the seed selects its streams.
 
@@ -44,7 +48,7 @@ class Noise:
     """
 
     def __init__(self, seed: int) -> None:
-        self.seed = seed
+        self.seed = whole_number("seed", seed, least=0)
         self.key = word_of(f"seed {seed}")
 
     def __eq__(self, other: object) -> bool:

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property, lru_cache
-from math import prod
-from operator import gt
+from math import isnan, prod
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, final
 
 import numpy as np
@@ -87,9 +86,12 @@ def refused_fields(kind: Any, error: ValidationError) -> ScmWorldError:
 
 
 class Frozen(BaseModel, metaclass=_Named):
-    """A declaration: immutable, strict about its fields, and the same after a JSON round trip."""
+    """A declaration: immutable, strict about its fields, and the same after a JSON round trip.
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    Its numbers are finite.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     if TYPE_CHECKING:  # subclasses that take other arguments pass their fields on
 
@@ -195,7 +197,7 @@ class Box(_Space):
 
     Attributes:
         low: One number for all components, or one for each, or a function of a parent.
-        high: Likewise.
+        high: Likewise. An end may be infinite where nothing is drawn from the box.
 
     Example:
         >>> Box(0.015, 0.045).contains(np.array(0.02))
@@ -204,6 +206,8 @@ class Box(_Space):
         >>> floor_level.bounds((2,), {"size": np.array(0.06)})[0]
         array([0.  , 0.03])
     """
+
+    model_config = ConfigDict(allow_inf_nan=True)
 
     kind: Literal["box"] = "box"
     low: Bounds
@@ -214,14 +218,16 @@ class Box(_Space):
 
     def model_post_init(self, context: Any) -> None:
         """Refuse an empty box; a validator would do so again in every declaration that has it."""
-        ends = (bound if isinstance(bound, tuple) else (bound,) for bound in (self.low, self.high))
-        low, high = (
-            [np.nan if isinstance(part, Affine | Switch) else part for part in end] for end in ends
-        )
+        low, high = (end if isinstance(end, tuple) else (end,) for end in (self.low, self.high))
+        if any(isinstance(part, float) and isnan(part) for part in (*low, *high)):
+            raise ValueError(f"an end of a box is not a number: {self.low} and {self.high}")
         if len(low) != len(high) and min(len(low), len(high)) != 1:
             raise ValueError(f"a box has corners of one shape; these have {len(low)}, {len(high)}")
         n = max(len(low), len(high))
-        if any(map(gt, low if len(low) == n else n * low, high if len(high) == n else n * high)):
+        ends = zip(
+            low if len(low) == n else n * low, high if len(high) == n else n * high, strict=True
+        )
+        if any(isinstance(a, float) and isinstance(b, float) and a > b for a, b in ends):
             raise ValueError(f"a box is empty where low > high: {self.low} and {self.high}")
 
     @cached_property
@@ -285,6 +291,22 @@ class Box(_Space):
         """Write the box down."""
         low, high = self.bounds(shape, values)
         return f"[{np.array2string(low, precision=6)}, {np.array2string(high, precision=6)}]"
+
+
+def refuse_infinite(option: str, region: Any) -> None:
+    """Refuse a box that cannot be drawn from.
+
+    Args:
+        option: Its name, for the error.
+        region: Anything.
+
+    Raises:
+        UnknownOption: An end of it is not finite.
+    """
+    if isinstance(region, Box):
+        ends = [*np.ravel(np.array(region.low, object)), *np.ravel(np.array(region.high, object))]
+        if any(isinstance(end, float | int) and not np.isfinite(end) for end in ends):
+            raise UnknownOption(option, region, ("a box with finite ends",))
 
 
 @final

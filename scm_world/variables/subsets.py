@@ -12,11 +12,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from fnmatch import fnmatchcase
 from typing import Any, final
 
-import numpy as np
-
 from scm_world.errors import UnknownOption
 from scm_world.variables.kinds import SPACES, SpaceName
-from scm_world.variables.spaces import Box, Frozen, Space
+from scm_world.variables.spaces import Frozen, Space, refuse_infinite
 
 Region = SpaceName | Space
 """A declared space by its name, or a custom set."""
@@ -111,22 +109,6 @@ def _pair(pair: Any) -> tuple[str, Any]:
         raise UnknownOption(f"region of {pattern}", region, (*SPACES, "a set, such as a Box"))
     refuse_infinite(f"region of {pattern}", region)
     return pattern, region
-
-
-def refuse_infinite(option: str, region: Any) -> None:
-    """Refuse a box that cannot be drawn from.
-
-    Args:
-        option: Its name, for the error.
-        region: Anything.
-
-    Raises:
-        UnknownOption: An end of it is not finite.
-    """
-    if isinstance(region, Box):
-        ends = [*np.ravel(np.array(region.low, object)), *np.ravel(np.array(region.high, object))]
-        if any(isinstance(end, float | int) and not np.isfinite(end) for end in ends):
-            raise UnknownOption(option, region, ("a box with finite ends",))
 
 
 def _patterns(given: str | tuple[str, ...]) -> tuple[str, ...]:

@@ -243,7 +243,7 @@ class Simulation(WorldAttributes):
             InterventionError: The intervention was refused. The episode has begun without it.
         """
         if seed is not None:
-            self.noise = CompiledNoise(whole_number("seed", seed, least=0))
+            self.noise = CompiledNoise(seed)
             self.episode = whole_number("episode", episode, least=0)
         elif not self._started:
             self.noise, self.episode = CompiledNoise(secrets.randbits(63)), 0

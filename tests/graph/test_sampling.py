@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from graph_models import small
 
-from scm_world.errors import (
-    ModelError,
-)
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.variables import (
     Derived,
@@ -18,6 +16,7 @@ from scm_world.variables import (
     Exogenous,
     Linear,
     Measured,
+    Noise,
     Normal,
     Parent,
     Shift,
@@ -107,3 +106,26 @@ def test_do_on_a_process_does_not_shift_its_noise() -> None:
     after = lagged().do({"x": 0.0}).draw(4, seed=0, steps=5)
     np.testing.assert_array_equal(before["push"], after["push"])
     np.testing.assert_array_equal(after["y"][:, 1:], np.zeros((4, 4)))
+
+
+@pytest.mark.parametrize("seed", [1.0, True, None, "1", -1, float("nan"), np.array([1])], ids=repr)
+def test_a_seed_is_a_whole_number(seed: Any) -> None:
+    """Anything else would be another stream than that of the number that it looks like."""
+    with pytest.raises(UnknownOption, match="seed cannot be"):
+        small().draw(1, seed=seed)
+    with pytest.raises(UnknownOption, match="seed"):
+        Noise(seed)
+
+
+def test_numbers_of_rows_and_steps_are_whole() -> None:
+    """No rows cannot be drawn, nor half a row; rows and steps are counted from 0."""
+    np.testing.assert_array_equal(
+        small().draw(1, seed=np.int64(1))["drag"], small().draw(1, seed=1)["drag"]
+    )
+    for n in (0, -1, 1.5, None, True):
+        with pytest.raises(UnknownOption, match="n cannot be"):
+            small().draw(n, seed=0)  # type: ignore[arg-type] # that is the point
+    with pytest.raises(UnknownOption, match="first"):
+        small().draw(1, seed=0, first=-1)
+    with pytest.raises(UnknownOption, match="steps"):
+        lagged().draw(1, seed=0, steps=0)

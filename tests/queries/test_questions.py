@@ -40,9 +40,18 @@ from scm_world.errors import (
 )
 from scm_world.evaluation import as_player
 from scm_world.graph import from_json, to_json
-from scm_world.queries import Effect, Episode, Samples, Verification, load_episode, save_episode
+from scm_world.queries import (
+    Effect,
+    Episode,
+    Samples,
+    Verification,
+    compare,
+    consequences,
+    load_episode,
+    save_episode,
+)
 from scm_world.tasks import StepTask
-from scm_world.variables import Measured, Normal
+from scm_world.variables import Bernoulli, Categories, Measured, Normal, Table
 
 RATE = Exogenous(name="rate", default=0.3, bounds=Box(0.0, 2.0), a=Box(0.2, 0.4))
 PUSH = Action(name="push", bounds=Box(-1.0, 1.0))
@@ -281,6 +290,44 @@ def test_effects_of_a_linear_model_are_its_weights() -> None:
     assert found.excludes_zero
     assert found.as_dict()["low"] is None
     assert chain().effect("x", do={"z": 1.0}, n=20).mean == 0.0
+
+
+def test_categories_have_no_mean_in_effects() -> None:
+    """Codes are not averaged, in any effect or summary; a function asks for a probability."""
+    kind: dict[str, Any] = {"dtype": "categorical", "bounds": Categories((3, 7, 9), tuple("rgb"))}
+    table = Table([[0.8, 0.1, 0.1], [0.1, 0.8, 0.1]], values=(3, 7, 9))
+    model = SCM(
+        [
+            Exogenous(name="t", distribution=Bernoulli(0.5), dtype="integer"),
+            Derived(name="c", parents=("t",), mechanism=table, **kind),
+        ]
+    )
+    arms: dict[str, Any] = {"do": {"t": 1}, "versus": {"t": 0}}
+    asks = (
+        lambda: model.effect("c", **arms),
+        lambda: model.effect(Outcome("c", "path"), **arms),
+        lambda: model.direct_effect("c", **arms, mediators={"t": 0}),
+        lambda: model.direct_effect("c", **arms, mediators=["t"]),
+        lambda: model.effect_over("c", name="t", values=[0, 1]),
+        lambda: model.effect_by("c", **arms, by="t"),
+    )
+    for ask in asks:
+        with pytest.raises(UnknownOption, match=r"lambda episode: episode.final\('c'\) == "):
+            ask()
+    for how in ("mean", "sum", "max", "change"):
+        with pytest.raises(UnknownOption, match="there are: final, first, path"):
+            model.sample(3, outcomes=[Outcome("c", how)])
+    with pytest.raises(UnknownOption, match="3 or more: categories have no order"):
+        model.effect_by("t", do={"t": 1}, by="c", bins=2)
+    assert set(model.sample(50)["c"]) == {3.0, 7.0, 9.0}
+    found = model.effect(lambda episode: episode.final("c") == 3, **arms, n=400)
+    assert found.mean == pytest.approx(-0.7, abs=0.1)
+    one = model.rollout(seed=0, do={"t": 0})
+    others = (one.counterfactual({"c": label}) for label in (3, 7, 9))
+    apart = [compare(one, other).variables.get("c") for other in others]
+    assert sorted(0.0 if each is None else each.largest for each in apart) == [0.0, 1.0, 1.0]
+    moved = {consequences(model, {"t": 1}, seed=k).variables["c"].difference for k in range(9)}
+    assert moved == {0.0, 1.0}
 
 
 def test_an_intervention_counts_from_the_beginning() -> None:

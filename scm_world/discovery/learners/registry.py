@@ -194,7 +194,7 @@ def learn(
         settings = {"blocks": level == "variable", **settings}
     started = time.perf_counter()
     with blamed(f"the learner {chosen.name!r}"):
-        result = chosen.learn(table, seed=seed, **settings)
+        result = chosen.learn(table, seed=whole_number("seed", seed, least=0), **settings)
     seconds = time.perf_counter() - started
     if not isinstance(result, EstimatedGraph) and not isinstance(table, Dataset):
         raise ModelError([f"the learner {chosen.name!r} has to give an EstimatedGraph"])

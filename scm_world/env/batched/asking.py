@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.env.arguments import doubles, finite
 from scm_world.errors import ActionError, UnknownOption
@@ -34,9 +35,9 @@ def seeds_of(seed: Any, size: int) -> list[int | None]:
         return [None] * size
     try:
         if not isinstance(seed, Sequence | np.ndarray):
-            return [operator.index(seed) + i for i in range(size)]
-        seeds = [None if one is None else operator.index(one) for one in seed]
-    except TypeError:
+            return [whole_number("seed", seed, least=0) + i for i in range(size)]
+        seeds = [None if one is None else whole_number("seed", one, least=0) for one in seed]
+    except UnknownOption:
         seeds = []
     if len(seeds) != size:
         raise UnknownOption("seed", seed, ("a whole number", f"a list of {size} of them or None"))

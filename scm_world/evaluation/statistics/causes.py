@@ -365,8 +365,9 @@ def _share(
     fitted = regressors @ (regressors.T @ centered) / n
     raw = float(np.square(fitted).mean()) / variance
 
+    rng = np.random.default_rng(whole_number("seed", seed, least=0))
     places = np.tile(np.arange(n), (permutations, 1))
-    shuffled = centered[np.random.default_rng(seed).permuted(places, axis=1)]
+    shuffled = centered[rng.permuted(places, axis=1)]
     by_chance = np.square(shuffled @ regressors / n).sum(axis=1) / variance
     p = (1 + int(np.count_nonzero(by_chance >= raw - 1e-12))) / (1 + permutations)
 
