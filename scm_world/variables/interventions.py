@@ -11,12 +11,18 @@ from collections.abc import Iterator
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
-from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import (
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.variables.distributions import Distribution
-from scm_world.variables.kinds import SPACES, AsMechanism, AsParents, Parent, SpaceName
-from scm_world.variables.mechanisms import Concatenation, Function, Linear, Table
+from scm_world.variables.kinds import SPACES, AsMechanism, AsParents, Parent, SpaceName, names
+from scm_world.variables.mechanisms import Concatenation, Function, Linear, Table, check_order
 from scm_world.variables.spaces import Frozen
 
 Number = float | tuple[float, ...]
@@ -132,7 +138,8 @@ class Mechanism(Frozen):
 
     Attributes:
         function: Called with the values of the parents, in their order, and with ``noise=`` if it
-            takes that; None for the variable's own.
+            takes that; None for the variable's own. One whose arguments have the names of the
+            parents in another order is refused.
         parents: The causes; the graph then has these edges in place of the others.
         noise: Distribution of the noise; that of the variable if None.
         of: A bundle that the function gives as a whole; the variable gets its part of it.
@@ -169,6 +176,11 @@ class Mechanism(Frozen):
             allowed = ("a function of the parents", "Function", "Linear", "Table")
             raise UnknownOption("Mechanism(function)", function, allowed)
         super().__init__(function=function, parents=named, **fields)
+
+    @model_validator(mode="after")
+    def _arguments_are_in_order(self) -> Mechanism:
+        check_order("Mechanism", self.function, names(self.parents))
+        return self
 
 
 @final

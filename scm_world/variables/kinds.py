@@ -11,7 +11,14 @@ from pydantic import BeforeValidator, Field, WrapValidator, model_validator
 
 from scm_world._types import Value, Values
 from scm_world.variables.distributions import Distribution
-from scm_world.variables.mechanisms import Concatenation, Equation, Function, Linear, Table
+from scm_world.variables.mechanisms import (
+    Concatenation,
+    Equation,
+    Function,
+    Linear,
+    Table,
+    check_order,
+)
 from scm_world.variables.spaces import (
     Box,
     Categories,
@@ -290,7 +297,8 @@ class Derived(Variable):
     """A Python function of its parents.
 
     Attributes:
-        parents: Its causes, in the order in which the mechanism takes them.
+        parents: Its causes, in the order in which the mechanism takes them. A function whose
+            arguments have their names in another order is refused.
         mechanism: The function.
         noise: Distribution of its own noise, or None. The mechanism takes it as ``noise=``.
         noise_shape: Shape of the noise; that of the variable if None.
@@ -342,6 +350,8 @@ class Derived(Variable):
             raise ValueError(
                 f"{self.name}: {len(expected)} weights for {len(self.parents)} parents"
             )
+        check_order(self.name, self.mechanism, names(self.parents))
+        check_order(self.name, self.inverse_noise, names(self.parents), before=1)
         if self.noise is None and (self.noise_shape is not None or self.inverse_noise is not None):
             raise ValueError(f"{self.name}: noise_shape and inverse_noise need a noise")
         return self
@@ -394,6 +404,14 @@ class Measured(Variable):
     def settable(self) -> bool:
         """Whether ``do`` accepts it."""
         return self.settable_state
+
+    @model_validator(mode="after")
+    def _arguments_are_in_order(self) -> Measured:
+        if self.mechanism is not None:
+            check_order(self.name, self.mechanism, names(self.parents))
+        if self.start is not None:
+            check_order(self.name, self.start, self.set_parents())
+        return self
 
     def set_parents(self) -> tuple[str, ...]:
         """Name the parents that act when the state is set."""

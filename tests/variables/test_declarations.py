@@ -39,6 +39,7 @@ from scm_world.variables import (
     Laplace,
     Linear,
     Measured,
+    Mechanism,
     Normal,
     Parent,
     Rotations,
@@ -295,3 +296,69 @@ def test_an_error_about_b_offers_a_value_of_b() -> None:
     with pytest.raises(OutOfSpace, match="without A") as caught:
         check_space(mass, np.array(0.03), "B", {})
     check_space(mass, np.array(caught.value.nearest), "B", {})
+
+
+class Difference:
+    """A callable object, and a method."""
+
+    def __call__(self, c: Any, b: Any) -> Any:
+        """Subtract."""
+        return c - b
+
+    def of(self, c: Any, b: Any) -> Any:
+        """Subtract."""
+        return c - b
+
+
+@pytest.mark.parametrize(
+    ("function", "parents"),
+    [
+        (lambda c, b: c - b, ("b", "c")),
+        (lambda c, b, noise: c - b + noise, ("b", "c")),
+        (lambda b, c, a: c - b, ("a", "b", "c")),
+        (lambda c, b, k: c - b, ("b", "c", "d")),
+        (lambda position, velocity: position, ("cart.velocity", "cart.position")),
+        (lambda cart_position, cart_velocity: 0.0, ("cart.velocity", "cart.position")),
+        (Difference(), ("b", "c")),
+        (Difference().of, ("b", "c")),
+        (Function(lambda c, b: c - b), (Parent("b", 1), "c")),
+    ],
+)
+def test_arguments_named_as_parents_stand_in_their_order(function: Any, parents: Any) -> None:
+    """Parents bind by position, so a permutation of their names would be exchanged in silence."""
+    for declare in (
+        lambda: Derived(name="y", parents=parents, mechanism=function, noise=Normal()),
+        lambda: Measured(name="y", parents=parents, mechanism=function),
+        lambda: Mechanism(function, parents),
+    ):
+        with pytest.raises(ModelError, match="the function takes its parents in the order"):
+            declare()
+
+
+@pytest.mark.parametrize(
+    ("function", "parents"),
+    [
+        (lambda b, c: c - b, ("b", "c")),
+        (lambda one, other: one - other, ("b", "c")),
+        (lambda x, y: x - y, ("y", "z")),
+        (lambda mass, friction: mass, ("a.mass", "b.mass")),
+        (lambda x, before: x - before, (Parent("x", 1), "x")),
+        (np.maximum, ("b", "c")),
+    ],
+)
+def test_other_names_of_arguments_say_nothing(function: Any, parents: Any) -> None:
+    """A function for any variables binds by position."""
+    made = Derived(name="w", parents=parents, mechanism=function)
+    assert names(made.parents) == tuple(p if isinstance(p, str) else p.name for p in parents)
+
+
+def test_the_inverse_of_noise_takes_the_parents_in_their_order() -> None:
+    """After the value of the variable."""
+    with pytest.raises(ModelError, match=r"y: .* in the order \(c, b\)"):
+        Derived(
+            name="y",
+            parents=("b", "c"),
+            mechanism=lambda b, c, noise: b - c + noise,
+            noise=Normal(),
+            inverse_noise=lambda value, c, b: value - b + c,
+        )
