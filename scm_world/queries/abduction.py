@@ -37,6 +37,7 @@ from scm_world.variables import (
     Action,
     Box,
     Categories,
+    Derived,
     Discrete,
     Draw,
     Exogenous,
@@ -334,10 +335,13 @@ class _Abduction:
                 drawn = key.natural(source, name, variable.shape, values)
             else:
                 drawn = noise_of(variable, variable, key, values)["noise"]
+            known = there
             if not there.all():
+                drawn, known = self._from_below(variable, source, drawn, there)
+            if not known.all():
                 self.sampled = True
                 self._unsure.add(name)
-                drawn = self._each(variable, source, drawn, there)
+                drawn = self._each(variable, source, drawn, known)
             given[name] = drawn
             if there.any():
                 natural = self._natural(name, wanted, there)
@@ -354,6 +358,73 @@ class _Abduction:
             self._weigh(name, there, self.near(value, wanted, whole=True), unsure=unsure)
             value = self._where(there, wanted, value)
         values[name] = value if variable.dtype == "real" else np.rint(value).astype(np.int64)
+
+    def _from_below(
+        self, variable: Any, source: Any, drawn: Value, there: Value
+    ) -> tuple[Value, Value]:
+        """Find hidden noise where something that follows from it without noise was observed.
+
+        Returns:
+            The noise, and for which units it is known.
+        """
+        name, own = variable.name, getattr(variable, "noise_shape", None)
+        shape = variable.shape if own is None else own
+        path = self._path_down(name, shape)
+        if not path or isinstance(getattr(variable, "mechanism", None), Table):
+            return drawn, there
+        if isinstance(source, Discrete | Categories | Integers) or source.parents():
+            return drawn, there
+        end = self.model[path[-1]]
+        wanted = self._observed[end.name][self._step]
+        seen = ~there & ~np.isnan(wanted).reshape(self._size, -1).any(axis=1)
+        form: Any = {"shape": end.shape, "dtype": end.dtype, "bounds": end.bounds}
+        below = Derived(
+            name=end.name, parents=(), mechanism=_Below(self, path), noise=source, **form
+        )
+        known = there | seen
+        causes = {parent.name for each in path for parent in self.model[each].all_parents}
+        unsure = not self._unsure.isdisjoint(causes)
+        weigh = unsure or not known.all()
+        value = self._where(seen, wanted, np.zeros_like(wanted))
+        found, log, possible, several = Inverse(self, below, source, [], self._step, 1).solve(
+            value, weigh=weigh
+        )
+        self.sampled |= several
+        if several or unsure:
+            self._unsure.add(name)
+        self._weigh(end.name, seen, possible, unsure=unsure)
+        self.log_weights += np.where(seen, log, 0.0)
+        return self._where(seen, found, drawn), known
+
+    def _path_down(self, name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
+        """List a hidden variable, and what follows from it without noise, to what was observed.
+
+        Args:
+            name: Of the variable.
+            shape: Of its noise, which is that of the observation.
+        """
+        known, path = {*self.values[-1]}, [name]
+        for other in self.model.structure.order:
+            variable: Any = self.model[other]
+            causes = {parent.name for parent in variable.all_parents if not parent.lag}
+            if other in known or causes.isdisjoint(path) or not causes <= known | {*path}:
+                continue
+            if getattr(variable, "noise", None) is not None or _is_free(variable):
+                continue
+            observed = other in self._observed
+            if observed and variable.shape == shape:
+                return (*path, other)
+            path += [other] * (not observed)
+        return ()
+
+    def along(self, path: tuple[str, ...], noise: Value) -> Value:
+        """Compute the last of some variables from the noise of the first, for all units."""
+        values, kept = dict(self.values[-1]), self.given[-1]
+        self.given[-1] = {**kept, path[0]: noise}
+        for name in path:
+            values[name] = self._computed(self.model, name, values, self._before, self._step)
+        self.given[-1] = kept
+        return values[path[-1]]
 
     def _each(self, variable: Any, source: Any, drawn: Value, there: Value) -> Value:
         """Give every value of a hidden discrete noise, or category of a table, its share of draws.
@@ -429,7 +500,12 @@ class _Abduction:
         return Inverse(self, variable, source, parents, self._step, each).solve(value, weigh=weigh)
 
     def _weigh(self, name: str, there: Value, possible: Value, *, unsure: bool) -> None:
-        """Leave out draws that contradict an observation; refuse what no draw gives."""
+        """Leave out draws that contradict an observation; refuse what no draw gives.
+
+        Raises:
+            ImpossibleObservation: The model cannot give it.
+            ModelError: It can, for all that is known, but no draw of what was not observed does.
+        """
         wrong = there & ~possible
         self.log_weights[wrong] = -np.inf
         lost = np.isinf(self.log_weights.reshape(self._rows, self.n)).all(axis=1)
@@ -442,9 +518,10 @@ class _Abduction:
                 said += "its causes give another value, and it has no noise"
             if unsure:
                 said = (
-                    f"{said}, in none of {self.n} draws of the causes that were not observed; "
-                    "observe them, give it noise, or draw more (n)"
+                    f"{name!r}: {said}, in none of {self.n} draws of the causes that were not "
+                    "observed; observe them, give it noise, or draw more (n)"
                 )
+                raise ModelError([said])  # the model may give it: it was not met
             raise ImpossibleObservation(name, said)
 
     # --- action and prediction ------------------------------------------------------------------
@@ -608,7 +685,7 @@ class _Abduction:
 
     def apply(self, function: Any, parents: list[Value], noise: Mapping[str, Value]) -> Value:
         """Call a mechanism for all units."""
-        if self._together:
+        if self._together or isinstance(function, _Below):
             return np.asarray(function(*parents, **noise))
         rows = range(len(next(iter([*noise.values(), *parents]))))
         return np.array([function(*(p[i] for p in parents), **_row(noise, i)) for i in rows])
@@ -618,6 +695,24 @@ class _Abduction:
         n = int(np.prod(shape))
         drawn = self._noise.uniforms(name, n=n, step=step, count=self._size)
         return drawn.reshape(self._size, *shape)
+
+
+@final
+@dataclass(frozen=True)
+class _Below:
+    """What follows from hidden noise without further noise, as a function of it.
+
+    Attributes:
+        units: That were observed.
+        path: The variables, see ``_Abduction.along``.
+    """
+
+    units: _Abduction
+    path: tuple[str, ...]
+
+    def __call__(self, *, noise: Value) -> Value:
+        """Compute it for all units."""
+        return self.units.along(self.path, noise)
 
 
 def _row(values: Values, row: int) -> dict[str, Value]:

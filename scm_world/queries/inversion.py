@@ -6,7 +6,7 @@ value by value; all else is looked for between quantiles of the noise.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, Protocol, final
@@ -29,6 +29,9 @@ from scm_world.variables import (
 _TAILS = np.array([1e-12, 1e-9, 1e-6])
 SHARES = np.concatenate([_TAILS, np.linspace(1e-4, 1.0 - 1e-4, 257), 1.0 - _TAILS[::-1]])
 """Of the quantiles of the noise between which solutions are looked for."""
+
+BEYOND = 12
+"""How many points there are beyond the quantiles at each end, each four times as far out."""
 
 JOINT = 4096
 """How many values a discrete noise may have in all."""
@@ -83,6 +86,14 @@ class Inverse:
     def _gives(self, noise: Value) -> Value:
         return self._units.apply(self._function, self._parents, {"noise": noise})
 
+    def _tried(self, noise: Value) -> Value:
+        """Call the function where it may not be defined; NaN where it is not."""
+        try:
+            with np.errstate(all="ignore"):
+                return self._gives(noise)
+        except (ArithmeticError, ValueError):  # ``math.log(0.0)``
+            return np.full(np.shape(noise), np.nan)
+
     def _at(self, shape: tuple[int, ...], which: str = "abduction") -> Floats:
         return self._units.uniforms(f"{self._variable.name}|{which}", self._step, shape)
 
@@ -112,18 +123,29 @@ class Inverse:
             said += f"{variable.shape}: give it inverse_noise, so that it follows from the value"
             raise ModelError([said])
         if variable.dtype == "real":
-            noise = np.asarray(value - self._gives(np.zeros(np.shape(value))), dtype=float)
-            if isinstance(variable.mechanism, Linear) or self._is_added(value - noise):
-                return self._unique(noise, value, weigh)
+            still = np.asarray(self._tried(np.zeros(np.shape(value))), dtype=float)
+            slope = 1.0 if isinstance(variable.mechanism, Linear) else self._slope(still)
+            if np.all(slope):
+                return self._unique(np.asarray((value - still) / slope), value, weigh)
         return self._ranges(value)
 
-    def _is_added(self, still: Value) -> bool:
-        """Tell whether all noise, from end to end, moves the value by as much."""
+    def _slope(self, still: Value) -> Any:
+        """Return by how much noise is multiplied before it is added; 0 where it is not.
+
+        Args:
+            still: The value without noise.
+        """
+        points = [np.broadcast_to(self._density.quantile(s), still.shape) for s in SHARES[::16]]
         with np.errstate(all="ignore"):
-            return all(
-                np.allclose(self._gives(np.full_like(still, by)), still + by, rtol=1e-6, atol=1e-9)
-                for by in np.ravel(self._density.quantile(SHARES[::16]))
-            )
+            moved = [self._gives(point) for point in points]
+            if all(
+                np.allclose(m, still + p, 1e-6, 1e-9) for m, p in zip(moved, points, strict=True)
+            ):
+                return 1.0
+            slope = (moved[12] - moved[4]) / (points[12] - points[4])
+            lines = (still + slope * point for point in points)
+            affine = all(np.allclose(m, s, 1e-6, 1e-9) for m, s in zip(moved, lines, strict=True))
+        return slope if affine else 0.0
 
     def _unique(self, noise: Value, value: Value, weigh: bool) -> Found:
         """Check a noise that is the only one that gives the value."""
@@ -194,14 +216,36 @@ class Inverse:
         return place, np.where(possible, log, 0.0), possible, several
 
     def _ranges(self, value: Value) -> Found:
-        """Look for all noise that gives the value, component by component, between quantiles.
+        """Look for all noise that gives the value, component by component.
+
+        It is looked for between quantiles, and beyond them for units that have none there.
+        """
+        inner = [self._density.quantile(share) for share in SHARES]
+        found = self._between(value, inner)
+        if found[2].all():
+            return found
+        further = self._between(value, self._density.beyond(inner))
+        noise, log, possible = (
+            np.where(found[2].reshape(-1, *(1,) * (np.ndim(one) - 1)), one, other)
+            for one, other in zip(found[:3], further[:3], strict=True)
+        )
+        return noise, log, possible, found[3] or further[3]
+
+    def _between(self, value: Value, ends: Sequence[Floats]) -> Found:
+        """Look for noise that gives the value between some points.
 
         Solutions are single numbers, of which the density counts; or ranges, where whole numbers,
         thresholds and ceilings give one value for many noises: then their probability counts.
         """
         density, shape = self._density, np.shape(value)
-        points = np.stack([np.broadcast_to(density.quantile(s), shape[1:]) for s in SHARES])
+        points = np.stack([np.broadcast_to(end, shape[1:]) for end in ends])
         signs = np.stack([self._sign(np.broadcast_to(p, shape), value) for p in points])
+        middle = len(points) // 2
+        for at in range(1, middle + 1):  # a function may end before the noise does
+            for outer, nearer in ((middle - at, middle - at + 1), (middle + at, middle + at - 1)):
+                if outer < len(points):
+                    lost = np.isnan(signs[outer])
+                    signs[outer] = np.where(lost, signs[nearer], signs[outer])
         turns = signs[1:] != signs[:-1]
         number = np.cumsum(turns, axis=0)
         begin = np.broadcast_to(points[0], shape)
@@ -246,7 +290,7 @@ class Inverse:
 
     def _sign(self, noise: Value, value: Value) -> Value:
         """Tell whether noise gives too little (-1), the value (0) or too much (1)."""
-        given = self._gives(noise)
+        given = self._tried(noise)
         whole = self._variable.dtype != "real"
         return np.asarray(np.sign((np.rint(given) if whole else given) - value))
 
@@ -295,6 +339,14 @@ class Density:
     def quantile(self, share: Any) -> Floats:
         """Give a quantile of a continuous distribution."""
         return np.asarray(self.frozen.ppf(share))
+
+    def beyond(self, inner: list[Floats]) -> list[Floats]:
+        """Add points beyond quantiles of a continuous distribution, as far as it reaches."""
+        (first, last), middle = self.frozen.support(), self.quantile(0.5)
+        low, high = inner[0], inner[-1]
+        far = 4.0 ** np.arange(1, BEYOND + 1)
+        below = [np.maximum(middle + by * (low - middle), first) for by in far[::-1]]
+        return [*below, *inner, *(np.minimum(middle + by * (high - middle), last) for by in far)]
 
     def mass(self, low: Floats, high: Floats) -> Floats:
         """Give the probability of a range of a continuous distribution, in both tails as well."""

@@ -260,6 +260,101 @@ def test_observed_under_an_intervention() -> None:
     np.testing.assert_allclose(found["z"], wanted["z"], atol=1e-6)
 
 
+def added(x: Any, noise: Any) -> Any:
+    """Add."""
+    return x + noise
+
+
+@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize(
+    "mechanism",
+    [
+        lambda x, noise: 2.0 * x + noise,
+        lambda x, noise: x - 3.0 * noise,
+        lambda x, noise: 2.0 * x + (1.0 + x**2) * noise,
+        lambda x, noise: x + np.exp(noise),
+        lambda x, noise: x + np.sinh(noise),
+        lambda x, noise: x + noise**3,
+    ],
+    ids=["added", "negative", "scaled", "exp", "sinh", "cubed"],
+)
+def test_a_rare_value_is_inverted_as_any_other(mechanism: Any, together: bool) -> None:
+    """Nine and forty standard deviations from the mean, for functions of rows or of one unit."""
+
+    def function(x: Any, noise: Any) -> Any:
+        return mechanism(x, noise) if together else mechanism(alone(x, 0.0), float(noise))
+
+    model = SCM(
+        [
+            Exogenous(name="x", distribution=Normal()),
+            Derived(name="y", parents=("x",), mechanism=function, noise=Normal()),
+        ]
+    )
+    noise = np.array([-3.0, 0.5, 9.0, 20.0])
+    seen = {"x": np.full(4, 0.5), "y": mechanism(0.5, noise)}
+    found = model.counterfactual(seen, do={"x": 1.5})
+    assert found.exact
+    np.testing.assert_allclose(found["y"], mechanism(1.5, noise), rtol=1e-5, atol=1e-9)
+
+
+def test_a_value_beyond_bounded_noise_stays_impossible() -> None:
+    """However far one looks; its ends are possible."""
+    noise = Box(-1.0, 1.0)
+    scaled = Derived(
+        name="y", parents=("x",), mechanism=lambda x, noise: x + np.exp(noise), noise=noise
+    )
+    model = SCM([Exogenous(name="x", distribution=Normal()), scaled])
+    end = math.exp(1.0)
+    assert model.counterfactual({"x": 0.0, "y": end}, do={"x": 1.0})["y"] == pytest.approx(1 + end)
+    with pytest.raises(ImpossibleObservation, match="no value of its noise"):
+        model.counterfactual({"x": 0.0, "y": end + 0.01}, do={"x": 1.0})
+
+
+@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize("child", [lambda y: 2.0 * y + 1.0, lambda y: y**3])
+def test_what_was_not_observed_follows_from_a_child_without_noise(
+    child: Any, together: bool
+) -> None:
+    """Through another variable that was not observed either; exactly, if it is invertible."""
+    model = SCM(
+        [
+            Exogenous(name="x", distribution=Normal()),
+            Derived(
+                name="y",
+                parents=("x",),
+                mechanism=added if together else alone,
+                noise=Normal(),
+            ),
+            Derived(name="m", parents=("y",), mechanism=lambda y: -y),
+            Derived(name="z", parents=("m", "x"), mechanism=lambda m, x: child(m) + x),
+        ]
+    )
+    whole = model.sample(5, seed=2)
+    found = model.counterfactual({"x": whole["x"], "z": whole["z"]}, do={"x": 1.0})
+    assert found.exact
+    wanted = model.counterfactual(whole, do={"x": 1.0})
+    for name in model:
+        np.testing.assert_allclose(found[name], wanted[name], atol=1e-5)
+
+
+def test_hidden_causes_of_a_sum_have_their_posterior() -> None:
+    """Of two normal summands that make 1, each has mean 1/2 and variance 1/2."""
+    parts = [Exogenous(name=name, distribution=Normal()) for name in "ab"]
+    total = Derived(name="s", parents=("a", "b"), mechanism=lambda a, b: a + b)
+    model = SCM([*parts, total])
+    found = model.counterfactual({"s": 1.0}, do={"a": 2.0}, n=4000)
+    assert found["s"] == pytest.approx(2.5, abs=0.05)
+    assert not found.exact
+    weights, drawn = found.weights[0], found.factual["a"][0]
+    assert weights @ drawn == pytest.approx(0.5, abs=0.05)
+    assert weights @ (drawn - 0.5) ** 2 == pytest.approx(0.5, abs=0.05)
+    np.testing.assert_allclose(found.factual["a"] + found.factual["b"], 1.0)
+    square = Derived(name="q", parents=("a",), mechanism=lambda a: a**2)
+    both = SCM([parts[0], square]).counterfactual({"q": 4.0}, do={}, n=2000)
+    assert set(np.round(both.factual["a"].ravel(), 6)) == {-2.0, 2.0}
+    assert float(both["a"]) == pytest.approx(0.0, abs=0.2)
+
+
 def test_what_cannot_be_is_refused_by_name() -> None:
     """Outside the support, against a function without noise, and what nobody can invert."""
     with pytest.raises(ImpossibleObservation, match="'x'") as problem:
@@ -269,8 +364,13 @@ def test_what_cannot_be_is_refused_by_name() -> None:
     model = SCM([Exogenous(name="x", distribution=Normal()), double])
     with pytest.raises(ImpossibleObservation, match="'y'"):
         model.counterfactual({"x": 1.0, "y": 3.0}, do={"x": 0.0})
-    with pytest.raises(ImpossibleObservation, match="observe them"):
-        model.counterfactual({"y": 3.0}, do={"x": 0.0})
+    assert model.counterfactual({"y": 3.0}, do={})["x"] == 1.5
+    pair = Derived(name="z", parents=("x",), mechanism=lambda x: np.stack([x, x], -1), shape=(2,))
+    with pytest.raises(ModelError, match="observe them") as unmet:
+        SCM([Exogenous(name="x", distribution=Normal()), pair]).counterfactual(
+            {"z": [0.1, 0.1]}, do={}
+        )
+    assert not isinstance(unmet.value, ImpossibleObservation)
     two = Derived(name="y", parents=("x",), mechanism=turned, noise=Normal(), noise_shape=(2,))
     hard = SCM([Exogenous(name="x"), two])
     assert hard.draw(4, seed=0)["y"].shape == (4,)
