@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import re
 import sys
 from collections import abc
@@ -11,6 +12,7 @@ from contextlib import suppress
 from functools import cache, wraps
 from importlib import import_module
 from importlib.util import find_spec
+from numbers import Real
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
@@ -31,13 +33,33 @@ def whole_number(option: str, value: Any, *, least: int) -> int:
     return int(value)
 
 
+def real_number(option: str, value: Any, *, least: float = -math.inf) -> float:
+    """Return an option that is a finite number.
+
+    Raises:
+        UnknownOption: It is none, or too small.
+    """
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, Real)
+        or not (least <= value and math.isfinite(value))
+    ):
+        allowed = "any finite number" + f" from {least:g} on" * (least > -math.inf)
+        raise UnknownOption(option, value, (allowed,))
+    return float(value)
+
+
 def one_of(option: str, value: Any, allowed: Collection[Any]) -> None:
     """Refuse an option that is none of those allowed; None is left out of the message.
 
     Raises:
         UnknownOption: It is none of them.
     """
-    if value not in allowed:
+    try:
+        known = value in allowed
+    except (TypeError, ValueError):  # an array, or not hashable
+        known = False
+    if not known:
         raise UnknownOption(option, value, [one for one in allowed if one is not None])
 
 

@@ -152,8 +152,11 @@ def noise_of(
 
 
 def _check_kind(variable: Variable, value: Value) -> None:
-    """Refuse what a function gives that is no whole number, or none of the categories."""
+    """Refuse what a function gives that is NaN, no whole number, or none of the categories."""
     bounds = variable.bounds
+    if value.dtype.kind == "f" and np.isnan(value).any():
+        rows = f" in {int(np.isnan(value).sum())} of {value.size} numbers" if value.ndim else ""
+        raise ModelError([f"the function of {variable.name!r} gives NaN{rows}"])
     if variable.dtype == "integer" and value.dtype.kind == "f" and (np.rint(value) != value).any():
         wrong = value[np.rint(value) != value].ravel().tolist()[:3]
         said = f"the function of {variable.name!r} gives {wrong}, and the variable is an integer"

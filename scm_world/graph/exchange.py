@@ -18,7 +18,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import load
+from scm_world._arguments import load, one_of
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph.scm import SCM
 from scm_world.variables import Affine, Box, Either, Space, Switch
@@ -64,8 +64,7 @@ def to_digraph(source: SCM | nx.DiGraph, view: View = "lagged") -> nx.MultiDiGra
         >>> to_digraph(model.do({"weight": 1.0})).edges
         OutMultiEdgeView([])
     """
-    if view not in VIEWS:
-        raise UnknownOption("view", view, VIEWS)
+    one_of("view", view, VIEWS)
     graph = _of_model(source) if isinstance(source, SCM) else _of_networkx(source)
     if view == "summary":
         return _summary(graph)
@@ -184,7 +183,7 @@ def _with_common_past(graph: nx.MultiDiGraph, past: int) -> list[list[tuple[str,
     common = np.zeros_like(edges)
     common[0] = np.eye(len(place))
 
-    def shared(apart: int) -> NDArray[np.float32]:
+    def shared(apart: int) -> Any:
         return common[apart] if apart >= 0 else common[-apart].T
 
     known = -1.0
@@ -385,11 +384,9 @@ def write_graph(
         >>> write_graph(nx.DiGraph([("mass", "weight")]), format="csv")
         'cause,mass,weight\nmass,0,1\nweight,0,0'
     """
-    if format not in FORMATS:
-        raise UnknownOption("format", format, tuple(FORMATS))
+    one_of("format", format, tuple(FORMATS))
     write, views = FORMATS[format]
-    if view is not None and view not in views:
-        raise UnknownOption("view", view, views)
+    one_of("view", view, (None, *views))
     text = write(to_digraph(source, view or views[0]))
     if path is not None:
         Path(path).write_text(text + "\n", encoding="utf-8")
@@ -409,8 +406,7 @@ def to_dowhy(source: SCM | nx.DiGraph, *, view: View = "two_slice") -> nx.DiGrap
         ModelError: The view has a cycle.
         UnknownOption: There is no such view.
     """
-    if view == "lagged":
-        raise UnknownOption("view", view, ("summary", "two_slice"))
+    one_of("view", view, ("summary", "two_slice"))
     return _bare(to_digraph(source, view))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from scm_world._fingerprint import differing, fingerprint
-from scm_world.errors import DAMAGED, InterventionError, ModelError
+from scm_world.errors import DAMAGED, InterventionError, ModelError, UnknownOption
 from scm_world.graph.scm import SCM
 from scm_world.variables import AnyVariable, Function, Intervention, Mechanism, Variable
 from scm_world.variables.mechanisms import check_portable, check_trusted
@@ -38,7 +38,7 @@ def _functions(
     variables: Iterable[Variable], held: Mapping[str, Intervention]
 ) -> Iterator[Function]:
     named: list[Any] = [act.function for act in held.values() if isinstance(act, Mechanism)]
-    for field in ("mechanism", "inverse", "start", "carry"):
+    for field in ("mechanism", "inverse", "inverse_noise", "start", "carry"):
         named += [getattr(variable, field, None) for variable in variables]
     yield from (function for function in named if isinstance(function, Function))
 
@@ -54,7 +54,10 @@ def to_dict(model: SCM) -> dict[str, Any]:
 
     Raises:
         ModelError: A mechanism is a lambda or another function without a name.
+        UnknownOption: It is no model.
     """
+    if not isinstance(model, SCM):
+        raise UnknownOption("model", model, ("an SCM, such as world.model",))
     check_portable(_functions(model.variables, model.interventions))
     return {
         "format": FORMAT,

@@ -169,7 +169,7 @@ class SCM:
         return len(self._declared)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._declared
+        return isinstance(name, str) and name in self._declared
 
     def __getitem__(self, name: str) -> Variable:
         """Return the variable as it is in this model: ``Fixed`` where ``do`` has set it.
@@ -219,7 +219,7 @@ class SCM:
         """
         try:
             return self._declared[name]
-        except KeyError:
+        except (KeyError, TypeError):  # or not hashable
             raise UnknownVariable(name, self._declared) from None
 
     @property
@@ -436,7 +436,10 @@ class SCM:
         Raises:
             ModelError: A measured variable or an action has no value, or a value is known of
                 what is computed, and ``only`` does not leave that out.
+            UnknownOption: What is known is no mapping.
         """
+        if not isinstance(known, Mapping | None):
+            raise UnknownOption("known", known, ("a dictionary of variables and values",))
         values: dict[str, Value] = dict(known or {})
         evaluate = self._evaluator.evaluate
         if only is None:
@@ -543,7 +546,8 @@ class SCM:
         Raises:
             ModelError: It is measured, and has no value.
         """
-        return self._evaluator.evaluate(name, self._acts.get(name), values, {}, key)
+        known = self.declared(name).name
+        return self._evaluator.evaluate(known, self._acts.get(known), values, {}, key)
 
     def draw(
         self, n: int, *, seed: int, first: int = 0, steps: int | None = None

@@ -7,7 +7,8 @@ from typing import Any
 
 import networkx as nx
 
-from scm_world.errors import UnknownVariable
+from scm_world._arguments import whole_number
+from scm_world.errors import UnknownOption, UnknownVariable
 from scm_world.graph.exchange import slices_of, to_digraph, window_of
 from scm_world.graph.scm import SCM
 
@@ -20,7 +21,7 @@ def unrolled(model: SCM, steps: int) -> nx.DiGraph:
 
     A parameter keeps its value from one step to the next: an edge with ``persists=True``.
     """
-    return slices_of(to_digraph(model), steps)
+    return slices_of(to_digraph(model), whole_number("steps", steps, least=1))
 
 
 def episode_outcome(
@@ -46,6 +47,7 @@ def episode_outcome(
         >>> sorted(episode_outcome(model, ["speed"], starts=["speed"]).edges)
         [('mass', 'speed'), ('speed@0', 'speed')]
     """
+    _check_model(model)
     parameters = [name for name in model if model.declared(name).role == "parameter"]
     edges = [edge for edge in model.edges if contact or edge.when != "contact"]
     follow = nx.DiGraph((edge.cause, edge.effect) for edge in edges)
@@ -59,13 +61,18 @@ def episode_outcome(
     )
     still = set(parameters)
     moving = follow.subgraph([name for name in follow if name not in still])
-    for outcome in outcomes:
+    for outcome in (outcomes,) if isinstance(outcomes, str) else outcomes:
         causes = {model.declared(outcome).name}
         causes |= nx.ancestors(moving, outcome) if outcome in moving else set()
         direct = {p for name in causes for p in follow.predecessors(name) if p in still}
         graph.add_edges_from((parameter, outcome) for parameter in sorted(direct))
         graph.add_edges_from((f"{name}@0", outcome) for name in starts if name in causes)
     return graph
+
+
+def _check_model(model: Any) -> None:
+    if not isinstance(model, SCM):
+        raise UnknownOption("model", model, ("an SCM, such as world.model",))
 
 
 def d_separated(
@@ -78,14 +85,18 @@ def d_separated(
 
     Raises:
         UnknownVariable: A node is not in the model.
+        UnknownOption: A node is in two of the sets.
 
     Source:
         Pearl, *Causality*, 2nd ed., section 1.2.3; computed by networkx.
     """
+    _check_model(model)
     graph = window_of(to_digraph(model))
 
     def nodes(chosen: Iterable[Node]) -> set[Any]:
         found: set[Any] = set()
+        if not isinstance(chosen, Iterable):
+            raise UnknownOption("nodes", chosen, ("names of variables",))
         for node in (chosen,) if isinstance(chosen, str) else chosen:
             full = (node, 0) if isinstance(node, str) else node
             if full not in graph or not -1 <= full[1] <= 0:
@@ -93,4 +104,7 @@ def d_separated(
             found.add(full)
         return found
 
-    return bool(nx.is_d_separator(graph, nodes(x), nodes(y), nodes(given)))
+    first, second, blocked = nodes(x), nodes(y), nodes(given)
+    if twice := (first & second) | (first & blocked) | (second & blocked):
+        raise UnknownOption("nodes", sorted(twice), ("three sets without a node in common",))
+    return bool(nx.is_d_separator(graph, first, second, blocked))

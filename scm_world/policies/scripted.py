@@ -9,9 +9,9 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import real_numbers, whole_number
+from scm_world._arguments import real_number, real_numbers, whole_number
 from scm_world._types import Floats
-from scm_world.errors import ActionError, UnknownOption
+from scm_world.errors import ActionError
 from scm_world.policies.planning import CrossEntropy
 from scm_world.tasks import TASKS
 from scm_world.tasks.base import Blind, action_range, kept_rows
@@ -38,8 +38,7 @@ class Random(Blind):
 
     def __post_init__(self) -> None:
         whole_number("every", self.every, least=1)
-        if not np.isfinite(self.share):
-            raise UnknownOption("share", self.share, ("a finite number",))
+        real_number("share", self.share)
 
     def ahead(self, world: Any, first: int, count: int) -> Floats:
         """Draw the actions of some control steps."""

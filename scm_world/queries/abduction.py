@@ -17,12 +17,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import real_number, whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world._types import Integers as Numbers
 from scm_world.errors import ImpossibleObservation, InterventionError, ModelError, UnknownOption
@@ -135,7 +134,7 @@ class Counterfactuals(Mapping[str, Floats]):
             UnknownVariable: There is no such variable.
         """
         self._refuse_categories(name)
-        if isinstance(level, bool) or not isinstance(level, Real) or not 0.0 < level < 1.0:
+        if not 0.0 < real_number("level", level) < 1.0:
             raise UnknownOption("level", level, ("a number between 0 and 1",))
         found = self.counterfactual[name]
         order = np.argsort(found, axis=1)
@@ -163,9 +162,9 @@ class Counterfactuals(Mapping[str, Floats]):
         except InterventionError:
             number = None
         if number is None or (bounds is not None and not bounds.contains(number)):
-            allowed = (f"a number of dtype {variable.dtype}, shape {variable.shape}",)
+            allowed = [f"a number of dtype {variable.dtype}, shape {variable.shape}"]
             if bounds is not None:
-                allowed = tuple(map(repr, (*bounds.labels, *bounds.members)))
+                allowed = list(map(repr, (*bounds.labels, *bounds.members)))
             raise UnknownOption(f"value of {name}", value, allowed)
         found = self.counterfactual[name] == number
         whole = tuple(range(found.ndim - number.ndim, found.ndim))
@@ -197,8 +196,7 @@ def counterfactuals(
     tolerance: float = 1e-6,
 ) -> Counterfactuals:
     """Say what observed units would have been under an intervention; see ``SCM.counterfactual``."""
-    if isinstance(tolerance, bool) or not tolerance >= 0.0:
-        raise UnknownOption("tolerance", tolerance, ("a number that is not negative",))
+    tolerance = real_number("tolerance", tolerance, least=0.0)
     seen = observations(model, observed)
     if n is None:
         sure = _Abduction(model, seen, 1, seed, tolerance, certain=True)

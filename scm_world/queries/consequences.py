@@ -7,8 +7,8 @@ from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
+from scm_world._arguments import one_of, whole_number
 from scm_world._types import Value
-from scm_world.errors import UnknownOption
 from scm_world.policies.scripted import as_policy
 from scm_world.queries.experiments.effects import gap
 from scm_world.queries.questions import SCM
@@ -117,9 +117,8 @@ def consequences(
         >>> found.astray, found.variables["tool_block.linear_velocity"].descendant
         ((), True)
     """
-    if space not in (None, *SPACES):
-        raise UnknownOption("space", space, SPACES)
-    steps = steps if system.graph.is_temporal else 0
+    one_of("space", space, (None, *SPACES))
+    steps = whole_number("steps", steps, least=0) if system.graph.is_temporal else 0
     with system.unchanged() if isinstance(system, World) else nullcontext():
         return _compared(asked(system)[1], request, steps, seed, space)
 

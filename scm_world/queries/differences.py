@@ -9,10 +9,12 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import real_number, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode
 from scm_world.queries.outcomes import as_outcome, is_category, read
+from scm_world.queries.rollouts import as_names
 from scm_world.variables import Draw, Natural
 
 NOISY = ("sensor_noise", "actuator_noise")
@@ -87,15 +89,15 @@ def compare(
         tolerance: Differences up to this do not count.
 
     Raises:
-        UnknownOption: They are not equally long.
+        UnknownOption: They are not equally long, or no episodes.
     """
     for given in (one, other):
-        if not isinstance(given, Episode):
-            raise UnknownOption("episode", given, ("what rollout or counterfactual gave",))
+        _check_episode(given)
+    real_number("tolerance", tolerance, least=0.0)
     if one.steps != other.steps:
         raise UnknownOption("episode", other, (f"one of {one.steps} steps",))
     both = [name for name in one.names if name in set(other.names)]
-    wanted = both if names is None else list(names)
+    wanted = both if names is None else as_names(names)
     first, second = one.replay(), other.replay()
     found = {name: _divergence(one, other, name, tolerance) for name in wanted}
     apart = {name: d for name, d in found.items() if d is not None}
@@ -109,6 +111,11 @@ def compare(
     alone = [(name, which) for which in (0, 1) for name in sorted(noise[which] - noise[1 - which])]
     ordered = dict(sorted(apart.items(), key=lambda item: item[1].first))
     return EpisodeDifference(ordered, contacts, tuple(alone))
+
+
+def _check_episode(given: Any) -> None:
+    if not isinstance(given, Episode):
+        raise UnknownOption("episode", given, ("what rollout or counterfactual gave",))
 
 
 def _divergence(first: Episode, second: Episode, name: str, tolerance: float) -> Divergence | None:
@@ -192,8 +199,10 @@ def but_for(
         One entry for each set of causes, those that matter first, the largest first.
 
     Raises:
-        UnknownOption: A cause without another value was not intervened on.
+        UnknownOption: A cause without another value was not intervened on, or an argument is none.
     """
+    _check_episode(episode)
+    most, at = whole_number("most", most, least=1), whole_number("at", at, least=0)
     contrasts = _contrasts(episode, over, at)
     wanted = as_outcome(outcome)
     actual = read(wanted, episode)
@@ -220,7 +229,7 @@ def _contrasts(
     if isinstance(over, Mapping):
         return dict(over)
     done = dict.fromkeys(name for start, plan in episode.layers if start <= at for name in plan)
-    names = tuple(done) if over is None else tuple(over)
+    names = tuple(done) if over is None else as_names(over)
     for name in names:
         if name not in done:
             allowed = (*done, f"{{{name!r}: the value that it would have had instead}}")

@@ -8,6 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats, Value
 from scm_world.errors import UnknownOption, UnknownVariable
 from scm_world.models.camera import Camera
@@ -25,7 +26,7 @@ from scm_world.queries.rollouts import (
     as_names,
     run,
 )
-from scm_world.queries.twins import AnyTwins
+from scm_world.queries.twins import AnyTwins, EquationTwins
 from scm_world.world import Audit
 
 
@@ -141,7 +142,14 @@ class Episode:
 
         Returns:
             The scene, and the cameras whose places are variables.
+
+        Raises:
+            UnknownOption: There is no such instant, or it is no episode of a world.
         """
+        if whole_number("step", step, least=0) > self.steps:
+            raise UnknownOption("step", step, (f"0 to {self.steps}",))
+        if isinstance(self.twins, EquationTwins):
+            raise UnknownOption("picture", "an episode of equations", ("one of a world",))
         values = _at(self.trace, step)
         compiled = next(c for at, c in reversed(self.trace.declarations) if at <= step)
         state = compiled.empty_state(np.array(self.trace.vectors[step]))
@@ -255,6 +263,8 @@ class Episode:
             workers: Threads, see ``Setting``; the result does not depend on how many.
         """
         at, names = self._instant(at), as_names(record)
+        if not isinstance(dos, Iterable) or isinstance(dos, Mapping):
+            raise UnknownOption("dos", dos, ("a list of interventions",))
         given = list(dos)
         start = None
         if at > 0 and given:

@@ -158,7 +158,7 @@ class Equations:
             if steps is None:
                 raise ModelError(["the model has lagged edges: say how many steps an episode has"])
             return whole_number("steps", steps, least=1)
-        if steps not in (None, 0):
+        if steps is not None and whole_number("steps", steps, least=0):
             raise UnknownOption("steps", steps, ("0: the model has no lagged edges",))
         return 0
 

@@ -57,7 +57,10 @@ def nature_graph(
 
     Raises:
         ModelError: Nature does something later than at the beginning.
+        UnknownOption: It is no model, or there are no names of outcomes.
     """
+    if not isinstance(model, SCM):
+        raise UnknownOption("model", model, ("an SCM, such as world.model",))
     plan = Plan(nature)
     acts = plan.at_first()
     late = sorted(
@@ -70,7 +73,7 @@ def nature_graph(
     moved = [name for name in acts if model.declared(model.target(name)).role == "state"]
     states = [target for name in moved for target in model.targets(name)]
     held = model.do({name: act for name, act in acts.items() if name not in moved})
-    graph = episode_outcome(held, outcomes, starts=states, contact=contact)
+    graph = episode_outcome(held, as_names(outcomes), starts=states, contact=contact)
     for name in moved:
         followed = sorted(_followed(model, name, acts[name]))
         causes = [n if n in graph else f"{n}@0" for n in followed]

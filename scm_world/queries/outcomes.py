@@ -6,6 +6,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
+from scm_world._arguments import one_of
 from scm_world._types import Floats, Value
 from scm_world.errors import UnknownOption, blamed
 from scm_world.queries.episodes import Episode
@@ -13,6 +14,7 @@ from scm_world.queries.equations import Equations, System
 from scm_world.tasks.rewards import FRACTION
 from scm_world.variables.spaces import Frozen
 
+MANY = 10  # numbers, of which an error shows the first wrong one
 ORDERLESS = ("final", "first", "path")
 """The summaries that categories have."""
 HOWS = ("final", "mean", "max", "min", "sum", "first", "change", "path")
@@ -41,8 +43,7 @@ class Outcome(Frozen):
     component: int | None = None
 
     def __init__(self, name: str, how: str = "final", component: int | None = None) -> None:
-        if how not in HOWS:
-            raise UnknownOption("outcome", how, HOWS)
+        one_of("outcome", how, HOWS)
         super().__init__(name=name, how=how, component=component)
 
     def of(self, episode: Episode) -> Floats:
@@ -132,17 +133,17 @@ def read(outcome: Any, episode: Episode) -> Floats:
     """Read an outcome off an episode, as numbers.
 
     Raises:
-        UnknownOption: A function gave no finite numbers.
+        UnknownOption: It is no finite numbers.
         FunctionFailure: A function raised an error.
     """
     if isinstance(outcome, Outcome):
-        return as_numbers(outcome.of(episode))
+        return as_numbers(outcome.of(episode), outcome)
     with blamed(f"the outcome {label(outcome)!r}"):
         value = outcome(episode)
-    return as_numbers(value)
+    return as_numbers(value, outcome)
 
 
-def as_numbers(value: Any) -> Floats:
+def as_numbers(value: Any, outcome: Any) -> Floats:
     """Check the value of an outcome.
 
     Raises:
@@ -153,7 +154,10 @@ def as_numbers(value: Any) -> Floats:
     except (TypeError, ValueError):
         number = np.asarray(np.nan)
     if not np.isfinite(number).all():
-        raise UnknownOption("value of the outcome", value, ("finite numbers",))
+        wrong = (
+            value if np.size(value) < MANY else np.ravel(number)[~np.isfinite(np.ravel(number))][0]
+        )
+        raise UnknownOption(f"value of the outcome {label(outcome)!r}", wrong, ("finite numbers",))
     return number
 
 

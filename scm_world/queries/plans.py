@@ -62,7 +62,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         if isinstance(request, Plan):
             self._parts: dict[str, tuple[Any, ...]] = dict(request._parts)
         else:
-            flat = flatten(request or {})
+            flat = flatten({} if request is None else request)
             self._parts = {name: _parts(value) for name, value in flat.items()}
 
     def __getitem__(self, name: str) -> tuple[Any, ...]:
@@ -213,8 +213,8 @@ def do(request: Mapping[str, Any]) -> Plan:
 
 
 def numbered(model: SCM, request: Mapping[str, Any]) -> dict[str, Any]:
-    """Put the numbers of categories in the place of their labels."""
-    found = dict(request)
+    """Put the numbers of categories in the place of their labels, under dotted names."""
+    found = flatten(request)
     for name, value in found.items():
         bounds = model.declared(name).bounds if isinstance(value, str) and name in model else None
         if isinstance(bounds, Categories) and value in bounds.labels:

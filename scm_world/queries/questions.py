@@ -239,7 +239,7 @@ class Questions(ABC):
             Pearl, *Direct and indirect effects*, UAI 2001, definitions 1 and 3.
         """
         if isinstance(mediators, Mapping):
-            arms = ({**given, **mediators} for given in (do, versus or {}))
+            arms = ({**Plan(given), **mediators} for given in (do, versus))
             both: dict[str, Any] = {**setting, "n": n, "progress": progress}
             return self.effect(outcome, do=next(arms), versus=next(arms), **both)
         self._averaged(outcome)
@@ -284,7 +284,9 @@ class Questions(ABC):
             progress: Called after each episode.
             setting: See ``sample``.
         """
-        if len(values) < 2:
+        if not isinstance(name, str):
+            raise UnknownOption("name", name, ("the name of a variable",))
+        if not isinstance(values, Sequence | np.ndarray) or len(values) < 2:
             raise UnknownOption("values", values, ("two or more values of the variable",))
         system, count = self._averaged(outcome), whole_number("n", n, least=2)
         control, *others = (
@@ -489,4 +491,4 @@ class SCM(Questions, graph.SCM):
         return self._twins, Equations(self._twins.layout)
 
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
-        return do if isinstance(do, Plan) else Plan(numbered(self, do or {}))
+        return do if isinstance(do, Plan) else Plan(numbered(self, {} if do is None else do))

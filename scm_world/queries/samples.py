@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode
@@ -66,8 +66,10 @@ class Setting:
         """Complete what is given: a world acts at random by default, equations with zeros.
 
         Raises:
-            UnknownOption: The number of steps is none.
+            UnknownOption: The number of steps is none, or there is no such setting.
         """
+        for name in given:
+            one_of("setting", name, [field.name for field in fields(cls)])
         defaults: dict[str, Any] = {}
         if isinstance(system, Equations):
             defaults = {"steps": STEPS if system.model.is_temporal else 0, "policy": None}
@@ -219,7 +221,8 @@ def sample(
             averages categories.
     """
     count = whole_number("n", n, least=1)
-    given = (outcomes,) if isinstance(outcomes, str | Outcome) else outcomes
+    alone = not isinstance(outcomes, Iterable) or isinstance(outcomes, str | Outcome)
+    given = (outcomes,) if alone else outcomes
     wanted = [as_outcome(outcome) for outcome in given]
     for one in wanted:
         if isinstance(one, Outcome) and one.how not in ORDERLESS and is_category(world, one.name):
@@ -238,6 +241,7 @@ def sample(
             progress(done, count)
         return found
 
+    first = whole_number("first", first, least=0)
     numbers, plan = range(first, first + count), setting.plan(world, do)
     unit = setting.unit(world, plan, first, names)
     for name, part in Plan(do).timed():
@@ -252,7 +256,7 @@ def sample(
     if isinstance(twins, EquationTwins) and all(isinstance(one, Outcome) for one in wanted):
         vectors = paths(twins, units)
         read_off = (one.of_many(twins.layout.read(one.name, vectors)) for one in wanted)
-        found = [as_numbers(values) for values in read_off]
+        found = [as_numbers(v, one) for v, one in zip(read_off, wanted, strict=True)]
         if progress is not None:
             progress(count, count)
     else:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, final
 import numpy as np
 from pydantic import Field
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import real_number, whole_number
 from scm_world.errors import UnknownOption
 from scm_world.models import Model
 from scm_world.queries.equations import System
@@ -155,8 +155,7 @@ class Reaches(Frozen):
         number: Any = given[0] if given[1] is None else given[1]
         if (fields.get("above") is None) == (fields.get("below") is None):
             raise UnknownOption("Reaches", fields, ("above=…", "below=…"))
-        if isinstance(number, str) or np.ndim(number) or not np.isfinite(number):
-            raise UnknownOption("threshold of Reaches", number, ("a finite number",))
+        real_number("threshold of Reaches", number)
         whole_number("component of Reaches", fields.get("component", 0), least=0)
         super().__init__(name=name, **fields)
 

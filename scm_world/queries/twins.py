@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar, final
 from weakref import WeakKeyDictionary
 
+from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.equations import Equations, Layout
 from scm_world.work.executors import Executor, Processes
@@ -150,9 +151,15 @@ AnyTwins = Twins | EquationTwins
 
 
 def asked(system: Simulation | SCM) -> tuple[AnyTwins, Simulation | Equations]:
-    """Return where episodes of a system are run, and a system that knows what is declared."""
+    """Return where episodes of a system are run, and a system that knows what is declared.
+
+    Raises:
+        UnknownOption: It is neither a world nor a model.
+    """
     if isinstance(system, Simulation):
         return twins_of(system), system
+    if not isinstance(system, SCM):
+        raise UnknownOption("system", system, ("a World", "an SCM"))
     twins = EquationTwins(system)
     return twins, Equations(twins.layout)
 
@@ -161,7 +168,13 @@ _TWINS: WeakKeyDictionary[Simulation, Twins] = WeakKeyDictionary()
 
 
 def twins_of(world: Simulation) -> Twins:
-    """Return the twins of a world; they are freed with it."""
+    """Return the twins of a world; they are freed with it.
+
+    Raises:
+        UnknownOption: It is no world.
+    """
+    if not isinstance(world, Simulation):
+        raise UnknownOption("world", world, ("a World",))
     found = _TWINS.get(world)
     if found is None:
         found = _TWINS[world] = Twins(world)

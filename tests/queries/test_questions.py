@@ -43,11 +43,15 @@ from scm_world.graph import from_json, to_json
 from scm_world.queries import (
     Effect,
     Episode,
+    Laboratory,
     Samples,
     Verification,
+    but_for,
     compare,
     consequences,
+    identify,
     load_episode,
+    nature_graph,
     save_episode,
 )
 from scm_world.tasks import StepTask
@@ -328,6 +332,110 @@ def test_categories_have_no_mean_in_effects() -> None:
     assert sorted(0.0 if each is None else each.largest for each in apart) == [0.0, 1.0, 1.0]
     moved = {consequences(model, {"t": 1}, seed=k).variables["c"].difference for k in range(9)}
     assert moved == {0.0, 1.0}
+
+
+def pair() -> SCM:
+    """Give a cause and its effect."""
+    line = Derived(name="y", parents=("x",), mechanism=Linear(weights=(2.0,)), noise=Normal())
+    return SCM([Exogenous(name="x", distribution=Normal()), line])
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        *(lambda m, do=do: m.effect("y", do=do, n=3) for do in (True, [1, 2], "x", np.zeros(3))),
+        *(lambda m, do=do: m.rollout(do=do) for do in (1.5, ["x"], len)),
+        *(lambda m, do=do: m.counterfactual({"x": 1.0}, do=do) for do in (1, "x", [["x", 1.0]])),
+        lambda m: m.sample(3, {"x": 1.0}, zzz=1),
+        lambda m: m.sample(3, nature=np.zeros(3)),
+        lambda m: m.sample(3, outcomes=5),
+        lambda m: m.sample(3, first="x"),
+        lambda m: m.sample(3, steps=np.zeros(2)),
+        lambda m: m.effect(lambda episode: 1 / 0, do={"x": 1.0}, n=3),
+        lambda m: m.effect(lambda episode: episode["x"][7], do={"x": 1.0}, n=3),
+        lambda m: m.effect_over("y", name=["x"], values=[0.0, 1.0]),
+        lambda m: m.effect_over("y", name="x", values=None),
+        lambda m: m.effect_over("y", name="x", values=1.0),
+        lambda m: m.parents(["x"]),
+        lambda m: m.do({("x",): 1.0}),
+        lambda m: m.solve([1.0]),
+        lambda m: m.evaluate("zzz", {"x": 1.0}),
+        lambda m: m.rollout().worlds(None),
+        lambda m: m.rollout().scene(0),
+        lambda m: compare(m.rollout(), m.rollout(), tolerance="x"),
+        lambda m: compare(m.rollout(), m.rollout(), names=1),
+        lambda m: but_for(m, "y"),
+        lambda m: but_for(m.rollout(do={"x": 1.0}), "y", most=None),
+        lambda m: consequences("model.json", {"x": 1.0}),
+        lambda m: consequences(m, {"x": 1.0}, space=np.zeros(2)),
+        lambda m: nature_graph("x", {}, ["y"]),
+        lambda m: nature_graph(m, {}, None),
+        Laboratory,
+        lambda m: graph.d_separated({"x": []}, ["x"], ["y"]),
+        lambda m: graph.d_separated(m, ["x"], ["x"]),
+        lambda m: graph.d_separated(m, None, ["y"]),
+        lambda m: graph.unrolled(m, 1.5),
+        lambda m: graph.episode_outcome(None, ["y"]),
+        lambda m: to_json("x"),
+        lambda m: Outcome("x", np.zeros(2)),
+        lambda m: Reaches("x", above={}),
+        lambda m: identify(m.graph, "x", "zzz"),
+        lambda m: identify(m, "x", ["y"]),
+    ],
+)
+def test_a_wrong_argument_is_named(ask: Any) -> None:
+    """By an error of this package, whatever is wrong with it."""
+    with pytest.raises(ScmWorldError):
+        ask(pair())
+
+
+def test_nan_of_a_function_names_its_variable() -> None:
+    """Where it came from, and not where it was seen."""
+    model = SCM(
+        [
+            Exogenous(name="x", distribution=Normal()),
+            Derived(name="root", parents=("x",), mechanism=np.sqrt),
+            Derived(name="end", parents=("root",), mechanism=lambda root: root + 1.0),
+        ]
+    )
+    with np.errstate(invalid="ignore"):
+        for ask in (
+            lambda: model.draw(50, seed=0),
+            lambda: model.sample(50, outcomes=["end"]),
+            lambda: model.effect("end", do={"x": -1.0}, n=3),
+            lambda: model.counterfactual({"x": 1.0}, do={"x": -1.0}),
+            lambda: model.do({"end": Mechanism(np.sqrt, "x")}).draw(50, seed=0),
+        ):
+            with pytest.raises(ModelError, match=r"the function of '(root|end)' gives NaN"):
+                ask()
+
+
+def test_a_number_that_is_not_finite_names_its_outcome() -> None:
+    """In the error of a function of the episode."""
+
+    def odd(episode: Episode) -> float:
+        return float("nan") * float(episode.final("x"))
+
+    with pytest.raises(UnknownOption, match="value of the outcome 'odd'"):
+        pair().sample(2, outcomes=[odd])
+
+
+def test_a_lagged_model_has_as_many_steps_as_is_usual() -> None:
+    """Effects and samples need no number of steps; None is refused with what to say."""
+    model = SCM(
+        [
+            Derived(
+                name="z",
+                parents=(Parent("z", 1),),
+                mechanism=Linear(weights=(0.5,)),
+                noise=Normal(),
+            )
+        ]
+    )
+    found = model.effect("z", do={"z": At(24, 1.0)}, n=30)
+    assert found.mean == model.effect("z", do={"z": At(24, 1.0)}, n=30, steps=25).mean
+    with pytest.raises(ModelError, match="say how many steps"):
+        model.effect("z", do={"z": 1.0}, n=3, steps=None)
 
 
 def test_an_intervention_counts_from_the_beginning() -> None:
