@@ -12,7 +12,6 @@ from contextlib import suppress
 from functools import cache, wraps
 from importlib import import_module
 from importlib.util import find_spec
-from numbers import Real
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
@@ -39,11 +38,9 @@ def real_number(option: str, value: Any, *, least: float = -math.inf) -> float:
     Raises:
         UnknownOption: It is none, or too small.
     """
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, Real)
-        or not (least <= value and math.isfinite(value))
-    ):
+    kinds = int | float | np.integer | np.floating
+    is_number = isinstance(value, kinds) and not isinstance(value, bool)
+    if not is_number or not math.isfinite(value) or value < least:
         allowed = "any finite number" + f" from {least:g} on" * (least > -math.inf)
         raise UnknownOption(option, value, (allowed,))
     return float(value)
