@@ -847,6 +847,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "picking, mujoco",
         (r"tool_block\.size",),
         lambda: task("picking", write=told(("tool_block", "size"), lambda v: 1.2 * v)),
+        visible=False,
+        test="test_weight",
     ),
     Sabotage(
         "a ball is a fifth smaller",

@@ -34,6 +34,7 @@ EXPERIMENTS: dict[str, Callable[[Any], None]] = {
     "damping times three": lambda world: check_motion(world, CART),
     "friction of the floor doubled": robot(test_formulas.test_stopping_distance, *SLIDE),
     "friction of the block halved": robot(test_formulas.test_stopping_distance, *SLIDE),
+    "the block is a fifth larger": robot(test_formulas.test_weight, 0.03),
     "a ball is a fifth smaller": check_rest,
     "restitution doubled": robot(test_restitution.test_rebound, 0.3),
 }
