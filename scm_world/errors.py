@@ -269,7 +269,7 @@ class UnknownVariable(InterventionError):
             more = f" and {len(self.near) - SHOWN} more" if len(self.near) > SHOWN else ""
             hint = f"; near it are: {', '.join(self.near[:SHOWN])}{more}"
         said = f"is named {name!r}"
-        if {*"*?"} & {*name}:
+        if {*"*?"} & {*str(name)}:
             ends = (f"*.{one.rpartition('.')[2]}" for one in known if "." in one)
             patterns = [*dict.fromkeys(ends)] or known
             self.suggestion = next(iter(difflib.get_close_matches(name, patterns, 1, 0.75)), None)
