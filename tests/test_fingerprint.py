@@ -255,3 +255,19 @@ def test_worlds_and_models_name_their_parts() -> None:
         sw.World("pushing", backend="fake", frame_skip=5),
     )
     assert "options" in differing(fingerprint(push), fingerprint(slow))
+
+
+def test_a_function_that_holds_its_world_ends() -> None:
+    """An outcome that looks at the world it is part of has a hash."""
+    held: list[Any] = []
+
+    def outcome(position: Any) -> Any:
+        return position + 0.0 * len(held)
+
+    body = '<body name="b"><joint name="j"/><geom size=".1"/></body>'
+    text = f"<mujoco><worldbody>{body}</worldbody></mujoco>"
+    world = sw.World(text, reward=(outcome, "j.position"))
+    held.append(world)
+    world.reset(seed=0)
+    assert world.snapshot().world == world.identity
+    assert "mechanism of 'reward'" in fingerprint(world)

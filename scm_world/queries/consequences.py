@@ -118,9 +118,10 @@ def consequences(
         ((), True)
     """
     one_of("space", space, (None, *SPACES))
+    stepped = asked(system)[1]
     steps = whole_number("steps", steps, least=0) if system.graph.is_temporal else 0
     with system.unchanged() if isinstance(system, World) else nullcontext():
-        return _compared(asked(system)[1], request, steps, seed, space)
+        return _compared(stepped, request, steps, seed, space)
 
 
 def _compared(

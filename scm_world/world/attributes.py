@@ -147,15 +147,19 @@ class WorldAttributes:
     @property
     def identity(self) -> tuple[Any, ...]:
         """What two worlds have in common if one can take up a snapshot of the other."""
+        return (*self._settings, self.structures.digest)
+
+    @property
+    def _settings(self) -> tuple[Any, ...]:
         numbers = (self.frame_skip, self.max_episode_length)
         options = (self.options.preset, self.action_mode, self.conventions.name)
         finer = () if self.resolution == self.task.resolutions[0] else (self.resolution,)
-        return (self.task.name, *options, *numbers, *finer, self.structures.digest)
+        return (self.task.name, *options, *numbers, *finer)
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return what decides what happens here, except versions: the task, and the options."""
         world: Any = self
-        options = (world.backend.name, world.variables_space, self.identity[:-1])
+        options = (world.backend.name, world.variables_space, self._settings)
         return {**self.structures.__fingerprint__(), "options": options}
 
     def describe(self, values: Values, state: State) -> Scene:

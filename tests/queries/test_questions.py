@@ -597,15 +597,15 @@ def test_a_file_of_equations_refuses_another_model(tmp_path: Path) -> None:
     """Also a world, and the file of a world refuses equations."""
     saved = save_episode(chain().rollout(seed=5), tmp_path / "equations")
     for other in (chain().do({"y": 1.0}), equations(), world()):
-        with pytest.raises(SnapshotMismatch, match="another model"):
+        with pytest.raises(SnapshotMismatch, match="another system"):
             load_episode(saved, world=other)
     saved = save_episode(world().rollout(steps=2), tmp_path / "world")
-    with pytest.raises(SnapshotMismatch, match="another model"):
+    with pytest.raises(SnapshotMismatch, match="another system"):
         load_episode(saved, world=equations())
 
 
 def test_equations_without_a_name_are_given_on_reading(tmp_path: Path) -> None:
-    """The error says how; a model with other functions computes other values."""
+    """The error says how; a model with other functions is refused by their names."""
 
     def model(factor: float) -> SCM:
         double = Derived(name="y", parents=("x",), mechanism=lambda x: factor * x)
@@ -618,7 +618,7 @@ def test_equations_without_a_name_are_given_on_reading(tmp_path: Path) -> None:
     found = load_episode(saved, world=model(2.0))
     assert found == episode
     assert found.counterfactual({"x": 1.0}).final("y") == 2.0
-    with pytest.raises(SnapshotMismatch, match="control step 0"):
+    with pytest.raises(SnapshotMismatch, match="mechanism of 'y' differ"):
         load_episode(saved, world=model(3.0))
 
 
