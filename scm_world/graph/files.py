@@ -44,9 +44,10 @@ def _functions(
 
 
 def _hashes(model: SCM) -> dict[str, str]:
-    """Return a hash of each function and intervention, by name; declarations are in the file."""
+    """Return a hash of each function, by name; all else is in the file."""
+    plain = ("declaration of ", "intervention on ")
     found = fingerprint(model, libraries=False)
-    return {n: each for n, each in found.items() if not n.startswith("declaration of ")}
+    return {name: part for name, part in found.items() if not name.startswith(plain)}
 
 
 def to_dict(model: SCM) -> dict[str, Any]:

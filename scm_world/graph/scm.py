@@ -157,7 +157,9 @@ class SCM:
             found.setdefault(entity, []).append(variable.model_dump_json(exclude=functions))
         for name, act in self._interventions.items():
             function = getattr(act, "function", None)
-            found[f"intervention on {name!r}"] = act.model_dump_json(exclude={"function"}), function
+            named = {"function"} if isinstance(function, Function) else set()
+            found[f"intervention on {name!r}"] = act.model_dump_json(exclude=named)
+            found |= {f"function that sets {name!r}": function for _ in named}
         return found
 
     # --- looking ------------------------------------------------------------------------------

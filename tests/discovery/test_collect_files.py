@@ -112,7 +112,7 @@ def test_a_model_goes_into_a_folder(tmp_path: Path) -> None:
     assert load(tmp_path / "a") == found == collect(named, Design(), 7)
     nameless = named.do({"x": Mechanism(lambda: 1.0)})
     assert len(collect(nameless, Design(), 2, out=tmp_path / "b")) == 2
-    with pytest.raises(UnreadableFile, match="intervention on 'x' differ"):
+    with pytest.raises(UnreadableFile, match="function that sets 'x' differ"):
         collect(named.do({"x": Mechanism(lambda: 2.0)}), Design(), 2, out=tmp_path / "b")
 
 
