@@ -156,16 +156,16 @@ def _check_kind(variable: Variable, value: Value) -> None:
     bounds = variable.bounds
     if value.dtype.kind == "f" and np.isnan(value).any():
         rows = f" in {int(np.isnan(value).sum())} of {value.size} numbers" if value.ndim else ""
-        raise ModelError([f"the function of {variable.name!r} gives NaN{rows}"])
+        raise FunctionFailure(f"the function of {variable.name!r} gives NaN{rows}")
     if variable.dtype == "integer" and value.dtype.kind == "f" and (np.rint(value) != value).any():
         wrong = value[np.rint(value) != value].ravel().tolist()[:3]
         said = f"the function of {variable.name!r} gives {wrong}, and the variable is an integer"
-        raise ModelError([f"{said}: round them in the function"])
+        raise FunctionFailure(f"{said}: round them in the function")
     if isinstance(bounds, Categories) and not bounds.contains(value):
         wrong = np.setdiff1d(value, bounds.members).tolist()[:3]
         allowed = bounds.describe(variable.shape, {})
         said = f"the function of {variable.name!r} gives {wrong}, which are none of {allowed}"
-        raise ModelError([said])
+        raise FunctionFailure(said)
 
 
 def first_value(variable: Variable) -> Value:

@@ -118,7 +118,7 @@ def consequences(
         ((), True)
     """
     one_of("space", space, (None, *SPACES))
-    stepped = asked(system)[1]
+    stepped: Any = asked(system)[1]
     steps = whole_number("steps", steps, least=0) if system.graph.is_temporal else 0
     with system.unchanged() if isinstance(system, World) else nullcontext():
         return _compared(stepped, request, steps, seed, space)

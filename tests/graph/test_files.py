@@ -121,6 +121,17 @@ def test_functions_from_elsewhere_are_not_loaded(reference: str) -> None:
         from_dict(plain, trusted=(HERE,))
 
 
+@pytest.mark.parametrize("field", ["mechanism", "inverse_noise"])
+def test_every_function_of_a_declaration_needs_trust(field: str) -> None:
+    """The inverse of the noise is called as the mechanism is."""
+    plain = to_dict(
+        SCM([Derived(name="y", parents=(), mechanism=Linear(weights=()), noise=Normal())])
+    )
+    plain["variables"][0][field] = {"kind": "function", "reference": "os:system", "constants": {}}
+    with pytest.raises(ModelError, match="trusted"):
+        from_dict(plain)
+
+
 def test_a_file_does_not_import_what_is_not_trusted() -> None:
     """Not even the module of a function from elsewhere is imported."""
     plain = to_dict(model())
