@@ -256,7 +256,7 @@ def test_default_causes_are_physical(world: World) -> None:
 @pytest.mark.parametrize("pattern", ["tool_blok.*", "fractional_success"])
 def test_patterns_that_name_nothing_are_refused(world: World, pattern: str) -> None:
     """A cause has to be something that can be set."""
-    with pytest.raises(UnknownVariable, match="no variable (is named|fits)"):
+    with pytest.raises(UnknownVariable, match=r"no variable (is named|fits)"):
         collect(world, Design(), 2, causes=[pattern])
 
 
