@@ -287,9 +287,9 @@ def test_tensors_that_do_not_fit_are_refused(given: dict[str, Any], match: str) 
         ({"task": "pushing", "activation": "gelu"}, "activation: "),
         ({"task": "pushing", "inputs": ("a", "a")}, "each once"),
         ({"task": "pushing", "card": {"x": object()}}, "card"),
-        ({"task": "pushing", "card": {"scores": [float("nan")]}}, "card: .*not finite"),
-        ('{"task": "pushing", "card": {"score": NaN}}', "card: .*not finite"),
-        ({"task": "pushing", "env": {"delta_scale": float("inf")}}, "env: .*not finite"),
+        ({"task": "pushing", "card": {"scores": [float("nan")]}}, "card.*finite"),
+        ('{"task": "pushing", "card": {"score": NaN}}', "card.*finite"),
+        ({"task": "pushing", "env": {"delta_scale": float("inf")}}, "env.*finite"),
         ({"task": "pushing", "colour": 1}, "colour: "),
     ],
 )
