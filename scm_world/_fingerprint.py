@@ -87,12 +87,9 @@ def fingerprint(parts: Any, *, libraries: bool = True) -> Fingerprint:
         the hash.
 
     Example:
-        >>> def law(x, gain=2.0):
-        ...     return gain * x
-        >>> before = fingerprint({"law": law})
-        >>> law.__defaults__ = (3.0,)
-        >>> differing(before, fingerprint({"law": law}))
-        ['law']
+        >>> before = fingerprint({"gain": 2.0, "colors": {"red", "blue"}})
+        >>> differing(before, fingerprint({"gain": 2.5, "colors": {"blue", "red"}}))
+        ['gain']
     """
     found: Fingerprint = {}
     versions: dict[str, str] = {}
