@@ -87,18 +87,23 @@ WRONG = [
     (("pushing", "--set=task=picking"), "the task stands before"),
     (("pushing", "--set=algo=sac"), "give --algo"),
     (("pushing", "--seed=-1"), "seed"),
+]
+LATER = [
     (("pushing", "--backend=muyoco"), "mujoco"),
     (("pushing", "--device=cudo"), "cuda"),
     (("pushing", "--start=none.safetensors"), "none.safetensors"),
     (("pushing", "--set=env.action_mode=fast"), "action_mode"),
 ]
+"""What is checked with the libraries of the extra ``train``."""
 
 
-@pytest.mark.parametrize(("arguments", "said"), WRONG)
+@pytest.mark.parametrize(("arguments", "said"), [*WRONG, *LATER])
 def test_what_is_wrong_is_said(
     arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In one line, before anything is written."""
+    if (arguments, said) in LATER:
+        pytest.importorskip("stable_baselines3")
     monkeypatch.chdir(tmp_path)
     found = called(*arguments)
     assert found.exit_code == 2
