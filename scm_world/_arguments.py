@@ -143,7 +143,7 @@ def real_numbers(value: Any) -> NDArray[np.float64]:
     """
     found = np.asarray(value)
     if found.dtype.kind not in "biufO":
-        raise TypeError(f"{value!r} is no real numbers")
+        raise TypeError(f"{value!r} does not consist of real numbers")
     return found.astype(np.float64, copy=False)
 
 

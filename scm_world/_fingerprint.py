@@ -153,7 +153,7 @@ class _Reader:
         self._done: dict[int, tuple[str, Any]] = {}  # digests of those that were read
 
     def read(self, value: Any) -> None:
-        """Feed the hash with an object; whether it is one with another object does not count."""
+        """Feed the hash with an object; one object met twice counts like two equal ones."""
         self._note(self._text(value))
 
     def _text(self, value: Any) -> str:

@@ -96,7 +96,7 @@ class StepModel:
     @cached_property
     def digest(self) -> str:
         """Hash of the function and the tables."""
-        return digest(fingerprint({"model": self}))
+        return digest(fingerprint({"model": self}, libraries=False))
 
     @property
     def n_commands(self) -> int:

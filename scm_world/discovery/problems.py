@@ -688,7 +688,7 @@ def _partly_hidden(name: str, seed: int, seen: str, hidden: str) -> SCMProblem:
 def problem_label(name: str | SCM, view: TaskView) -> str:
     """Return the name of a problem as it is shown; of a model it tells models apart."""
     if isinstance(name, SCM):
-        return f"model {digest(fingerprint(name))[:8]}"
+        return f"model {digest(fingerprint(name, libraries=False))[:8]}"
     if name.partition(":")[0] in (*FAMILIES, *PHYSICS) or name.endswith(".json"):
         return Path(name).stem if name.endswith(".json") else name
     home, colon, function = name.rpartition(":")

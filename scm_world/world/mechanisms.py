@@ -218,14 +218,14 @@ class _Python:
         except Exception as error:
             reason = str(error).strip().splitlines()[-1:] if isinstance(error, NumbaError) else ()
             said = f"cannot be compiled: {reason[0]}" if reason else f"raised {in_one_line(error)}"
-            raise FunctionFailure(f"{self._told(row)} {said}") from error
+            raise FunctionFailure(f"{self._described(row)} {said}") from error
         problem = wrong_value(self._variable, value) if self._is_users else ""
         if problem:
-            raise FunctionFailure(f"{self._told(row)} {problem}")
+            raise FunctionFailure(f"{self._described(row)} {problem}")
         found = np.asarray(value, dtype=np.float64)
         row[self._place] = found.ravel()
 
-    def _told(self, row: Floats) -> str:
+    def _described(self, row: Floats) -> str:
         return f"in control step {row[self._clock]:.0f}, the function of {self._variable.name!r}"
 
 

@@ -71,7 +71,7 @@ class StructureCache:
     @cached_property
     def digest(self) -> str:
         """Hash of the variables and of the model, not of the arguments of the task."""
-        return digest(fingerprint(self._system))
+        return digest(fingerprint(self._system, libraries=False))
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return what decides the system: task and arguments, compiled model, variables."""

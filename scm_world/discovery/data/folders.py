@@ -308,9 +308,9 @@ def load(folder: Location | str, *, trusted: Sequence[str] = (), partial: bool =
     files = Folder(place, head, trusted)
     parts, ranges = [], head.ranges()
     known = {files.shard(index) for index in range(len(ranges))}
-    for stranger in sorted(set(place.glob("shard-*.parquet")) - known, key=str):
+    for unknown in sorted(set(place.glob("shard-*.parquet")) - known, key=str):
         reason = f"the dataset has {len(ranges)} files, and it is none of them"
-        raise UnreadableFile(str(stranger), reason, "remove it from the folder")
+        raise UnreadableFile(str(unknown), reason, "remove it from the folder")
     for index, numbers in enumerate(ranges):
         part = files.read(index, numbers)
         if part is None and not partial:
