@@ -17,7 +17,7 @@ class FakeBackend(InMemory):
     """No forces and no contacts: nothing moves.
 
     A structure can say otherwise. Its ``realization("fake")`` has three functions:
-    ``move(state, mode, command, seconds)`` and ``settle(state)``, which change a state in place,
+    ``move(structure, state, command, seconds)`` and ``settle(state)``, which change a state in place,
     and ``inertia(structure, parameters, body)``.
     """
 
@@ -45,7 +45,9 @@ class FakeBackend(InMemory):
         """
         custom = self._structure.realization("fake")
         if custom is not None:
-            custom.move(self._state, mode, command, substeps * self._structure.timestep)
+            custom.move(
+                self._structure, self._state, command, substeps * self._structure.timestep
+            )
         if not np.isfinite(self._state.vector).all():
             raise EngineFailure("a number is not finite", self.name)
 

@@ -27,6 +27,10 @@ Numbers = float | tuple[float, ...]
 """One number, or one for each component."""
 
 
+REPORTED = "qfrc_actuator"
+"""The array of what engines report and what cannot be set: torques and forces of actuators."""
+
+
 @dataclass(frozen=True)
 class Row:
     """A named quantity.
@@ -61,12 +65,15 @@ class Parameter(Row):
 
     Attributes:
         key: The element and the property, as backends know it.
+        slot: For a binding: finds where the value is written, given MuJoCo's model and data; it can
+            be pickled. None for a field of the compiled model, which is found by its key.
         kind: ``"real"``, ``"rotation"`` (unit quaternion), ``"inertia"`` (principal moments, which
             obey the triangle inequality) or ``"switch"`` (0 or 1).
         visual: Whether it acts on pictures only.
     """
 
     key: ParameterKey = ("", "")
+    slot: Callable[[Any, Any], Any] | None = field(default=None, repr=False)
     kind: Literal["real", "rotation", "inertia", "switch"] = "real"
     visual: bool = False
 
@@ -74,15 +81,28 @@ class Parameter(Row):
 @final
 @dataclass(frozen=True)
 class StateRow(Row):
-    """Something that physics moves. Its own tree is in ``always``.
+    """Something that physics moves, or that it reports. Its own trees are in ``always``.
 
     Attributes:
-        tree: Number of the kinematic tree it belongs to.
+        trees: Numbers of the kinematic trees it belongs to.
         kind: ``"rotation"`` for a unit quaternion (x, y, z, w).
+        array: The array of MuJoCo's data it is kept in: ``"qpos"``, ``"qvel"`` or ``"act"``, or
+            ``"qfrc_actuator"`` for what is only reported.
+        numbers: Its places in that array, in order.
+        frame: ``"world"`` for the orientation and the angular velocity of a free body whose
+            quaternion has w >= 0 and whose angular velocity is given in the world.
     """
 
-    tree: int = 0
+    trees: frozenset[int] = frozenset()
     kind: Literal["real", "rotation"] = "real"
+    array: str = ""
+    numbers: tuple[int, ...] = ()
+    frame: Literal["body", "world"] = "body"
+
+    @property
+    def reported(self) -> bool:
+        """Whether the engine computes it in every step, so that it cannot be set."""
+        return self.array == REPORTED
 
 
 @final
@@ -175,6 +195,7 @@ class Model:
             tuple(row.name for row in self.states),
             sizes,
             tuple(np.concatenate([*start, np.empty(0)]).tolist()),
+            frozenset(row.name for row in self.states if row.reported),
         )
 
     @cached_property

@@ -43,8 +43,6 @@ class StateDeclaration:
         bounds: What is possible.
         default: At the start of an episode.
         doc: One sentence.
-        always: Causes that act at every control step; all other physical quantities of the
-            world act while there is contact.
         on_set: Parameters and states that move it when they are set.
         start: Its value at the start, a function of ``on_set``.
         carry: Its value after one of ``on_set`` was set: a function of the present value, of
@@ -61,7 +59,6 @@ class StateDeclaration:
     bounds: Space
     default: Numbers
     doc: str
-    always: tuple[str, ...]
     on_set: tuple[str, ...] = ()
     start: Function | None = None
     carry: Function | None = None
@@ -70,21 +67,16 @@ class StateDeclaration:
     a: Space | None = None
     b: Space | None = None
 
-    def declare(self, inputs: Mapping[str, Parent]) -> Measured:
+    def declare(self, always: tuple[Parent, ...], others: Mapping[str, Parent]) -> Measured:
         """Write the declaration.
 
         Args:
-            inputs: All quantities of the world that physics knows, by name, as causes that act
-                where there is contact.
+            always: Causes of lag 1 that act at every control step.
+            others: Causes of lag 1 of many states, by name, as edges that hold while there is
+                contact.
         """
-        always, on_set = self._edges
-        return self._alone.model_copy(update={"parents": Coupled(always, inputs, on_set)})
-
-    @cached_property
-    def _edges(self) -> tuple[tuple[Parent, ...], tuple[Parent, ...]]:
-        """What always acts, and what acts when it is set."""
-        always = tuple(parent_of(name, 1) for name in self.always)
-        return always, tuple(parent_of(name, 0, "set") for name in self.on_set)
+        on_set = tuple(parent_of(name, 0, "set") for name in self.on_set)
+        return self._alone.model_copy(update={"parents": Coupled(always, others, on_set)})
 
     @cached_property
     def _alone(self) -> Measured:
@@ -127,20 +119,12 @@ class Entity(ABC):  # every hook has a sensible empty default
         """Declare what physics moves."""
         return ()
 
-    def inputs(self) -> Iterable[str]:
-        """Name the variables of this entity that physics depends on."""
-        return ()
+    def actions(self) -> Mapping[str, tuple[str, ...]]:
+        """Map what acts through commands to the states that it acts on in every step."""
+        return {}
 
     def parameters(self) -> Mapping[str, ParameterKey]:
         """Say which variable sets which physical parameter."""
-        return {}
-
-    def slices(self, block: int) -> Mapping[str, slice]:
-        """Say where its states stand in the vector of ``PhysicalState``.
-
-        Args:
-            block: Index of this entity among the movable blocks.
-        """
         return {}
 
     @property

@@ -84,7 +84,8 @@ class ModelComposition(Composition):
         if model.describe is None:
             return {}
         for row in model.states:
-            states.setdefault(model.trees[row.tree], []).append(row.name)
+            for tree in row.trees:
+                states.setdefault(model.trees[tree], []).append(row.name)
         found, top = dict[str, tuple[str, ...]](), [""]
         for number, body in enumerate(model.bodies.bodies):  # parents come before children
             if number:
@@ -340,10 +341,10 @@ class ModelTask(DeclaredTask):
         ]
         actions = [self._action(row) for row in system.inputs]
         together = [bundle("action", actions, doc="All controls.")] if len(actions) > 1 else []
-        causes = _causes(system)
+        causes = causes_of(system)
         states: list[Variable] = []
         for row in system.states:
-            states += self._state(row, causes[row.tree])
+            states += self._state(row, causes[row.trees])
         clock = next(iter(Clock(timing.steps, timing.control_period).variables()))
         readouts = [_readout(row) for row in system.readouts]
         own = [one for one in self.outcomes if not isinstance(one, str)]
@@ -412,20 +413,24 @@ class ModelTask(DeclaredTask):
             **self._fields(row, row.kind),
             default=_numbers(f"spaces[{row.name!r}]['default']", default, row.shape),
             parents=causes,
-            settable_state=True,
+            settable_state=not row.reported,
         )
         return beginning(state, self.start.get(row.name))
 
 
-def _causes(model: Model) -> list[tuple[Parent, ...]]:
-    """List what acts on the states of each tree, as edges of lag 1; the trees share them."""
-    found: list[list[Parent]] = [[] for _ in model.trees]
+def causes_of(model: Model) -> dict[frozenset[int], tuple[Parent, ...]]:
+    """List what acts on the states of each group of trees, as edges of lag 1, which they share."""
+    found: dict[frozenset[int], tuple[Parent, ...]] = {}
     seen = (row for row in model.parameters if not row.visual)
-    for row in (*seen, *model.states, *model.inputs):
-        sure, at_contact = Parent(row.name, 1), Parent(row.name, 1, "contact")
-        for tree in row.always | row.contact:
-            found[tree].append(sure if tree in row.always else at_contact)
-    return [tuple(causes) for causes in found]
+    states = [row for row in model.states if not row.reported]
+    rows = [row for row in (*seen, *states, *model.inputs) if row.always or row.contact]
+    for trees in {row.trees for row in model.states}:
+        found[trees] = tuple(
+            Parent(row.name, 1, None if trees & row.always else "contact")
+            for row in rows
+            if trees & (row.always | row.contact)
+        )
+    return found
 
 
 def beginning(state: Measured, begin: Any) -> tuple[Variable, ...]:

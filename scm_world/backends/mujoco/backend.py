@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, ClassVar, final
 
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
-from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.backends.base import (
@@ -20,19 +17,10 @@ from scm_world.backends.base import (
     EngineBatch,
     EngineSnapshot,
 )
-from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.batch import BatchSlot, MujocoBatch
 from scm_world.backends.mujoco.contacts import Touches
-from scm_world.backends.mujoco.realization import (
-    Realization,
-    Rows,
-    read_rows,
-    read_vector,
-    refuse_callbacks,
-    write_vector,
-)
-from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import EngineFailure, ModelError
+from scm_world.backends.mujoco.realization import Realization, refuse_callbacks
+from scm_world.errors import EngineFailure, ModelError, UnknownOption
 from scm_world.models.model import Model
 from scm_world.models.scene import (
     ControlMode,
@@ -44,71 +32,6 @@ from scm_world.models.scene import (
     Structure,
     complete,
 )
-
-
-@final
-class Articulated(Realization):
-    """A ``Model``. Its state vector is a permutation of MuJoCo's numbers."""
-
-    modes = (ControlMode.CONTROLS,)
-    lean = True
-
-    def __init__(self, structure: Model) -> None:
-        compiled = reading.compiled(structure)
-        keys = [row.key for row in structure.parameters]
-        super().__init__(
-            structure,
-            compiled,
-            lambda model, data: fields.slots(compiled, keys, model, data),
-            reading.body_names(compiled),
-            reading.contact_bodies(compiled),
-        )
-        self._places = np.concatenate(reading.permutation(compiled)).astype(np.int64)
-        self._compiled = compiled
-
-    @cached_property
-    def _dynamic(self) -> NDArray[np.bool_]:
-        """Which shapes touch with coefficients of their own, shape (ngeom, ngeom)."""
-        return Couplings(self._compiled).dynamic
-
-    def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """Say with which shapes a friction that was changed has no effect.
-
-        Source:
-            MuJoCo, *Computation, Contact*: of two shapes the one with the higher priority decides,
-            and with equal priorities the larger of each of their coefficients.
-        """
-        mj, names = self.model, fields.element_names(self._compiled)["geom"]
-        found = []
-        for (element, attribute), old in before.items():
-            name = element.removeprefix("geom:")
-            if attribute not in fields.FRICTIONS or name not in names:
-                continue
-            geom, column = names.index(name), fields.FRICTIONS.index(attribute)
-            rank, theirs = mj.geom_priority, mj.geom_friction[:, column]
-            larger = (rank == rank[geom]) & (theirs >= max(float(old), theirs[geom]))
-            others = np.flatnonzero(self._dynamic[geom] & ((rank > rank[geom]) | larger))
-            if len(others):
-                shown = [f"{names[i]} ({theirs[i]:g})" for i in others[:4].tolist()]
-                more = f" and {len(others) - 4} more" if len(others) > 4 else ""
-                found.append(
-                    f"{element}.{attribute} has no effect in contacts with {', '.join(shown)}{more}"
-                    ": the larger coefficient counts, or the one with priority"
-                )
-        return tuple(found)
-
-    def read(self, into: Floats) -> None:
-        """Write the state into a vector, shape (nq + nv + na,)."""
-        read_vector(self._positions, self._velocities, self._activations, self._places, into)
-
-    def place(self, vector: Floats) -> None:
-        """Write a state; all else stays as it is."""
-        write_vector(self._positions, self._velocities, self._activations, self._places, vector)
-
-    def rows(self, batch: Batch) -> Rows:
-        """Give what reads states of such models out of a batch."""
-        states, places = batch.state, self._places
-        return lambda which, into: int(read_rows(states, places, which, into))
 
 
 @final
@@ -133,16 +56,20 @@ class Payload:
     again: tuple[tuple[Floats, int] | None, Floats | None] = (None, None)
 
 
+def _check_mode(mode: ControlMode) -> None:
+    if mode is not ControlMode.CONTROLS:
+        raise UnknownOption("control mode", str(mode), (str(ControlMode.CONTROLS),))
+
+
 def realize(structure: Any, parameters: Parameters) -> Realization:
     """Compile a structure, and write all parameters.
 
     Raises:
         ModelError: It is nothing that MuJoCo can realise.
     """
-    kind = structure.realization("mujoco") or Articulated
-    if kind is Articulated and not isinstance(structure, Model):
+    if not isinstance(structure, Model):
         raise ModelError([f"MuJoCo cannot realise a {type(structure).__name__}; it takes models"])
-    fresh: Realization = kind(structure)
+    fresh = Realization(structure)
     fresh.edit(parameters)
     return fresh
 
@@ -244,8 +171,7 @@ class MujocoBackend(Backend):
             self._return()
         refuse_callbacks()
         now = self._now
-        if mode is not now.mode:
-            now.switch(mode)
+        _check_mode(mode)
         now.command[:] = command
         now.forget()
         if now.staged and substeps == 1:
@@ -306,8 +232,7 @@ class MujocoBackend(Backend):
     def move_to(self, slot: BatchSlot, mode: ControlMode) -> bool:
         """Copy the state to a slot; tell whether the model has changed since the last time."""
         now = self._now
-        if mode is not now.mode:
-            now.switch(mode)
+        _check_mode(mode)
         edited = now.edited
         if self.slot is not slot:
             self._return()

@@ -8,13 +8,15 @@ import hashlib
 import math
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
 
 import mujoco
+import numba
 import numpy as np
 
-from scm_world._types import Integers
+from scm_world._types import Floats, Integers
 from scm_world.backends.mujoco.bodies import describe
 from scm_world.backends.mujoco.fields import (
     MEDIUM,
@@ -25,12 +27,11 @@ from scm_world.backends.mujoco.fields import (
     table,
 )
 from scm_world.backends.mujoco.readouts import find_readouts
-from scm_world.backends.mujoco.realization import callbacks, inertia_of, sensible
 from scm_world.backends.mujoco.sources import Source, read_source, realized, understood
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, nearest
 from scm_world.models.bodies import ModelBodies
-from scm_world.models.model import Input, Model, Numbers, Parameter, StateRow
+from scm_world.models.model import REPORTED, Input, Model, Numbers, Parameter, StateRow
 from scm_world.models.scene import REVERSED, reversed_ranges
 
 _DSBL, _JNT, _TRN, _INT = (
@@ -47,6 +48,64 @@ _CONTROLS = {
 }
 
 
+CALLBACKS = {
+    name: getattr(mujoco, f"get_mjcb_{name}")
+    for name in ("control", "passive", "act_dyn", "act_gain", "act_bias", "contactfilter")
+}
+"""What gives the callbacks of a user that act on the physics."""
+_control, _passive, _act_dyn, _act_gain, _act_bias, _filter = CALLBACKS.values()
+
+
+def callbacks() -> list[str]:
+    """Say of each callback that is in use why no model can have it; none of them is usual."""
+    if not (_control() or _passive() or _act_dyn() or _act_gain() or _act_bias() or _filter()):
+        return []
+    return [
+        f"the callback mjcb_{name} is in use: what it acts on is unknown; call "
+        f"mujoco.set_mjcb_{name}(None)"
+        for name, callback in CALLBACKS.items()
+        if callback() is not None
+    ]
+
+
+@numba.njit("b1(f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])", cache=True)
+def sensible(
+    masses: Floats, moments: Floats, inertia: Floats, dof_weights: Floats, body_weights: Floats
+) -> bool:
+    """Tell whether masses and what MuJoCo derives from them are those of something that can move.
+
+    Args:
+        masses: Of the bodies, shape (nbody,).
+        moments: Their principal moments of inertia, shape (nbody, 3).
+        inertia: Diagonal of the inertia matrix, shape (nv,).
+        dof_weights: Inverse weights, shape (nv,).
+        body_weights: Inverse weights, shape (nbody, 2).
+    """
+    for body in range(masses.shape[0]):
+        a, b, c = moments[body]
+        least, most = min(a, b, c), max(a, b, c)
+        if not (0.0 <= masses[body] < math.inf and least >= 0.0 and most < math.inf):
+            return False
+        if not a + b + c - 2.0 * most >= -1e-6 * most:  # the triangle inequality
+            return False
+        for weight in body_weights[body]:
+            if not 0.0 <= weight < math.inf:
+                return False
+    for dof in range(inertia.shape[0]):
+        if not (0.0 < inertia[dof] < math.inf and 0.0 <= dof_weights[dof] < math.inf):
+            return False
+    return True
+
+
+def inertia_of(mj: mujoco.MjModel) -> tuple[Floats, ...]:
+    """Return views of what ``sensible`` looks at."""
+    return mj.body_mass, mj.body_inertia, mj.dof_M0, mj.dof_invweight0, mj.body_invweight0
+
+
+Bindings = Callable[[mujoco.MjModel, Couplings], Iterable[Field]]
+"""Makes the parameters of a compiled model with these kinematic trees."""
+
+
 def read_model(
     source: Any,
     *,
@@ -56,6 +115,11 @@ def read_model(
     fixed_base: bool = True,
     keyframe: str | int | None = None,
     settings: Mapping[str, Any] | None = None,
+    reported: Iterable[str] | str = (),
+    states: Mapping[str, Sequence[str]] | None = None,
+    controls: Sequence[str] | None = None,
+    bindings: Bindings | None = None,
+    frame: Literal["body", "world"] = "body",
 ) -> Model:
     """Read a model, and describe it by tables.
 
@@ -73,11 +137,24 @@ def read_model(
         keyframe: Name or number of a keyframe of the file whose state, controls and mocap poses are
             the defaults; the pose of the file if None.
         settings: Options of MJCF to be set to something else: ``{"timestep": 0.001}``.
+        reported: Patterns of what the engine reports in every step and what cannot be set:
+            ``"hinge.actuator_torque"`` [N m] and ``"slide.actuator_force"`` [N], the sum of the
+            actuators of a joint.
+        states: Names of states, in the order of the state vector, each with the elementary states
+            (and reported quantities) that it consists of: ``{"joint_positions":
+            ["hip.position", "knee.position"]}``. Each elementary state by itself if None.
+        controls: Names of the actuators that are commanded, in order, the first ones of the model;
+            all if None.
+        bindings: Makes the parameters in place of the fields of the compiled model, given that
+            model and its kinematic trees: each writes one value to any arrays. ``expose`` has no
+            effect then.
+        frame: ``"world"`` for angular velocities of free bodies in the world, and orientations with
+            w >= 0; ``"body"`` for those that MuJoCo has.
 
     Raises:
         UnreadableFile: There is no such file, or it is no text.
         ModelError: It is no model, or one that cannot be a causal model; or a pattern or readout
-            names nothing.
+            names nothing; or states are left out.
         UnknownOption: A setting or keyframe does not exist.
     """
     found = callbacks()
@@ -92,17 +169,22 @@ def read_model(
     start = _start(mj, keyframe)
     trees = Couplings(mj)
     names = element_names(mj)
-    states = tuple(_states(mj, names, trees, start))
+    elements = {row.name: row for row in _states(mj, names, trees, start, frame)}
+    rows = _grouped(elements, states, [reported] if isinstance(reported, str) else [*reported])
     inputs = tuple(_inputs(mj, names, trees, start))
-    placed = [
-        (row, state.array, state.numbers, state.number if state.kind == "joint" else -1)
-        for row, state in zip(states, _moving(mj, names), strict=True)
-    ]
+    if controls is not None:
+        inputs = inputs[: len(controls)]
+        if [row.name for row in inputs] != [f"{name}.control" for name in controls]:
+            first = [row.name.removesuffix(".control") for row in inputs]
+            raise ModelError([f"controls={[*controls]}: the first actuators are {first}"])
     patterns = None if expose is None else [expose] if isinstance(expose, str) else list(expose)
     fluid = patterns is not None and any(fnmatch.filter(MEDIUM, p) for p in patterns if p != "*")
-    fields = table(mj, fluid=fluid)
-    chosen = _exposed(fields, patterns)
-    parameters = tuple(_parameter(mj, start, field) for field in fields if field.name in chosen)
+    bound = bindings is not None
+    fields = tuple(bindings(mj, trees)) if bindings is not None else table(mj, fluid=fluid)
+    chosen = {field.name for field in fields} if bound else _exposed(fields, patterns)
+    parameters = tuple(
+        _parameter(mj, start, field, bound=bound) for field in fields if field.name in chosen
+    )
     wrong = reversed_ranges({row.key: row.default for row in parameters})
     if wrong:
         raise ModelError([f"{where}: {'.'.join(key)}: {REVERSED}" for key in wrong])
@@ -111,15 +193,17 @@ def read_model(
         warnings.warn(note, stacklevel=3)
     keys = "\0".join(f"{row.name}\0{row.key}" for row in parameters)
     keys += "" if keyframe is None else f"\0{keyframe}"
+    keys += "" if states is None else f"\0{[*states.items()]}"
+    keys += "" if (frame, len(inputs)) == ("body", mj.nu) else f"\0{frame} {len(inputs)}"
     return Model(
         name=name or own_name or "model",
         digest=hashlib.sha256(f"{sealed.digest}\0{keys}".encode()).hexdigest(),
         source=sealed,
         timestep=float(mj.opt.timestep),
         parameters=parameters,
-        states=states,
+        states=rows,
         inputs=inputs,
-        readouts=tuple(find_readouts(mj, sealed, placed, parameters, tuple(readouts))),
+        readouts=tuple(find_readouts(mj, sealed, rows, parameters, tuple(readouts))),
         trees=tuple(names["body"][root] for root in trees.roots),
         refused=tuple(
             (field.name, field.refusal or "is not exposed; name it in expose=[…]")
@@ -317,8 +401,10 @@ def _exposed(fields: Sequence[Field], patterns: Sequence[str] | None) -> set[str
     return found
 
 
-def _parameter(mj: mujoco.MjModel, data: mujoco.MjData, field: Field) -> Parameter:
-    """Describe a field with what it is in the model as it was given."""
+def _parameter(
+    mj: mujoco.MjModel, data: mujoco.MjData, field: Field, *, bound: bool
+) -> Parameter:
+    """Describe a field, or a binding, with its value in the model as it was given."""
     if field.slot is None:
         raise TypeError(f"{field.name} has no place")
     slot = field.slot(mj, data)
@@ -335,6 +421,7 @@ def _parameter(mj: mujoco.MjModel, data: mujoco.MjData, field: Field) -> Paramet
         always=always,
         contact=contact,
         key=field.key,
+        slot=field.slot if bound else None,
         kind=field.nature,
         visual=field.visual,
     )
@@ -348,29 +435,19 @@ def _numbers(values: Any) -> Numbers:
 # --- states and inputs -------------------------------------------------------------------------
 
 
-class Permutation(NamedTuple):
-    """Where each of MuJoCo's numbers stands in the state vector.
+def permutation(model: Model) -> tuple[Integers, Integers, Integers]:
+    """Return where in the state vector each number of ``qpos``, ``qvel`` and ``act`` stands.
 
-    Attributes:
-        positions: ``vector[positions]`` is ``qpos``.
-        velocities: ``vector[velocities]`` is ``qvel``.
-        activations: ``vector[activations]`` is ``act``.
+    ``vector[places]`` is the array, for each of the three.
     """
-
-    positions: Integers
-    velocities: Integers
-    activations: Integers
-
-
-def permutation(mj: mujoco.MjModel) -> Permutation:
-    """Give the place of every number of MuJoCo's state in that of the tables."""
-    found = Permutation(*(np.empty(n, dtype=np.int64) for n in (mj.nq, mj.nv, mj.na)))
-    arrays = {"qpos": found.positions, "qvel": found.velocities, "act": found.activations}
-    end = 0
-    for state in _moving(mj, element_names(mj)):
-        arrays[state.array][state.numbers] = np.arange(end, end + len(state.numbers))
-        end += len(state.numbers)
-    return found
+    places = model.layout.slices
+    found: dict[str, list[tuple[int, int]]] = {"qpos": [], "qvel": [], "act": [], REPORTED: []}
+    for row in model.states:
+        found[row.array] += zip(row.numbers, range(places[row.name].start, model.layout.size))
+    qpos, qvel, act, _ = (
+        np.array([place for _, place in sorted(pairs)], dtype=np.int64) for pairs in found.values()
+    )
+    return qpos, qvel, act
 
 
 class _Moving(NamedTuple):
@@ -437,11 +514,30 @@ def _moving(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterato
         )  # fmt: skip
 
 
+def _reported(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterator[_Moving]:
+    """List what the engine reports: torques and forces of actuators, for joints with one axis."""
+    for joint, kind in enumerate(mj.jnt_type.tolist()):
+        if kind in (int(_JNT.mjJNT_HINGE), int(_JNT.mjJNT_SLIDE)):
+            turns = kind == int(_JNT.mjJNT_HINGE)
+            what, unit = ("torque", "N m") if turns else ("force", "N")
+            limited = mj.jnt_actfrclimited[joint]
+            low, high = mj.jnt_actfrcrange[joint] if limited else (-math.inf, math.inf)
+            yield _Moving(
+                REPORTED, [int(mj.jnt_dofadr[joint])], "joint", joint, names["joint"][joint],
+                f"actuator_{what}", unit, f"Sum of the {what}s of its actuators, in the last step.",
+                float(low), float(high),
+            )  # fmt: skip
+
+
 def _states(
-    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings, data: mujoco.MjData
+    mj: mujoco.MjModel,
+    names: Mapping[str, tuple[str, ...]],
+    trees: Couplings,
+    data: mujoco.MjData,
+    frame: Literal["body", "world"],
 ) -> Iterator[StateRow]:
-    """Describe what moves, in the order of the state vector; the data are where it begins."""
-    states = list(_moving(mj, names))
+    """Describe what moves, in MuJoCo's order, then what is reported; the data are the start."""
+    states = [*_moving(mj, names), *_reported(mj, names)]
     named = Counter(f"{state.element}.{state.attribute}" for state in states)
     for state in states:
         plain = f"{state.element}.{state.attribute}"
@@ -453,6 +549,8 @@ def _states(
             tree, always, contact = _of_actuator(trees, state.number, stateful=True)
         scalar = len(state.numbers) == 1
         rotation = state.attribute == "orientation"
+        free = state.kind == "joint" and mj.jnt_type[state.number] == int(_JNT.mjJNT_FREE)
+        turns = free and state.attribute in ("orientation", "angular_velocity")
         yield StateRow(
             name=f"{state.kind}:{plain}" if named[plain] > 1 else plain,
             unit=state.unit,
@@ -460,12 +558,79 @@ def _states(
             default=_numbers(default[0] if scalar else default),
             low=-1.0 if rotation else min(state.low, float(default.min())),
             high=1.0 if rotation else max(state.high, float(default.max())),
-            doc=state.doc,
+            doc=_IN_WORLD[state.attribute] if turns and frame == "world" else state.doc,
             always=always,
             contact=contact,
-            tree=tree,
+            trees=frozenset([tree]),
             kind="rotation" if rotation else "real",
+            array=state.array,
+            numbers=tuple(state.numbers),
+            frame=frame if turns else "body",
         )
+
+
+_IN_WORLD = {
+    "orientation": "Orientation of the body in the world (x, y, z, w) with w >= 0.",
+    "angular_velocity": "Angular velocity of the body, in the world.",
+}
+
+
+def _grouped(
+    elements: Mapping[str, StateRow],
+    states: Mapping[str, Sequence[str]] | None,
+    reported: Sequence[str],
+) -> tuple[StateRow, ...]:
+    """Put elementary states together, in the order of the state vector.
+
+    Raises:
+        ModelError: A name or a pattern names nothing, or a state is left out or taken twice.
+    """
+    known = [name for name, row in elements.items() if row.reported]
+    asked = {name for pattern in reported for name in fnmatch.filter(known, pattern)}
+    problems = [
+        f"reported={pattern!r} names nothing that is reported; there are: {', '.join(known)}"
+        for pattern in reported
+        if not fnmatch.filter(known, pattern)
+    ]
+    rows = [row for name, row in elements.items() if not row.reported or name in asked]
+    if states is None and not problems:
+        return tuple(rows)
+    used = Counter(part for parts in (states or {}).values() for part in parts)
+    problems += [f"states: there is no state {name!r}" for name in used if name not in elements]
+    problems += [f"states: {name!r} stands in {n} of them" for name, n in used.items() if n > 1]
+    problems += [f"states: {row.name!r} is left out" for row in rows if states and not used[row.name]]
+    if problems:
+        raise ModelError(problems)
+    found = []
+    for name, parts in (states or {}).items():
+        first, *rest = (elements[part] for part in parts)
+        if not rest:
+            found.append(replace(first, name=name))
+            continue
+        together = (first, *rest)
+        always = frozenset().union(*(row.always for row in together))
+        found.append(
+            replace(
+                first,
+                name=name,
+                shape=(sum(len(row.numbers) for row in together),),
+                default=_joined(together, "default"),
+                low=_joined(together, "low"),
+                high=_joined(together, "high"),
+                always=always,
+                contact=frozenset().union(*(row.contact for row in together)) - always,
+                trees=frozenset().union(*(row.trees for row in together)),
+                numbers=tuple(number for row in together for number in row.numbers),
+                frame=max(row.frame for row in together),
+            )
+        )
+    return tuple(found)
+
+
+def _joined(rows: Iterable[StateRow], what: str) -> tuple[float, ...]:
+    """Return default or bounds of states in a row."""
+    parts = (np.broadcast_to(getattr(row, what), row.shape).ravel() for row in rows)
+    return tuple(np.concatenate([*parts]).tolist())
 
 
 def _of_actuator(

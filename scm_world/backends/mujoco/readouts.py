@@ -58,7 +58,8 @@ class Computed:
 
     Attributes:
         source: Of the model.
-        states: For each state, which numbers of ``"qpos"``, ``"qvel"`` or ``"act"`` it is.
+        states: For each state, which numbers of ``"qpos"``, ``"qvel"`` or ``"act"`` it is, and in
+            which frame it is given; see ``StateRow``.
         keys: Of the parameters.
         kind: Of the element: ``"site"``, ``"body"``, ``"geom"`` or ``"sensor"``.
         index: Of the element.
@@ -66,7 +67,7 @@ class Computed:
     """
 
     source: Source
-    states: tuple[tuple[str, tuple[int, ...]], ...]
+    states: tuple[tuple[str, tuple[int, ...], str], ...]
     keys: tuple[ParameterKey, ...]
     kind: str
     index: int
@@ -76,8 +77,16 @@ class Computed:
         """Compute the value from those of the parents."""
         mj, data, scratch, slots = _scratch(self.source, self.keys, threading.get_ident())
         data.qpos[:], data.qvel[:] = mj.qpos0, 0.0
-        for (array, numbers), value in zip(self.states, values, strict=False):
+        for (array, numbers, _), value in zip(self.states, values, strict=False):
             getattr(data, array)[list(numbers)] = value
+        for array, numbers, frame in self.states:
+            for dof in numbers if (array, frame) == ("qvel", "world") else ():
+                joint = int(mj.dof_jntid[dof])  # MuJoCo has spins in the frame of the body
+                if int(mj.jnt_type[joint]) == FREE and dof == mj.jnt_dofadr[joint] + 3:
+                    start, back, spin = int(mj.jnt_qposadr[joint]) + 3, np.empty(4), np.empty(3)
+                    mujoco.mju_negQuat(back, data.qpos[start : start + 4])
+                    mujoco.mju_rotVecQuat(spin, data.qvel[dof : dof + 3], back)
+                    data.qvel[dof : dof + 3] = spin
         for key, value in zip(self.keys, values[len(self.states) :], strict=True):
             slots[key].write(np.asarray(value, dtype=np.float64))
         if any(slots[key].constant for key in self.keys):
@@ -115,7 +124,7 @@ class Computed:
 def find_readouts(
     mj: mujoco.MjModel,
     source: Source,
-    states: Sequence[tuple[StateRow, str, Sequence[int], int]],
+    states: Sequence[StateRow],
     parameters: Sequence[Parameter],
     wanted: Sequence[str],
 ) -> Iterator[Readout]:
@@ -124,7 +133,7 @@ def find_readouts(
     Args:
         mj: The compiled model.
         source: What it was compiled from.
-        states: Each with the array it is in, its numbers there, and its joint (-1 if it has none).
+        states: Rows of the state vector.
         parameters: Those that are exposed.
         wanted: Names: ``"tip.position"``, ``"body:tip.position"``, ``"imu.value"``.
 
@@ -143,6 +152,14 @@ def find_readouts(
         raise ModelError(problems)
 
 
+def _joints_of(mj: mujoco.MjModel, row: StateRow) -> list[int]:
+    """Return the joint of each number of a state; none for activations."""
+    if row.array == "qpos":
+        starts = mj.jnt_qposadr
+        return (np.searchsorted(starts, row.numbers, side="right") - 1).tolist()
+    return mj.dof_jntid[list(row.numbers)].tolist() if row.array == "qvel" else []
+
+
 @final
 class _Finder:
     """Looks for elements, and for what decides where they are."""
@@ -151,10 +168,11 @@ class _Finder:
         self,
         mj: mujoco.MjModel,
         source: Source,
-        states: Sequence[tuple[StateRow, str, Sequence[int], int]],
+        states: Sequence[StateRow],
         parameters: Sequence[Parameter],
     ) -> None:
         self._mj, self._source, self._states = mj, source, states
+        self._joints = {row.name: _joints_of(mj, row) for row in states}
         self._parameters = [row for row in parameters if not row.visual]
         self._names = element_names(mj)
 
@@ -162,7 +180,7 @@ class _Finder:
         """Describe a readout, or say what is wrong with its name."""
         prefix, _, plain = name.rpartition(":")
         element, _, attribute = plain.rpartition(".")
-        taken = [row.name for row in (*self._parameters, *(row for row, *_ in self._states))]
+        taken = [row.name for row in (*self._parameters, *self._states)]
         if name in taken:
             kinds = [f"{kind}:{name}" for kind in _OBJECTS if clean(element) in self._names[kind]]
             return "it is a variable already" + (f"; write {kinds[0]!r}" if kinds else "")
@@ -198,10 +216,11 @@ class _Finder:
     def _chain(self, kind: str, index: int, states: Sequence[str], *, turn: bool) -> Chain:
         """Write a pose down as a chain of joints, which is computed faster than by MuJoCo."""
         mj, first, numbers = self._mj, 0, dict[int, int]()
-        for row, _, where, joint in self._states:
+        for row in self._states:
             if row.name in states:
-                numbers.setdefault(joint, first)
-                first += len(where)
+                for joint in dict.fromkeys(self._joints[row.name]):
+                    numbers.setdefault(joint, first)
+                    first += self._joints[row.name].count(joint)
         steps: list[tuple[float, ...]] = []
         body = index
         if kind != "body":
@@ -236,7 +255,7 @@ class _Finder:
         function: Callable[..., Any] | None = None,
     ) -> Readout:
         named = {row.key: row.name for row in self._parameters}
-        where = {row.name: (array, tuple(numbers)) for row, array, numbers, _ in self._states}
+        where = {row.name: (row.array, row.numbers, row.frame) for row in self._states}
         places = tuple(where[state] for state in states)
         parents = (*states, *(named[key] for key in keys))
         function = function or Computed(self._source, places, keys, *what)
@@ -260,7 +279,9 @@ class _Finder:
         elements |= {("joint", self._names["joint"][joint]) for joint in joints}
         arrays = ("qpos", "qvel") if velocity else ("qpos",)
         states = [
-            row.name for row, array, _, joint in self._states if array in arrays and joint in joints
+            row.name
+            for row in self._states
+            if row.array in arrays and not joints.isdisjoint(self._joints[row.name])
         ]
         keys = tuple(
             row.key
@@ -288,10 +309,14 @@ class _Finder:
         objects = self._objects(index, kind)
         if kind in _OF_JOINTS:
             array, joint = "qvel" if velocity else "qpos", int(mj.sensor_objid[index])
-            states = [row.name for row, a, _, j in self._states if a == array and j == joint]
+            states = [
+                row.name
+                for row in self._states
+                if row.array == array and joint in self._joints[row.name]
+            ]
             keys: tuple[ParameterKey, ...] = ()
         elif objects is None:
-            states = [row.name for row, array, *_ in self._states if array != "act"]
+            states = [row.name for row in self._states if row.array in ("qpos", "qvel")]
             keys = tuple(row.key for row in self._parameters)
         else:
             states, keys = self._parents(objects, velocity)

@@ -1,26 +1,34 @@
-"""A structure as MuJoCo realizes it: one class for each kind of structure.
-
-``Realization`` holds a compiled model with its parameters and its state. ``backend`` has the one
-of any ``Model``; a structure can bring its own (``Structure.realization``).
-"""
+"""A model as MuJoCo realizes it: compiled, with parameters and a state."""
 
 from __future__ import annotations
 
 import copy
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar
+from collections.abc import Callable, Iterable
+from functools import cached_property
+from typing import Any
 
 import mujoco
 import numba
 import numpy as np
 from mujoco.batch import Batch
+from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
+from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.contacts import Touches, earlier_stages, has_stages, touches
-from scm_world.backends.mujoco.slots import Slot
+from scm_world.backends.mujoco.states import (
+    LastStep,
+    Turned,
+    into_bodies,
+    read_rows,
+    read_vector,
+    settle,
+    write_vector,
+)
+from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import EngineFailure, Infeasible, UnknownOption
+from scm_world.models.model import Model
 from scm_world.models.scene import (
     REVERSED,
     ControlMode,
@@ -51,101 +59,6 @@ def sound(positions: Floats, velocities: Floats, activations: Floats, counts: An
     return total == 0.0 and counts[1] + counts[2] == 2
 
 
-@numba.njit("void(f8[::1], f8[::1], f8[::1], i8[::1], f8[::1])", cache=True)
-def read_vector(
-    positions: Floats, velocities: Floats, activations: Floats, places: Integers, into: Floats
-) -> None:
-    """Copy MuJoCo's coordinates into a state vector.
-
-    Args:
-        positions: Shape (nq,).
-        velocities: Shape (nv,).
-        activations: Shape (na,).
-        places: Where in the vector each of them stands, in this order, shape (nq + nv + na,).
-        into: Written, shape (nq + nv + na,).
-    """
-    nq, nv = positions.shape[0], velocities.shape[0]
-    for i in range(nq):
-        into[places[i]] = positions[i]
-    for i in range(nv):
-        into[places[nq + i]] = velocities[i]
-    for i in range(activations.shape[0]):
-        into[places[nq + nv + i]] = activations[i]
-
-
-@numba.njit("void(f8[::1], f8[::1], f8[::1], i8[::1], f8[::1])", cache=True)
-def write_vector(
-    positions: Floats, velocities: Floats, activations: Floats, places: Integers, vector: Floats
-) -> None:
-    """Copy a state vector into MuJoCo's coordinates; see ``read_vector``."""
-    nq, nv = positions.shape[0], velocities.shape[0]
-    for i in range(nq):
-        positions[i] = vector[places[i]]
-    for i in range(nv):
-        velocities[i] = vector[places[nq + i]]
-    for i in range(activations.shape[0]):
-        activations[i] = vector[places[nq + nv + i]]
-
-
-@numba.njit("i8(f8[:, ::1], i8[::1], i4[::1], f8[:, ::1])", cache=True)
-def read_rows(states: Floats, places: Integers, which: Any, into: Floats) -> int:
-    """Copy some rows of MuJoCo's states (time, positions, velocities, activations, ...).
-
-    Args:
-        states: Of all simulations, one to a row.
-        places: See ``read_vector``.
-        which: The rows, shape (m,).
-        into: The first columns of these rows are written.
-
-    Returns:
-        A row in which something is not finite; -1 if there is none.
-    """
-    wrong = -1
-    for row in which:
-        total = 0.0
-        for i in range(places.shape[0]):
-            value = states[row, 1 + i]
-            into[row, places[i]] = value
-            total += value * 0.0
-        if total != 0.0:
-            wrong = row
-    return wrong
-
-
-@numba.njit("b1(f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])", cache=True)
-def sensible(
-    masses: Floats, moments: Floats, inertia: Floats, dof_weights: Floats, body_weights: Floats
-) -> bool:
-    """Tell whether masses and what MuJoCo derives from them are those of something that can move.
-
-    Args:
-        masses: Of the bodies, shape (nbody,).
-        moments: Their principal moments of inertia, shape (nbody, 3).
-        inertia: Diagonal of the inertia matrix, shape (nv,).
-        dof_weights: Inverse weights, shape (nv,).
-        body_weights: Inverse weights, shape (nbody, 2).
-    """
-    for body in range(masses.shape[0]):
-        a, b, c = moments[body]
-        least, most = min(a, b, c), max(a, b, c)
-        if not (0.0 <= masses[body] < math.inf and least >= 0.0 and most < math.inf):
-            return False
-        if not a + b + c - 2.0 * most >= -1e-6 * most:  # the triangle inequality
-            return False
-        for weight in body_weights[body]:
-            if not 0.0 <= weight < math.inf:
-                return False
-    for dof in range(inertia.shape[0]):
-        if not (0.0 < inertia[dof] < math.inf and 0.0 <= dof_weights[dof] < math.inf):
-            return False
-    return True
-
-
-def inertia_of(mj: mujoco.MjModel) -> tuple[Floats, ...]:
-    """Return views of what ``sensible`` looks at."""
-    return mj.body_mass, mj.body_inertia, mj.dof_M0, mj.dof_invweight0, mj.body_invweight0
-
-
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Everything that decides the future of a simulation of MuJoCo."""
 
@@ -154,27 +67,11 @@ FULL = (
     "of the model, for example with <size memory='100M'/>"
 )
 
-CALLBACKS = {
-    name: getattr(mujoco, f"get_mjcb_{name}")
-    for name in ("control", "passive", "act_dyn", "act_gain", "act_bias", "contactfilter")
-}
-"""What gives the callbacks of a user that act on the physics."""
-_control, _passive, _act_dyn, _act_gain, _act_bias, _filter = CALLBACKS.values()
+_NO_FORCES = np.zeros((1, 0))
+_NO_FORCES.flags.writeable = False
 
 Rows = Callable[[Any, Floats], int]
 """Reads some states of a batch, and gives a row that is not finite, or -1."""
-
-
-def callbacks() -> list[str]:
-    """Say of each callback that is in use why no model can have it; none of them is usual."""
-    if not (_control() or _passive() or _act_dyn() or _act_gain() or _act_bias() or _filter()):
-        return []
-    return [
-        f"the callback mjcb_{name} is in use: what it acts on is unknown; call "
-        f"mujoco.set_mjcb_{name}(None)"
-        for name, callback in CALLBACKS.items()
-        if callback() is not None
-    ]
 
 
 def refuse_callbacks() -> None:
@@ -183,7 +80,7 @@ def refuse_callbacks() -> None:
     Raises:
         EngineFailure: With the callbacks.
     """
-    found = callbacks()
+    found = reading.callbacks()
     if found:
         raise EngineFailure("; ".join(found), "mujoco")
 
@@ -205,15 +102,11 @@ def lost(structure: Any, vector: Floats, time: float) -> str:
     )
 
 
-class Realization(ABC):
+class Realization:
     """A compiled model with parameters and a state of its own.
 
     Args:
-        structure: What was compiled.
-        compiled: The result, which is copied and not changed.
-        slots: Finds the places of all parameters in a model and its data.
-        bodies: Name of each body.
-        owners: Name of the body of each shape: the geoms, then the flexes.
+        structure: The description of the model.
 
     Attributes:
         structure: What was compiled.
@@ -221,7 +114,6 @@ class Realization(ABC):
         data: With the present state.
         kept: The parameters in force; at first, none has been written.
         applied: The parameters of a snapshot, while they are those in force.
-        mode: What a command means.
         command: Where it is written, shape (n_commands,).
         edited: Whether the model has changed since someone last cleared this.
         staged: Whether a physics step has stages, each with contacts of its own.
@@ -231,53 +123,102 @@ class Realization(ABC):
             taken elsewhere, so that their contacts are not in the data.
     """
 
-    modes: ClassVar[tuple[ControlMode, ...]]
-    lean: ClassVar[bool] = False
+    mode = ControlMode.CONTROLS
 
-    def __init__(
-        self,
-        structure: Any,
-        compiled: mujoco.MjModel,
-        slots: Callable[[mujoco.MjModel, mujoco.MjData], Mapping[ParameterKey, Slot]],
-        bodies: tuple[str, ...],
-        owners: tuple[str, ...],
-    ) -> None:
+    def __init__(self, structure: Model) -> None:
+        self._compiled = compiled = reading.compiled(structure)
         self.structure = structure
         self.model = model = copy.copy(compiled)
         self.data = data = mujoco.MjData(model)
         self._scratch = mujoco.MjData(model)
-        self._slots = slots(model, data)
+        rows = structure.parameters
+        keys = [row.key for row in rows if row.slot is None]
+        self._slots = fields.slots(compiled, keys, model, data) if keys else {}
+        self._slots |= {row.key: row.slot(model, data) for row in rows if row.slot is not None}
         self._constant = frozenset(key for key, slot in self._slots.items() if slot.constant)
-        self._bodies, self._owners = bodies, owners
+        self._follow_ups = {key: f for key, slot in self._slots.items() if (f := slot.follow_up)}
+        self._bodies = reading.body_names(compiled)
+        self._owners = reading.contact_bodies(compiled)
         self.kept: dict[ParameterKey, Floats] = {}
         self.applied: Parameters | None = None
         self._numbers: bytes | None = None  # of what is kept, if nothing was written since
-        self.mode = self.modes[0]
         self.edited = True
         self.staged = has_stages(model)
         self.began: Floats | None = None
         self.replay: tuple[Floats, int] | None = None
         self.command = data.ctrl[: structure.n_commands]
         self._positions, self._velocities, self._activations = data.qpos, data.qvel, data.act
+        self._forces = data.qfrc_actuator
+        self._places = np.concatenate(reading.permutation(structure)).astype(np.int64)
+        self._turned, places = Turned.of(structure, compiled), structure.layout.slices
+        pairs = [
+            (place, number)
+            for row in structure.states
+            if row.reported
+            for place, number in enumerate(row.numbers, places[row.name].start)
+        ]
+        self._reported = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+        self.lean = not (pairs or self._turned.names)
+        self._last: LastStep | None = None
+        self._written: Floats | None = None  # since the last step, if bodies are turned
         self._counts = data.warning.number
-        self._weights = inertia_of(model)
+        self._weights = reading.inertia_of(model)
         self._size = int(mujoco.mj_stateSize(model, STATE))
         # MuJoCo prints a warning, and writes it to a file, when it counts the first of its kind.
         self._counts[:] = self._scratch.warning.number[:] = 1
 
-    # --- state: how numbers are converted differs between kinds of structures ------------------
+    # --- state ---------------------------------------------------------------------------------
 
-    @abstractmethod
     def read(self, into: Floats) -> None:
-        """Write the state into a vector."""
+        """Write the state into a vector, shape (layout.size,)."""
+        read_vector(
+            self._positions,
+            self._velocities,
+            self._activations,
+            self._forces,
+            self._places,
+            self._turned.vector,
+            self._reported,
+            into,
+        )
+        if self._written is not None:
+            settle(self._written, into, self._turned.vector)
 
-    @abstractmethod
     def place(self, vector: Floats) -> None:
-        """Write a state; all else stays as it is."""
+        """Write a state; all else stays as it is. What is as the last step left it stays exact."""
+        turned = self._turned
+        if turned.names:
+            names, known, exact = self._remembered()
+            if names != turned.names:
+                where = [names.index(name) if name in names else -1 for name in turned.names]
+                nobody = np.full((1, 7), np.nan)
+                known, exact = (np.vstack([part, nobody])[where] for part in (known, exact))
+            numbers = np.empty((len(turned.names), 7))
+            into_bodies(vector, turned.vector, known, exact, numbers)
+            self._written = vector.copy()
+        write_vector(
+            self._positions, self._velocities, self._activations, self._places, vector
+        )
+        if turned.names:
+            turned.write_own(numbers, self._positions, self._velocities)
 
-    @abstractmethod
+    def _remembered(self) -> LastStep:
+        """Return what the last physics step left of turned bodies, before the first change."""
+        if self._last is None:
+            vector = np.empty(self.structure.layout.size)
+            self.read(vector)
+            own = self._turned.read_own(self._positions, self._velocities)
+            self._last = self._turned.names, self._turned.read(vector), own
+        return self._last
+
     def rows(self, batch: Batch) -> Rows:
-        """Give what reads states of such models out of a batch."""
+        """Return what reads states of such models out of a batch."""
+        forces = batch.bind("qfrc_actuator") if len(self._reported) else _NO_FORCES
+        states, places = batch.state, self._places
+        turned, reported = self._turned.vector, self._reported
+        return lambda which, into: int(
+            read_rows(states, forces, places, turned, reported, which, into)
+        )
 
     def reset(self) -> None:
         """Forget every step; parameters stay."""
@@ -285,12 +226,13 @@ class Realization(ABC):
         places, turns = data.mocap_pos.copy(), data.mocap_quat.copy()
         mujoco.mj_resetData(self.model, data)
         data.mocap_pos[:], data.mocap_quat[:] = places, turns
-        self.began = self.replay = None
+        self.began = self.replay = self._written = None
+        self._last = (), np.empty((0, 7)), np.empty((0, 7))
         self._counts[:] = 1
 
     def forget(self) -> None:
         """Forget what was before a step that is made now."""
-        self.began = self.replay = None
+        self.began = self.replay = self._last = self._written = None
 
     def problem(self) -> str:
         """Say what is wrong with what a step left, or nothing."""
@@ -343,27 +285,25 @@ class Realization(ABC):
 
     def memory(self) -> Any:
         """Return what has to be kept in addition to ``mjSTATE_INTEGRATION``; it can be pickled."""
-        return None
+        return None if self.lean else (self._forces.copy(), self._last, self._written)
 
     def recall(self, numbers: Floats, memory: Any) -> None:
         """Restore what was kept."""
         mujoco.mj_setState(self.model, self.data, numbers, STATE)
         self._counts[:] = 1
         self.began = self.replay = None
+        if memory is not None:
+            self._forces[:], self._last, self._written = memory
 
     def follow(self, before: Realization) -> None:
         """Continue after the last step of another realization; then the state is written."""
         self.data.time = before.data.time
-
-    def switch(self, mode: ControlMode) -> None:
-        """Change the meaning of commands.
-
-        Raises:
-            UnknownOption: This structure has no such mode.
-        """
-        if mode not in self.modes:
-            raise UnknownOption("control mode", str(mode), map(str, self.modes))
-        self.mode = mode
+        if self._turned.names:
+            self._last = before._remembered()
+        there = before.structure.layout.slices
+        for row in (row for row in self.structure.states if row.reported and row.name in there):
+            other = next(one for one in before.structure.states if one.name == row.name)
+            self._forces[list(row.numbers)] = before._forces[list(other.numbers)]
 
     # --- model ---------------------------------------------------------------------------------
 
@@ -378,15 +318,42 @@ class Realization(ABC):
         moments: Floats = self.model.body_inertia[self._bodies.index(body)].copy()
         return moments
 
+    @cached_property
+    def _dynamic(self) -> NDArray[np.bool_]:
+        """Which shapes touch with coefficients of their own, shape (ngeom, ngeom)."""
+        return Couplings(self._compiled).dynamic
+
     def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """Say which changes of parameters have no effect, and why."""
-        return ()
+        """Say with which shapes a friction that was changed has no effect.
+
+        Source:
+            MuJoCo, *Computation, Contact*: of two shapes the one with the higher priority decides,
+            and with equal priorities the larger of each of their coefficients.
+        """
+        mj, names = self.model, fields.element_names(self._compiled)["geom"]
+        found = []
+        for (element, attribute), old in before.items():
+            name = element.removeprefix("geom:")
+            if attribute not in fields.FRICTIONS or name not in names:
+                continue
+            geom, column = names.index(name), fields.FRICTIONS.index(attribute)
+            rank, theirs = mj.geom_priority, mj.geom_friction[:, column]
+            larger = (rank == rank[geom]) & (theirs >= max(float(old), theirs[geom]))
+            others = np.flatnonzero(self._dynamic[geom] & ((rank > rank[geom]) | larger))
+            if len(others):
+                shown = [f"{names[i]} ({theirs[i]:g})" for i in others[:4].tolist()]
+                more = f" and {len(others) - 4} more" if len(others) > 4 else ""
+                found.append(
+                    f"{element}.{attribute} has no effect in contacts with {', '.join(shown)}{more}"
+                    ": the larger coefficient counts, or the one with priority"
+                )
+        return tuple(found)
 
     def fingerprint(self) -> tuple[Any, ...]:
         """Return a digest of the model without its structure: models of one digest are alike."""
         if self._numbers is None:
             self._numbers = b"".join(value.tobytes() for value in self.kept.values())
-        return self.mode, tuple(self.kept), self._numbers
+        return tuple(self.kept), self._numbers
 
     def check(self, keys: Iterable[ParameterKey]) -> None:
         """Raise ``UnknownOption`` for the first parameter that there is not."""
@@ -441,6 +408,9 @@ class Realization(ABC):
 
     def followed(self, keys: Iterable[ParameterKey]) -> str:
         """Compute what follows from some parameters; say what is wrong with it, or nothing."""
+        keys = tuple(keys)
+        for follow_up in {self._follow_ups[key] for key in keys if key in self._follow_ups}:
+            follow_up(self.model)
         if self._constant.isdisjoint(keys):
             return ""
         try:
@@ -450,7 +420,7 @@ class Realization(ABC):
             self._scratch.warning.number[:] = 1
             return f"MuJoCo says: {error}"
         singular = self._scratch.warning.number
-        if singular[0] != 1 or not sensible(*self._weights):
+        if singular[0] != 1 or not reading.sensible(*self._weights):
             singular[0] = 1
             return "masses and moments of inertia would not be those of something that can move"
         return ""

@@ -28,11 +28,13 @@ class Slot:
         write: Writes a value in the units of the scene.
         read: Reads it back.
         constant: Whether derived constants have to follow a write (``mj_setConst``).
+        follow_up: Called with the model after writes, before constants are derived.
     """
 
     write: Callable[[Floats], None]
     read: Callable[[], Floats]
     constant: bool = False
+    follow_up: Callable[[Any], None] | None = None
 
 
 def place(
@@ -40,6 +42,7 @@ def place(
     constant: bool = False,
     to: Callable[[Floats], Any] | None = None,
     back: Callable[[Any], Any] | None = None,
+    follow_up: Callable[[Any], None] | None = None,
 ) -> Slot:
     """Give the slot of a value that stands in some views of arrays, alike in all of them.
 
@@ -48,6 +51,7 @@ def place(
         constant: See ``Slot``.
         to: What MuJoCo keeps of a value; the value itself if None.
         back: The value of what stands in a view; all of it if None.
+        follow_up: See ``Slot``.
     """
 
     def write(value: Floats) -> None:
@@ -58,7 +62,7 @@ def place(
     def read() -> Floats:
         return np.array(views[0] if back is None else back(views[0]), dtype=np.float64)
 
-    return Slot(write, read, constant)
+    return Slot(write, read, constant, follow_up)
 
 
 def first(view: Floats) -> Any:

@@ -12,7 +12,6 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.models import ControlMode
 from scm_world.tasks.base import Observed, Scenario, Task, Timing, numbers_of
 from scm_world.tasks.composition import Clock, Composition, Entity
 from scm_world.tasks.rewards import (
@@ -27,9 +26,9 @@ from scm_world.tasks.rewards import (
 )
 from scm_world.tasks.trifinger import hardware, shaping
 from scm_world.tasks.trifinger.entities.block_world import BlockWorld
-from scm_world.tasks.trifinger.entities.robot import ACTIONS, RESOLUTIONS, Robot
+from scm_world.tasks.trifinger.entities.robot import ACTIONS, Robot
 from scm_world.tasks.trifinger.entities.stage import LightAndCameras, Stage
-from scm_world.tasks.trifinger.hardware import PRESETS, TIMESTEP
+from scm_world.tasks.trifinger.hardware import PRESETS, RESOLUTIONS, TIMESTEP
 from scm_world.tasks.trifinger.scenarios import scenarios
 from scm_world.variables import Linear, Measured, Variable
 
@@ -108,6 +107,7 @@ class TriFingerTask(Task):
     action_modes = tuple(ACTIONS)
     presets = tuple(PRESETS)
     resolutions = RESOLUTIONS
+    generated_graph = True
     time_unit = TIMESTEP
     frame_skip = 10
 
@@ -191,7 +191,6 @@ class TriFingerTask(Task):
         of a pile of which a block is missing. The reward sums up the terms that are left.
         """
         torques = timing.action_mode == "joint_torques"
-        mode = ControlMode.JOINT_TORQUES if torques else ControlMode.JOINT_POSITIONS
         entities: tuple[Entity, ...] = (
             *_always_there(timing, self.start),
             *self.entities(),
@@ -200,7 +199,13 @@ class TriFingerTask(Task):
         while True:
             unchecked = self.unchecked if self.conventions.published_spaces else ()
             made = BlockWorld(
-                *(there, tuple(self.shared()), self.decided_by, mode, self.conventions, unchecked)
+                there,
+                tuple(self.shared()),
+                self.decided_by,
+                torques,
+                timing.resolution,
+                self.conventions,
+                unchecked,
             )
             readouts: Iterable[Variable] = self.readouts()
             if self.success is not None:

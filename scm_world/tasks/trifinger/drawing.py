@@ -56,7 +56,8 @@ from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.cameras import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW
 from scm_world.tasks.trifinger.kinematics import FRAMES_PER_FINGER, link_frames
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import WALL_HEIGHT, WALL_RADIUS, TriFingerStructure
+from scm_world.tasks.trifinger.hardware import WALL_HEIGHT, WALL_RADIUS
+from scm_world.tasks.trifinger.system import TriFinger, trifinger
 
 FLOOR, STAGE, ROBOT = range(3)
 """What a pixel shows, where it is none of the links, blocks or obstacles; see ``names``."""
@@ -99,13 +100,13 @@ class TriFingerDrawing(Drawing):
     cameras = CAMERAS
     original_cameras = ORIGINAL_CAMERAS
 
-    def names(self, structure: TriFingerStructure) -> tuple[str, ...]:
+    def names(self, structure: TriFinger) -> tuple[str, ...]:
         """Name what the numbers of a segmentation stand for.
 
         Example:
-            >>> DRAWING.names(TriFingerStructure(blocks=("tool_block",)))[:4]
+            >>> DRAWING.names(trifinger(("tool_block",)))[:4]
             ('floor', 'stage', 'robot', 'robot_finger_60_link_0')
-            >>> DRAWING.names(TriFingerStructure(blocks=("tool_block",), obstacles=("wall",)))[-2:]
+            >>> DRAWING.names(trifinger(("tool_block",), obstacles=("wall",)))[-2:]
             ('tool_block', 'wall')
         """
         links = hardware.LINK_NAMES
@@ -156,14 +157,10 @@ class TriFingerDrawing(Drawing):
 
     def background(self, scene: Scene, *, obstacles: bool) -> Scene:
         """Take away the blocks, and the obstacles unless they are wanted, and park the robot."""
-        state = PhysicalState(0)
+        kept = scene.structure.obstacles if obstacles else ()
+        structure = trifinger((), scene.structure.preset, kept)
+        state: Any = structure.empty_state()
         state.joint_positions[:] = hardware.JOINT_LOW
-        structure = replace(
-            scene.structure,
-            blocks=(),
-            hulls=(),
-            obstacles=scene.structure.obstacles if obstacles else (),
-        )
         return scene.with_(structure=structure, state=state)
 
     def draw(

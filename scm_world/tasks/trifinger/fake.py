@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.models import ControlMode, Parameters
+from scm_world.models import Parameters
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import TriFingerStructure
+from scm_world.tasks.trifinger.system import TriFinger
 
 
-def move(state: PhysicalState, mode: ControlMode, command: Floats, seconds: float) -> None:
+def move(structure: TriFinger, state: PhysicalState, command: Floats, seconds: float) -> None:
     """Let blocks drift; let joints jump, or stay where torques are commanded."""
-    if mode is ControlMode.JOINT_POSITIONS:
+    if not structure.torques:
         state.joint_positions[:] = command
         state.joint_torques[:] = 0.0
     else:
@@ -26,7 +26,7 @@ def settle(state: PhysicalState) -> None:
     state.orientations[state.orientations[:, 3] < 0.0] *= -1.0
 
 
-def inertia(structure: TriFingerStructure, parameters: Parameters, body: str) -> Floats:
+def inertia(structure: TriFinger, parameters: Parameters, body: str) -> Floats:
     """Compute the principal moments of inertia of a block or a link, shape (3,) [kg m²]."""
     mass = parameters[body, "mass"]
     if body in hardware.LINK_NAMES:

@@ -17,7 +17,7 @@ from scm_world.models.scene import TOLERANCE, Overlap, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import FRAMES_PER_FINGER, frames_of_rows, link_frames
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
-from scm_world.tasks.trifinger.structure import WALL_HEIGHT, WALL_RADIUS
+from scm_world.tasks.trifinger.hardware import WALL_HEIGHT, WALL_RADIUS
 
 _LINK = {"upper": 1, "middle": 2, "lower": 3, "tip": 3}
 """The link that a collision shape belongs to: the tip is a part of the lower link."""
@@ -71,8 +71,8 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
         One entry for each pair of names, blocks first.
 
     Example:
-        >>> from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
-        >>> scene = default_scene(TriFingerStructure(blocks=("tool_block",)))
+        >>> from scm_world.tasks.trifinger.system import trifinger
+        >>> scene = trifinger(("tool_block",)).default_scene()
         >>> overlaps(scene, tolerance=1e-4)
         ()
         >>> scene.state.positions[0, 2] = 0.03

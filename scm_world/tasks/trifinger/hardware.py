@@ -20,12 +20,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.models.scene import ControlMode
+from scm_world.models.scene import ControlMode, Parameters
+from scm_world.variables import Box, part_of
 
 FINGERS = ("60", "120", "300")
 """The fingers, in the order of every joint vector."""
@@ -114,6 +116,15 @@ COLLISION = {
 }
 """One shape per link, fitted to the bounding boxes and radii of the published meshes."""
 
+ARENA_HALF_WIDTH = 0.15  # [m]
+ARENA_HEIGHT = 0.3  # [m]
+WALL_RADIUS = 0.242  # [m] inner radius of the ring
+WALL_HEIGHT = 0.25  # [m]
+WALL_THICKNESS = 0.02  # [m] outward, so that nothing tunnels through it
+WALL_SEGMENTS = 24
+
+SPINNING_FRICTION = 0.001  # [m] torsional coefficient of every contact
+
 LINK_COLORS = {"60": (0.6, 0.0, 0.0), "120": (0.0, 0.6, 0.0), "300": (0.0, 0.0, 0.6)}
 
 
@@ -129,6 +140,74 @@ def link_name(finger: str, index: int) -> str:
 
 LINK_NAMES = tuple(link_name(finger, i) for finger in FINGERS for i in range(LINKS_PER_FINGER))
 """All links, finger by finger."""
+
+
+RESOLUTIONS = ("vector", "finger", "joint")
+"""Whether all joints, those of a finger, or each are a variable; the first is the default."""
+
+QUANTITIES = ("joint_positions", "joint_velocities", "joint_torques")
+"""What moves, in the order of the state vector, by its names for the whole robot."""
+
+
+@final
+@dataclass(frozen=True)
+class JointGroup:
+    """Some joints that are variables together.
+
+    Attributes:
+        where: Their places among the nine.
+        fingers: Those that they belong to.
+        names: Of ``QUANTITIES``.
+        action: Name of their action.
+        of: What they are joints of, for sentences.
+    """
+
+    where: slice
+    fingers: tuple[str, ...]
+    names: tuple[str, ...]
+    action: str
+    of: str
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of each of their variables."""
+        n = self.where.stop - self.where.start
+        return (n,) if n > 1 else ()
+
+    def cut(self, box: Box) -> Box:
+        """Give their part of a box of all nine."""
+        return box if self.shape == (N_JOINTS,) else part_of(box, self.where, N_JOINTS, self.shape)
+
+
+def joints_of(resolution: str) -> tuple[JointGroup, ...]:
+    """Cut the nine joints into those that are variables together, in their order.
+
+    Args:
+        resolution: One of ``RESOLUTIONS``.
+
+    Example:
+        >>> [joints.names[0] for joints in joints_of("finger")]
+        ['finger_60.joint_positions', 'finger_120.joint_positions', 'finger_300.joint_positions']
+        >>> joints_of("joint")[8].action
+        'finger_300_joint_2.action'
+    """
+    if resolution == "vector":
+        return (JointGroup(slice(0, N_JOINTS), FINGERS, QUANTITIES, "action", "all fingers"),)
+    found = []
+    for index, finger in enumerate(FINGERS):
+        if resolution == "finger":
+            name, where = f"finger_{finger}", slice(3 * index, 3 * index + 3)
+            names = tuple(f"{name}.{quantity}" for quantity in QUANTITIES)
+            found.append(JointGroup(where, (finger,), names, f"{name}.action", f"finger {finger}"))
+            continue
+        for joint in range(3):
+            name, place = f"finger_{finger}_joint_{joint}", 3 * index + joint
+            names = tuple(f"{name}.{what}" for what in ("position", "velocity", "torque"))
+            of = f"joint {joint} of finger {finger}"
+            found.append(
+                JointGroup(slice(place, place + 1), (finger,), names, f"{name}.action", of)
+            )
+    return tuple(found)
 
 
 TIMESTEP = 0.004  # [s] the unit in which ``frame_skip`` counts, for every preset
@@ -181,6 +260,16 @@ class ControllerSpec:
         damped = inner - np.tile(self.safety, 3) * velocities
         safe: Floats = np.clip(damped, -self.limit, self.limit)
         return safe
+
+
+def controller_spec(parameters: Parameters) -> ControllerSpec:
+    """Read the joint controller from parameters; gains have no place where torques are commanded."""
+    usual, found = ControllerSpec(), {}
+    names = {"kp": "position_gains", "kd": "velocity_gains", "safety": "safety_damping"}
+    for field, name in names.items():
+        value = parameters.get(("controller", name))
+        found[field] = getattr(usual, field) if value is None else tuple(value.tolist())
+    return ControllerSpec(**found, limit=float(parameters["controller", "torque_limit"]))
 
 
 @dataclass(frozen=True)

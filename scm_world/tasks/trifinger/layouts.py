@@ -9,7 +9,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
-from scm_world.tasks.trifinger.structure import ARENA_HALF_WIDTH, ARENA_HEIGHT
+from scm_world.tasks.trifinger.hardware import ARENA_HALF_WIDTH, ARENA_HEIGHT
 
 MAX_LEVELS = 10
 MAX_PER_LEVEL = 15

@@ -13,7 +13,6 @@ from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_parameters
 
 MOST = 9
 SHAPE = (MOST, 7)
@@ -89,24 +88,25 @@ def _pile(
 @lru_cache(maxsize=512)
 def _dropped(lone: bytes, each: bytes) -> bytes:
     """Simulate a pile once, and cache it: poses of the blocks, shape (n, 7)."""
-    from scm_world.backends import make_backend  # it loads a backend
+    from scm_world.backends import make_backend  # these load an engine
+    from scm_world.tasks.trifinger.system import trifinger
 
     size, mass, floor, *gravity = np.frombuffer(lone).tolist()
     drops = np.frombuffer(each).reshape(-1, 7)
     names = tuple(f"block_{index}" for index in range(len(drops)))
-    structure = TriFingerStructure(names)
+    structure = trifinger(names)
     common = {("world", "gravity"): gravity, ("floor", "friction"): floor}
     common[("robot", "height")] = AWAY
     for name, drop in zip(names, drops, strict=True):
         common |= {(name, "size"): [size] * 3, (name, "mass"): mass, (name, "friction"): drop[6]}
     changed = {key: np.asarray(value, dtype=np.float64) for key, value in common.items()}
-    rest = PhysicalState(len(names))  # all blocks are in the sky, far from one another
+    rest = PhysicalState(structure.layout)  # all blocks are in the sky, far from one another
     rest.joint_positions[:] = hardware.RAISED
     rest.positions[:, 0] = 10.0 * np.arange(len(names))
     rest.positions[:, 2] = SKY
     state, substeps = rest.copy(), round(FALL / structure.preset.timestep)
     engine = make_backend(ENGINE)
-    engine.build(Scene(structure, default_parameters(structure) | changed, rest))
+    engine.build(Scene(structure, structure.default_parameters() | changed, rest))
     for index, drop in enumerate(drops):
         state.vector[:27] = rest.vector[:27]
         state.blocks[index:] = rest.blocks[index:]
@@ -114,7 +114,7 @@ def _dropped(lone: bytes, each: bytes) -> bytes:
         low = lowest_point(np.full(3, size), turned)
         state.positions[index] = _lifted(drop[:3], low, state.positions[:index], size)
         engine.apply(Difference(state=state.copy()))
-        engine.step(ControlMode.JOINT_POSITIONS, rest.joint_positions, substeps)
+        engine.step(ControlMode.CONTROLS, rest.joint_positions, substeps)
         engine.read(state)
     engine.close()
     inside = np.clip(state.positions, *numbers.POSITION_BOUNDS.bounds((3,), {}))

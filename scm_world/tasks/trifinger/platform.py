@@ -31,11 +31,8 @@ from scm_world.models.scene import ControlMode, Difference, Parameters, Scene
 from scm_world.tasks.trifinger import fake, hardware
 from scm_world.tasks.trifinger.kinematics import forward, inverse
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import (
-    TriFingerStructure,
-    controller_spec,
-    default_parameters,
-)
+from scm_world.tasks.trifinger.hardware import controller_spec
+from scm_world.tasks.trifinger.system import TriFinger
 
 CUBE = 0.065  # [m] edge of the platform's cube
 TURN = math.radians(-48.0)  # of this package's world about z, so that the fingers lie alike
@@ -87,7 +84,7 @@ class TriFingerPlatform(InMemory):
             UnknownOption: It is no scene with one cube, or a value is not the platform's.
         """
         structure = scene.structure
-        if not isinstance(structure, TriFingerStructure) or (
+        if not isinstance(structure, TriFinger) or (
             len(structure.blocks), structure.obstacles, structure.hulls
         ) != (1, (), ()):  # fmt: skip
             raise UnknownOption("scene of the TriFinger platform", structure, ("one cube",))
@@ -118,7 +115,7 @@ class TriFingerPlatform(InMemory):
         Raises:
             EngineFailure: Torques are commanded, or a number is not finite.
         """
-        if mode is not ControlMode.JOINT_POSITIONS:
+        if self._structure.torques:
             advice = "use action_mode='joint_positions', or relative to them"
             raise EngineFailure(f"the platform takes joint positions only; {advice}", self.name)
         if self._platform is None:
@@ -148,9 +145,9 @@ class TriFingerPlatform(InMemory):
 
     # --- the platform ------------------------------------------------------------------------
 
-    def _fits(self, structure: TriFingerStructure, parameters: Parameters) -> None:
+    def _fits(self, structure: TriFinger, parameters: Parameters) -> None:
         """Refuse values of parameters that the platform cannot change."""
-        usual = default_parameters(structure)
+        usual = structure.default_parameters()
         for key, value in parameters.items():
             body, name = key
             free = name == "color" or body == "controller" or key == ("world", "gravity")

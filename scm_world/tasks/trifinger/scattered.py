@@ -9,7 +9,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.entities.obstacles import Obstacle, obstacle_size
-from scm_world.tasks.trifinger.structure import ARENA_HALF_WIDTH, ARENA_HEIGHT
+from scm_world.tasks.trifinger.hardware import ARENA_HALF_WIDTH, ARENA_HEIGHT
 from scm_world.variables import Box, Exogenous, Function, Integers, Variable
 
 COUNT = "number_of_obstacles"

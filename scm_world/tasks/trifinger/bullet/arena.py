@@ -15,7 +15,7 @@ from typing import Any
 from scm_world.geometry.hulls import Hull
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import Capsule, Inertial
-from scm_world.tasks.trifinger.structure import (
+from scm_world.tasks.trifinger.hardware import (
     WALL_HEIGHT,
     WALL_RADIUS,
     WALL_SEGMENTS,

@@ -28,13 +28,14 @@ from scm_world.tasks.trifinger.bullet.arena import (
 from scm_world.tasks.trifinger.bullet.passive import MASSES, resistance
 from scm_world.tasks.trifinger.hardware import ControllerSpec
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
-from scm_world.tasks.trifinger.structure import TriFingerStructure, controller_spec, parameter_keys
+from scm_world.tasks.trifinger.hardware import controller_spec
+from scm_world.tasks.trifinger.system import TriFinger
 
 Law = Callable[[Sequence[Any], Sequence[float]], list[float]]
 """From joint states (position, velocity, …) and a command, nine each, to nine torques [N m]."""
 
 
-def compile_law(spec: ControllerSpec, mode: ControlMode) -> Law:
+def compile_law(spec: ControllerSpec, *, commanded: bool) -> Law:
     """Write ``ControllerSpec.torques`` without arrays; the numbers are the same, bit for bit."""
     gains = tuple(zip(spec.kp * 3, spec.kd * 3, spec.safety * 3, strict=True))
     high, low = spec.limit, -spec.limit
@@ -57,7 +58,7 @@ def compile_law(spec: ControllerSpec, mode: ControlMode) -> Law:
             safe.append(high if torque > high else low if torque < low else torque)
         return safe
 
-    return positions if mode is ControlMode.JOINT_POSITIONS else torques
+    return torques if commanded else positions
 
 
 TIP, LOWER = 4, 3  # links of a finger
@@ -151,24 +152,22 @@ class TriFingerClient(Client):
     signed: ClassVar[bool] = True
     block_damping: ClassVar[float] = 0.0
 
-    modes: ClassVar[tuple[ControlMode, ...]] = (
-        ControlMode.JOINT_POSITIONS,
-        ControlMode.JOINT_TORQUES,
-    )
+    modes: ClassVar[tuple[ControlMode, ...]] = (ControlMode.CONTROLS,)
 
     def __init__(self, engine: Any) -> None:
         super().__init__(engine)
         self.bodies = Handles(-1, -1, ())
         self._timestep = 0.0
-        self._laws: dict[ControlMode, Law] = {}
+        self._laws: dict[bool, Law] = {}
+        self._torques = False
 
     @staticmethod
-    def keys(structure: TriFingerStructure) -> Iterable[ParameterKey]:
+    def keys(structure: TriFinger) -> Iterable[ParameterKey]:
         """List every parameter of a structure."""
-        return parameter_keys(structure)
+        return [row.key for row in structure.parameters]
 
     @staticmethod
-    def heavy(structure: TriFingerStructure) -> Iterator[ParameterKey]:
+    def heavy(structure: TriFinger) -> Iterator[ParameterKey]:
         """List the parameters that need new bodies, or new contacts."""
         yield ("robot", "height")
         hulls = dict(structure.hulls)
@@ -179,7 +178,7 @@ class TriFingerClient(Client):
             yield from ((name, quantity) for quantity in ("size", "position", "orientation"))
 
     @staticmethod
-    def rotations(structure: TriFingerStructure) -> Sequence[int]:
+    def rotations(structure: TriFinger) -> Sequence[int]:
         """List where the quaternions of the blocks begin."""
         return range(ROBOT_SIZE + 3, structure.layout.size, BLOCK_SIZE)
 
@@ -191,9 +190,9 @@ class TriFingerClient(Client):
         self.bodies = Handles(arena.add_robot(engine, handle), floor, stage)
         super().furnish()
 
-    def construct(self, structure: TriFingerStructure, parameters: Values) -> None:
+    def construct(self, structure: TriFinger, parameters: Values) -> None:
         """Make sure that the obstacles and blocks are there, with their shapes."""
-        timestep = structure.preset.timestep
+        timestep, self._torques = structure.preset.timestep, structure.torques
         if timestep != self._timestep:
             self.engine.setPhysicsEngineParameter(
                 fixedTimeStep=timestep, physicsClientId=self.handle
@@ -208,7 +207,7 @@ class TriFingerClient(Client):
         if not same or tuple(self.bodies.blocks) != structure.blocks:
             self._remake(structure, shapes)
 
-    def _remake(self, structure: TriFingerStructure, shapes: dict[str, arena.Shape]) -> None:
+    def _remake(self, structure: TriFinger, shapes: dict[str, arena.Shape]) -> None:
         """Replace all obstacles and blocks: their order in the engine is that in the structure."""
         engine, handle, was = self.engine, self.handle, self.bodies
         for body in reversed((*was.obstacles.values(), *was.blocks.values())):
@@ -296,7 +295,7 @@ class TriFingerClient(Client):
         if any(key[0] == "controller" for key in keys):
             told = {key: v for key, v in self.applied.items() if key[0] == "controller"}
             spec = controller_spec(arrays(told))
-            self._laws = {mode: compile_law(spec, mode) for mode in self.modes}
+            self._laws = {torques: compile_law(spec, commanded=torques) for torques in (0, 1)}
 
     def parameter(self, key: ParameterKey) -> Floats:
         """Ask the engine for a parameter, in the units of the scene.
@@ -355,7 +354,7 @@ class TriFingerClient(Client):
         engine, handle, robot = self.engine, self.handle, self.bodies.robot
         ask, step = engine.getJointStates, engine.stepSimulation
         tell, torque_control = engine.setJointMotorControlArray, engine.TORQUE_CONTROL
-        law, resist, torques = self._laws[mode], None, []
+        law, resist, torques = self._laws[self._torques], None, []
         damping = self.applied["robot", "joint_damping"]
         if damping:
             gravity, masses = self.applied["world", "gravity"], [self.applied[k] for k in MASSES]

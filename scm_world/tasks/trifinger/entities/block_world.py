@@ -4,32 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 from scm_world._types import Floats, Values
 from scm_world.geometry.hulls import Hull
-from scm_world.models import ControlMode, GoalRegion, Light, ParameterKey, Scene
-from scm_world.models.scene import Overlap
+from scm_world.models import GoalRegion, Light, ParameterKey, Scene
+from scm_world.models.scene import Overlap, State
 from scm_world.tasks.composition import Commands, Composition, Entity
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
+from scm_world.tasks.model import ModelComposition
 from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
 from scm_world.tasks.trifinger.hardware import (
     FINGERS,
     LINK_NAMES,
     PRESET_NAMES,
+    RESOLUTIONS,
     preset,
 )
-from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState
-from scm_world.tasks.trifinger.structure import TriFingerStructure
-from scm_world.variables import Variable
+from scm_world.variables import Parent, Variable
 from scm_world.variables.kinds import parent_of
 from scm_world.variables.reserved import PRESET
 
-
-def block_slice(block: int, start: int, stop: int) -> slice:
-    """Give the place of some numbers of a block in the state vector."""
-    offset = ROBOT_SIZE + BLOCK_SIZE * block
-    return slice(offset + start, offset + stop)
+if TYPE_CHECKING:
+    from scm_world.tasks.trifinger.system import TriFinger
 
 
 @final
@@ -42,7 +39,8 @@ class BlockWorld(Composition):
         shared: Variables that belong to no single entity.
         deciding: Variables that decide which entities there are. A body that comes or goes acts
             on the others by contact, so they do.
-        mode: What a command means.
+        torques: Whether joint torques are commanded, and not joint positions.
+        resolution: How finely joints are cut; see ``hardware.joints_of``.
         conventions: Say how deep bodies may lie in one another after an intervention, and
             whether Bullet has the physics of the predecessor.
         unchecked: What makes an intervention accepted however deep it puts bodies.
@@ -51,7 +49,8 @@ class BlockWorld(Composition):
     entities: tuple[Entity, ...]
     shared: tuple[Variable, ...] = ()
     deciding: tuple[str, ...] = ()
-    mode: ControlMode = ControlMode.JOINT_POSITIONS
+    torques: bool = False
+    resolution: str = RESOLUTIONS[0]
     conventions: Conventions = CONVENTIONS["scm_world"]
     unchecked: tuple[str, ...] = ()
     solid: bool = field(init=False, default=True)
@@ -59,7 +58,7 @@ class BlockWorld(Composition):
     obstacles: tuple[str, ...] = field(init=False)
     hulls: tuple[tuple[str, Hull], ...] = field(init=False)
     commands: Commands | None = field(init=False)
-    _structures: dict[str, TriFingerStructure] = field(init=False, default_factory=dict, repr=False)
+    _systems: dict[str, TriFinger] = field(init=False, default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         blocks = [entity for entity in self.entities if entity.is_block]
@@ -73,16 +72,24 @@ class BlockWorld(Composition):
         for name, value in found.items():
             object.__setattr__(self, name, value)
 
-    def structure(self, values: Values) -> TriFingerStructure:
-        """Say which bodies the backend has to build, and how finely it cuts time."""
-        name = PRESET_NAMES[int(values[PRESET])]
-        if name not in self._structures:
-            published = self.conventions.published_physics
-            made = TriFingerStructure(
-                self.blocks, preset(name), self.obstacles, self.hulls, published
+    def structure(self, values: Values) -> TriFinger:
+        """Return the model of the bodies, with the settings that a preset stands for."""
+        return self._system(PRESET_NAMES[int(values[PRESET])])
+
+    def _system(self, name: str) -> TriFinger:
+        if name not in self._systems:
+            from scm_world.tasks.trifinger.system import trifinger  # it loads an engine
+
+            self._systems[name] = trifinger(
+                self.blocks,
+                preset(name),
+                self.obstacles,
+                self.hulls,
+                torques=self.torques,
+                resolution=self.resolution,
+                published=self.conventions.published_physics,
             )
-            self._structures[name] = made
-        return self._structures[name]
+        return self._systems[name]
 
     def overlaps(
         self, scene: Scene, tolerance: float | None = None, asked: Iterable[str] = ()
@@ -107,31 +114,49 @@ class BlockWorld(Composition):
             thin(candidates, blocks, obstacles, before, tolerances)
 
     def variables(self) -> tuple[Variable, ...]:
-        """Declare every variable, with the states coupled to all physical quantities."""
-        names = [name for entity in self.entities for name in entity.inputs()]
-        inputs = {name: parent_of(name, 1, "contact") for name in (*names, *self.deciding)}
+        """Declare every variable; edges into states follow from the kinematic trees."""
+        system = self._system(PRESET_NAMES[0])
+        trees = {row.name: row.trees for row in system.states}
+        every = frozenset(range(len(system.trees)))
+        rows = {row.key: row for row in system.parameters}
+        effects = {
+            name: (rows[key].always, rows[key].contact)
+            for name, key in self.parameters().items()
+            if not rows[key].visual
+        }
+        effects |= {row.name: (row.always, row.contact) for row in system.states if not row.reported}
+        for entity in self.entities:
+            for name, states in entity.actions().items():
+                reached = frozenset().union(*(trees[state] for state in states))
+                effects[name] = reached, every - reached
+        effects |= {PRESET: (every, frozenset()), **dict.fromkeys(self.deciding, (frozenset(), every))}
+        shared: dict[tuple[str, ...], dict[str, Parent]] = {}
+        causes: dict[frozenset[int], tuple[tuple[Parent, ...], dict[str, Parent]]] = {}
+        for own in set(trees.values()):
+            always = [name for name, effect in effects.items() if not own.isdisjoint(effect[0])]
+            others = tuple(n for n, e in effects.items() if not own.isdisjoint(e[0] | e[1]))
+            alike = shared.setdefault(
+                others, {name: parent_of(name, 1, "contact") for name in others}
+            )
+            causes[own] = tuple(parent_of(name, 1) for name in always), alike
         declared: list[Variable] = list(self.shared)
         for entity in self.entities:
             variables, states = entity.declared
             declared.extend(variables)
-            declared.extend(state.declare(inputs) for state in states)
+            declared.extend(state.declare(*causes[trees[state.name]]) for state in states)
         return tuple(declared)
 
     def parameters(self) -> dict[str, ParameterKey]:
         """Say which variable sets which physical parameter."""
         return {k: v for entity in self.entities for k, v in entity.parameters().items()}
 
-    def slices(self) -> dict[str, slice]:
+    def slices(self) -> Mapping[str, slice]:
         """Say where each state stands in the state vector."""
-        found: dict[str, slice] = {}
-        for entity in self.entities:
-            block = self.blocks.index(entity.name) if entity.is_block else -1
-            found.update(entity.slices(block))
-        return found
+        return self._system(PRESET_NAMES[0]).layout.slices
 
-    def empty_state(self) -> PhysicalState:
-        """Give a state to read into."""
-        return PhysicalState(len(self.blocks))
+    def empty_state(self) -> State:
+        """Return a state to read into."""
+        return self._system(PRESET_NAMES[0]).empty_state()
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         """List goals that lie in an obstacle."""
@@ -142,11 +167,8 @@ class BlockWorld(Composition):
         return (*(f"robot_finger_{finger}" for finger in FINGERS), *self.blocks)
 
     def touched(self) -> Mapping[str, tuple[str, ...]]:
-        """Map links and blocks to their states; floor, stage and obstacles are fixed."""
-        still = dict.fromkeys(("floor", "stage", *self.obstacles), ())
-        blocks = {e.name: (*e.slices(0),) for e in self.entities if e.is_block}
-        robot = (name for e in self.entities if not e.is_block for name in e.slices(-1))
-        return {**still, **blocks, **dict.fromkeys(LINK_NAMES, tuple(robot))}
+        """Map links and blocks to the states of their trees; what is fixed has none."""
+        return ModelComposition(self._system(PRESET_NAMES[0])).touched()
 
     def shaped(self) -> Mapping[str, str]:
         """Map parameters to the body that they are a property of."""

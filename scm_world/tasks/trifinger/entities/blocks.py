@@ -15,9 +15,8 @@ from scm_world.geometry.rotations import from_rotation_vector, to_rotation_vecto
 from scm_world.models import ParameterKey
 from scm_world.tasks.composition import Entity, StateDeclaration
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger.entities.block_world import block_slice, lowest_point
+from scm_world.tasks.trifinger.entities.block_world import lowest_point
 from scm_world.variables import Box, Derived, Exogenous, Fixed, Function, Variable
-from scm_world.variables.reserved import PRESET
 
 CUBOID = 1  # the published type ids
 MESH = 2
@@ -183,8 +182,6 @@ class ToolBlock(Entity):
         """Declare pose and velocities."""
         position, orientation = self._v("cartesian_position"), self._v("orientation")
         linear, angular = self._v("linear_velocity"), self._v("angular_velocity")
-        always = "gravity", PRESET
-        spinning = angular, self._v("size"), PRESET  # the size decides the inertia: a block tumbles
         yield StateDeclaration(
             position,
             "m",
@@ -192,7 +189,6 @@ class ToolBlock(Entity):
             numbers.POSITION_BOUNDS,
             (0.0, 0.0, 0.0),
             "Position of the center.",
-            always=(position, linear, *always),
             on_set=(self._v("size"), orientation, *self._spawn_from),
             start=self._spawn,
             carry=self._carry,
@@ -205,7 +201,6 @@ class ToolBlock(Entity):
             numbers.QUATERNION_BOUNDS,
             self._orientation,
             "Orientation as a unit quaternion (x, y, z, w) with w >= 0.",
-            always=(orientation, *spinning),
             **self._respawn(numbers.IDENTITY),
         )
         yield StateDeclaration(
@@ -215,7 +210,6 @@ class ToolBlock(Entity):
             numbers.LINEAR_VELOCITY_BOUNDS,
             (0.0, 0.0, 0.0),
             "Velocity of the center.",
-            always=(linear, *always),
             **self._respawn((0.0, 0.0, 0.0)),
         )
         yield StateDeclaration(
@@ -225,7 +219,6 @@ class ToolBlock(Entity):
             numbers.ANGULAR_VELOCITY_BOUNDS,
             (0.0, 0.0, 0.0),
             "Angular velocity in the world frame.",
-            always=(orientation, *spinning),
             **self._respawn((0.0, 0.0, 0.0)),
         )
 
@@ -236,26 +229,10 @@ class ToolBlock(Entity):
         start = Function(constantly, constants={"value": value})
         return {"on_set": self._again, "start": start, "restart": self._again}
 
-    def inputs(self) -> Iterable[str]:
-        """Pose, velocities, mass, size and friction matter to physics; the color does not."""
-        yield from (state.name for state in self.declared[1])
-        yield from (self._v("mass"), self._v("friction"))
-        if self._hull is None:
-            yield self._v("size")
-
     def parameters(self) -> Mapping[str, ParameterKey]:
         """Say which variable sets which physical parameter."""
         own = ("mass", "friction", "color") if self._hull else ("mass", "size", "friction", "color")
         return {self._v(quantity): (self.name, quantity) for quantity in own}
-
-    def slices(self, block: int) -> Mapping[str, slice]:
-        """Say where its states stand in the state vector."""
-        return {
-            self._v("cartesian_position"): block_slice(block, 0, 3),
-            self._v("orientation"): block_slice(block, 3, 7),
-            self._v("linear_velocity"): block_slice(block, 7, 10),
-            self._v("angular_velocity"): block_slice(block, 10, 13),
-        }
 
 
 def same(parent: Floats) -> Floats:

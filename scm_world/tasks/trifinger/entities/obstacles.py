@@ -65,10 +65,6 @@ class Obstacle(Entity):
         yield color(self._v("color"), (0.0, 0.0, 0.0))
         yield from coordinates(self.name, a=None, b=None, yaw=False)
 
-    def inputs(self) -> Iterable[str]:
-        """Everything but the color matters to what touches it."""
-        return (self._v(quantity) for quantity in QUANTITIES if quantity != "color")
-
     def parameters(self) -> Mapping[str, ParameterKey]:
         """Say which variable sets which physical parameter."""
         return {self._v(ours): (self.name, its) for ours, its in QUANTITIES.items()}

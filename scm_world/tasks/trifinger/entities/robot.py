@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
@@ -17,7 +16,15 @@ from scm_world.tasks.composition import Commands, Entity, StateDeclaration
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.entities.blocks import color
-from scm_world.tasks.trifinger.hardware import FINGERS, N_JOINTS, ControllerSpec
+from scm_world.tasks.trifinger.hardware import (
+    FINGERS,
+    N_JOINTS,
+    QUANTITIES,
+    RESOLUTIONS,
+    ControllerSpec,
+    JointGroup,
+    joints_of,
+)
 from scm_world.tasks.trifinger.kinematics import forward_kernel, inverse_kernel, tip_kernel
 from scm_world.variables import (
     Action,
@@ -27,9 +34,8 @@ from scm_world.variables import (
     Normal,
     Variable,
     bundle,
-    part_of,
 )
-from scm_world.variables.reserved import ACTUATOR_NOISE, PRESET
+from scm_world.variables.reserved import ACTUATOR_NOISE
 
 END_EFFECTORS = Box((-0.5, -0.5, 0.0) * 3, (0.5, 0.5, 0.5) * 3)  # [m] what an action may ask for
 
@@ -62,6 +68,8 @@ CONTROLLER = (
     ),
 )
 """The joint controller."""
+SERVO = ("position_gains", "velocity_gains")
+"""Those of it that have no effect where torques are commanded."""
 
 
 @njit(cache=True)
@@ -88,74 +96,6 @@ def joints_tip(q0: Value, q1: Value, q2: Value, robot_height: Value, finger: flo
     height = scalar(robot_height)
     tip_kernel(int(finger), scalar(q0), scalar(q1), scalar(q2), height, found, 0)
     return found
-
-
-RESOLUTIONS = ("vector", "finger", "joint")
-"""Whether all joints, those of a finger, or each are a variable; the first is the default."""
-
-QUANTITIES = ("joint_positions", "joint_velocities", "joint_torques")
-"""What moves, in the order of the state vector, by its names for the whole robot."""
-
-
-@final
-@dataclass(frozen=True)
-class JointGroup:
-    """Some joints that are variables together.
-
-    Attributes:
-        where: Their places among the nine.
-        fingers: Those that they belong to.
-        names: Of ``QUANTITIES``.
-        action: Name of their action.
-        of: What they are joints of, for sentences.
-    """
-
-    where: slice
-    fingers: tuple[str, ...]
-    names: tuple[str, ...]
-    action: str
-    of: str
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Of each of their variables."""
-        n = self.where.stop - self.where.start
-        return (n,) if n > 1 else ()
-
-    def cut(self, box: Box) -> Box:
-        """Give their part of a box of all nine."""
-        return box if self.shape == (N_JOINTS,) else part_of(box, self.where, N_JOINTS, self.shape)
-
-
-def joints_of(resolution: str) -> tuple[JointGroup, ...]:
-    """Cut the nine joints into those that are variables together, in their order.
-
-    Args:
-        resolution: One of ``RESOLUTIONS``.
-
-    Example:
-        >>> [joints.names[0] for joints in joints_of("finger")]
-        ['finger_60.joint_positions', 'finger_120.joint_positions', 'finger_300.joint_positions']
-        >>> joints_of("joint")[8].action
-        'finger_300_joint_2.action'
-    """
-    if resolution == "vector":
-        return (JointGroup(slice(0, N_JOINTS), FINGERS, QUANTITIES, "action", "all fingers"),)
-    found = []
-    for index, finger in enumerate(FINGERS):
-        if resolution == "finger":
-            name, where = f"finger_{finger}", slice(3 * index, 3 * index + 3)
-            names = tuple(f"{name}.{quantity}" for quantity in QUANTITIES)
-            found.append(JointGroup(where, (finger,), names, f"{name}.action", f"finger {finger}"))
-            continue
-        for joint in range(3):
-            name, place = f"finger_{finger}_joint_{joint}", 3 * index + joint
-            names = tuple(f"{name}.{what}" for what in ("position", "velocity", "torque"))
-            of = f"joint {joint} of finger {finger}"
-            found.append(
-                JointGroup(slice(place, place + 1), (finger,), names, f"{name}.action", of)
-            )
-    return tuple(found)
 
 
 STREAM = "actuators"
@@ -317,7 +257,6 @@ class Robot(Entity):
 
     def _quantities(self, joints: JointGroup) -> Iterable[StateDeclaration]:
         """Declare what moves of some joints: position, velocity and torque."""
-        always = self._always(joints)
         start = self._start[joints.where]
         still = (0.0,) * len(start)
         position, velocity, torque = joints.names
@@ -328,7 +267,6 @@ class Robot(Entity):
             joints.cut(numbers.JOINT_BOUNDS),
             start if joints.shape else start[0],
             f"Angles of the joints of {joints.of}." if joints.shape else f"Angle of {joints.of}.",
-            always=always,
             a=joints.cut(numbers.JOINTS_A),
             b=joints.cut(numbers.JOINTS_B),
         )
@@ -339,7 +277,6 @@ class Robot(Entity):
             numbers.JOINT_VELOCITY_BOUNDS,
             still if joints.shape else 0.0,
             "Angular velocities of the joints.",
-            always=always,
         )
         yield StateDeclaration(
             torque,
@@ -348,45 +285,23 @@ class Robot(Entity):
             Box(-1.0, 1.0),
             still if joints.shape else 0.0,
             "Torques of the last physics step.",
-            always=always,
             settable=False,
         )
 
-    def _always(self, joints: JointGroup) -> tuple[str, ...]:
-        """Name what acts on some joints in every control step.
-
-        Other fingers are other kinematic trees: they act by contact only.
-        """
-        others = {
-            name
-            for finger in FINGERS
-            if finger not in joints.fingers
-            for name in self._of_finger(finger)
+    def actions(self) -> Mapping[str, tuple[str, ...]]:
+        """Map actions to the joints of their fingers, and the rest of ``RobotCommands`` to all."""
+        every = [name for joints in self._joints for name in joints.names]
+        found = {
+            joints.action: tuple(
+                name
+                for other in self._joints
+                if not set(other.fingers).isdisjoint(joints.fingers)
+                for name in other.names
+            )
+            for joints in self._acting
         }
-        by_contact = {"finger_friction"} if self._by_tips else {"finger_friction", "robot_height"}
-        acting = (name for name in self.inputs() if name not in others | by_contact)
-        return (*acting, "gravity", PRESET)
-
-    def _of_finger(self, finger: str) -> Iterable[str]:
-        """Name what belongs to one finger and acts on how it moves."""
-        for joints in self._joints:
-            yield from joints.names[:2] if joints.fingers == (finger,) else ()
-        for joints in self._acting:
-            yield from (joints.action,) if joints.fingers == (finger,) else ()
-        yield from (f"{hardware.link_name(finger, index)}.mass" for index in (1, 2, 3))
-
-    def inputs(self) -> Iterable[str]:
-        """Everything but colors, the fixed finger bases and what is only read out."""
-        yield from (joints.names[0] for joints in self._joints)
-        yield from (joints.names[1] for joints in self._joints)
-        yield from (joints.action for joints in self._acting)
-        yield "robot_height"
-        yield from ("finger_friction", "joint_damping", "safety_damping", "torque_limit")
-        if self.action_mode != "joint_torques":
-            yield from ("position_gains", "velocity_gains")
-        yield ACTUATOR_NOISE
-        for finger in FINGERS:
-            yield from (f"{hardware.link_name(finger, index)}.mass" for index in (1, 2, 3))
+        others = ("robot_height", ACTUATOR_NOISE) if self._by_tips else (ACTUATOR_NOISE,)
+        return found | dict.fromkeys(others, tuple(every))
 
     def parameters(self) -> Mapping[str, ParameterKey]:
         """Say which variable sets which physical parameter."""
@@ -395,7 +310,11 @@ class Robot(Entity):
             for link in hardware.LINK_NAMES
             for quantity in ("mass", "color")
         }
-        control = {variable.name: ("controller", variable.name) for variable in CONTROLLER}
+        control = {
+            variable.name: ("controller", variable.name)
+            for variable in CONTROLLER
+            if self.action_mode != "joint_torques" or variable.name not in SERVO
+        }
         own = {
             "robot_height": ("robot", "height"),
             "finger_friction": ("robot", "friction"),
@@ -406,11 +325,3 @@ class Robot(Entity):
     def commands(self) -> Commands:
         """Give what turns actions into joint positions or torques."""
         return RobotCommands(self.action_mode)
-
-    def slices(self, block: int) -> Mapping[str, slice]:
-        """Say where its states stand in the state vector."""
-        return {
-            name: slice(N_JOINTS * index + joints.where.start, N_JOINTS * index + joints.where.stop)
-            for joints in self._joints
-            for index, name in enumerate(joints.names)
-        }

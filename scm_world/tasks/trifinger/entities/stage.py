@@ -65,11 +65,6 @@ class Stage(Entity):
             "Standard deviation of every observed number, as a fraction of half its range.",
         )
 
-    def inputs(self) -> Iterable[str]:
-        """Gravity, frictions, restitution and the time step."""
-        yield from ("gravity", "floor_friction", "stage_friction")
-        yield from ("restitution", "spinning_friction", PRESET)
-
     def parameters(self) -> Mapping[str, ParameterKey]:
         """Say which variable sets which physical parameter."""
         return {

@@ -1,1 +1,0 @@
-"""How MuJoCo realizes the TriFinger."""

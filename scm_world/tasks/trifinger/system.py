@@ -1,0 +1,713 @@
+"""The TriFinger and its blocks as a model: an ``MjSpec``, and parameters bound to its arrays.
+
+Stock settings cannot lift a block with three fingers, let it creep on a slope and make a fast one
+hover. A softer friction reference for contacts without fingers, elliptic cones and a high
+``impratio`` mend all three. Fingers keep the hard reference: they have to grip.
+
+Source:
+    Measured; see the parity table in ``docs/design``.
+
+Every binding is a pure function of the values in force afterwards, so that any order of changes
+ends in the same model bit for bit. Frictions of pairs follow with ``couple``, derived constants of
+the model (bounding radii, inverse weights) with ``mj_setConst``.
+
+The first nine actuators are servos or motors, as the action mode says; the other nine are the
+dampers of the safety filter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields
+from functools import lru_cache, partial
+from importlib import import_module
+from typing import Any, final
+
+import mujoco
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world._types import Floats
+from scm_world.backends.mujoco.fields import Field
+from scm_world.backends.mujoco.reading import read_model
+from scm_world.backends.mujoco.slots import Slot, first, place, turn
+from scm_world.backends.mujoco.trees import NOTHING, Couplings, Effect
+from scm_world.geometry.hulls import Hull
+from scm_world.models.model import Model
+from scm_world.models.scene import State
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.hardware import (
+    FAST,
+    FINGERS,
+    N_JOINTS,
+    SPINNING_FRICTION,
+    WALL_HEIGHT,
+    WALL_RADIUS,
+    WALL_SEGMENTS,
+    WALL_THICKNESS,
+    ControllerSpec,
+    Preset,
+    joints_of,
+    link_name,
+)
+from scm_world.tasks.trifinger.state import PhysicalState
+
+FLOOR = "floor"
+STAGE = "stage"
+SHAPES = ("upper", "middle", "lower", "tip")  # in the order of the links 1, 2, 3 and 3
+
+CONTACT = {"fast": (0.010, 1.0), "precise": (0.004, 1.0)}
+"""Time constant [s] and damping ratio of contacts, by preset."""
+
+SLIDING = {"fast": (0.04, 1.0), "precise": (0.02, 1.0)}
+"""The same for friction between blocks, floor and stage."""
+
+IMPRATIO = 100.0  # stiffness of friction over stiffness of the normal
+MANY = 8
+"""From more blocks than this on, the Jacobian of the constraints is a sparse matrix."""
+
+_BLOCK_HALF = 0.0325  # [m] any positive size and mass do: parameters follow
+_BLOCK_MASS = 0.02  # [kg]
+_SPEC = ControllerSpec()
+_OBSTACLE_POSE = {"pos": (0.1, 0.2, 0.3), "quat": (0.9, 0.1, 0.2, 0.3)}
+"""MuJoCo fixes poses of zero for good."""
+
+_ROLLING_FRICTION = 1e-4  # not in force: contacts have four dimensions
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class TriFinger(Model):
+    """The robot with blocks and obstacles.
+
+    Attributes:
+        blocks: Names of the movable blocks, in the order of the state.
+        preset: Numerical settings.
+        obstacles: Names of boxes that never move by themselves. Blocks, middle and lower links
+            and fingertips collide with them.
+        hulls: The movable blocks that are no boxes, each with its convex shape.
+        torques: Whether joint torques are commanded [N m], and not joint positions [rad].
+        published: Whether Bullet realises all bodies as the predecessor does; see
+            ``bullet.published``.
+    """
+
+    blocks: tuple[str, ...] = ()
+    preset: Preset = FAST
+    obstacles: tuple[str, ...] = ()
+    hulls: tuple[tuple[str, Hull], ...] = ()
+    torques: bool = False
+    published: bool = False
+
+    def hull(self, block: str) -> Hull | None:
+        """Return the shape of a block that is no box; None for a box."""
+        return next((hull for name, hull in self.hulls if name == block), None)
+
+    def empty_state(self) -> State:
+        """Return a state to read into."""
+        return PhysicalState(self.layout)
+
+    def realization(self, backend: str) -> Any:
+        """Return how the robot is realised on Bullet, without physics, or drawn."""
+        name = "published" if self.published and backend == "bullet" else backend
+        if name not in _REALIZATIONS:
+            return None
+        module, what = _REALIZATIONS[name]
+        found = import_module(f"scm_world.tasks.trifinger.{module}")
+        return found if what is None else getattr(found, what)
+
+
+_REALIZATIONS = {
+    "bullet": ("bullet.client", "TriFingerClient"),
+    "published": ("bullet.published", "PublishedClient"),
+    "fake": ("fake", None),
+    "renderer": ("drawing", "DRAWING"),
+}
+
+START = "start"
+"""The keyframe in which fingers and blocks are clear of one another."""
+COLUMNS, ROWS = 3, 2
+SPACING = 0.1  # [m] between the centers of blocks that stand side by side
+LAYER = 0.07  # [m] between the centers of blocks that stand on one another
+
+
+@lru_cache(maxsize=64)
+def trifinger(
+    blocks: tuple[str, ...] = (),
+    preset: Preset = FAST,
+    obstacles: tuple[str, ...] = (),
+    hulls: tuple[tuple[str, Hull], ...] = (),
+    *,
+    torques: bool = False,
+    resolution: str = "vector",
+    published: bool = False,
+) -> TriFinger:
+    """Return the model of the robot with some blocks and obstacles; it is made once in a process.
+
+    Its parameters are, with the friction of a contact as the product of those of its two bodies:
+
+    ======================  ==========================================
+    element                 properties
+    ======================  ==========================================
+    ``world``               ``gravity`` (3,) [m/s²], ``restitution``, ``spinning_friction``
+    ``robot``               ``height`` [m], ``friction``, ``joint_damping`` [N m s/rad]
+    ``controller``          ``position_gains`` (3,) [N m/rad], ``velocity_gains`` (3,)
+                            [N m s/rad], ``safety_damping`` (3,) [N m s/rad],
+                            ``torque_limit`` [N m]; see ``ControllerSpec``
+    ``robot_finger_F_link_i``  ``mass`` [kg], ``color`` (3,)
+    ``floor``, ``stage``    ``friction``, ``color`` (3,)
+    every block             ``mass`` [kg], ``size`` (3,) [m], ``friction``, ``color`` (3,);
+                            one that is a hull has no ``size``
+    every obstacle          ``size`` (3,) [m], ``friction``, ``color`` (3,), ``position`` (3,)
+                            [m], ``orientation`` (4,)
+    ======================  ==========================================
+
+    Args:
+        blocks: See ``TriFinger``.
+        preset: See ``TriFinger``.
+        obstacles: See ``TriFinger``.
+        hulls: See ``TriFinger``.
+        torques: See ``TriFinger``.
+        resolution: Whether all joints, those of a finger, or each are a state; see ``joints_of``.
+        published: See ``TriFinger``.
+    """
+    parts = _Parts(blocks, preset, obstacles, hulls, torques)
+    states: dict[str, list[str]] = {}
+    for index, what in enumerate(("position", "velocity", "actuator_torque")):
+        for group in joints_of(resolution):
+            joints = range(group.where.start, group.where.stop)
+            states[group.names[index]] = [f"{_JOINT_NAMES[i]}.{what}" for i in joints]
+    for block in blocks:
+        names = (f"{block}.{what}" for what in MOTION)
+        states |= {name: [name] for name in names}
+    read = read_model(
+        _compiled(parts),
+        name="trifinger",
+        keyframe=START,
+        states=states,
+        controls=[f"{joint}_servo" for joint in _JOINT_NAMES],
+        bindings=partial(_bindings, parts=parts),
+        frame="world",
+    )
+    described = {name: getattr(read, name) for name in read.__dataclass_fields__}
+    described["digest"] += f" {published}"
+    return TriFinger(**described, **vars(parts), published=published)
+
+
+MOTION = ("cartesian_position", "orientation", "linear_velocity", "angular_velocity")
+"""The states of a block, in the order of the state vector."""
+_JOINT_NAMES = tuple(link_name(finger, index) for finger in FINGERS for index in (1, 2, 3))
+
+
+@final
+@dataclass(frozen=True)
+class _Parts:
+    """What there is, and how it is commanded; see ``TriFinger``."""
+
+    blocks: tuple[str, ...]
+    preset: Preset
+    obstacles: tuple[str, ...]
+    hulls: tuple[tuple[str, Hull], ...]
+    torques: bool
+
+
+def _compiled(parts: _Parts) -> mujoco.MjModel:
+    """Compile what there is, with the default of every parameter, and with the start."""
+    hulls = dict(parts.hulls)
+    spec = mujoco.MjSpec()
+    spec.modelname = "scm_world"
+    spec.compiler.degree = False
+    _write_options(spec, parts)
+    floor = spec.worldbody.add_body(name=FLOOR)
+    _add_shape(floor, FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1.0, 1.0, 0.1))
+    box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": (_BLOCK_HALF,) * 3}
+    for name in parts.obstacles:
+        _add_shape(spec.worldbody.add_body(name=name), name, **box, **_OBSTACLE_POSE)
+    _add_wall(spec.worldbody)
+    _add_robot(spec, CONTACT[parts.preset.name], torques=parts.torques)
+    for name in parts.blocks:
+        body, hull = spec.worldbody.add_body(name=name), hulls.get(name)
+        body.add_freejoint()
+        body.mass = _BLOCK_MASS
+        body.inertia = (_BLOCK_MASS / 6 * (2 * _BLOCK_HALF) ** 2,) * 3
+        body.explicitinertial = True
+        if hull is None:
+            _add_shape(body, name, **box)
+        else:  # MuJoCo moves a mesh into a frame of its own and the shape back by as much
+            mesh = spec.add_mesh(name=name)
+            mesh.uservert = [number for vertex in hull.vertices for number in vertex]
+            mesh.userface = [index for face in hull.faces for index in face]
+            _add_shape(body, name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
+    contact, slide = (table[parts.preset.name] for table in (CONTACT, SLIDING))
+    gripping = spec.default
+    sliding = spec.add_default("sliding", gripping)
+    for kind, friction in ((gripping, contact), (sliding, slide)):
+        pair = kind.pair
+        pair.condim, pair.margin, pair.gap = 4, 0.0, 0.0
+        pair.solref, pair.solreffriction = contact, friction
+        pair.friction = (1.0, 1.0, SPINNING_FRICTION, _ROLLING_FRICTION, _ROLLING_FRICTION)
+    for one, other, slides in contact_pairs(parts):
+        spec.add_pair(sliding if slides else gripping, geomname1=one, geomname2=other)
+    start = [*hardware.REST]
+    for index in range(len(parts.blocks)):
+        layer, spot = divmod(index, COLUMNS * ROWS)
+        row, column = divmod(spot, COLUMNS)
+        x = SPACING * (column - (min(len(parts.blocks), COLUMNS) - 1) / 2)
+        start += [x, 0.09 * row, _BLOCK_HALF + LAYER * layer, 1.0, 0.0, 0.0, 0.0]
+    spec.add_key(name=START, qpos=start)
+    model, defaults = spec.compile(), _defaults(parts)
+    scratch = mujoco.MjData(model)
+    for field in _bindings(model, Couplings(model), parts=parts):
+        slot = field.slot(model, scratch)
+        slot.write(np.asarray(defaults[field.name], dtype=np.float64))
+    couple(model)
+    mujoco.mj_setConst(model, scratch)
+    return model
+
+
+def _defaults(parts: _Parts) -> dict[str, object]:
+    """Return the published default of every parameter, by name."""
+    surface = {"floor": (0.31, 0.27, 0.25), "stage": (0.95, 0.95, 0.95)}
+    values: dict[str, object] = {
+        "world.gravity": (0.0, 0.0, -9.81),
+        "world.restitution": 0.0,
+        "world.spinning_friction": SPINNING_FRICTION,
+        "robot.height": hardware.NOMINAL_HEIGHT,
+        "robot.friction": 0.5,
+        "robot.joint_damping": 0.0,
+        "controller.position_gains": _SPEC.kp,
+        "controller.velocity_gains": _SPEC.kd,
+        "controller.safety_damping": _SPEC.safety,
+        "controller.torque_limit": _SPEC.limit,
+    }
+    for finger in FINGERS:
+        for index, mass in enumerate(hardware.LINK_MASS):
+            values[f"{link_name(finger, index)}.mass"] = mass
+            values[f"{link_name(finger, index)}.color"] = hardware.LINK_COLORS[finger]
+    for name, color in surface.items():
+        values |= {f"{name}.friction": 0.5, f"{name}.color": color}
+    for block in parts.blocks:
+        values |= {f"{block}.mass": _BLOCK_MASS, f"{block}.size": (2.0 * _BLOCK_HALF,) * 3}
+        values |= {f"{block}.friction": 1.0, f"{block}.color": (1.0, 0.0, 0.0)}
+    for index, name in enumerate(parts.obstacles):
+        values |= {f"{name}.size": (0.01,) * 3, f"{name}.friction": 0.5}
+        values |= {f"{name}.color": (0.0,) * 3, f"{name}.orientation": (0.0, 0.0, 0.0, 1.0)}
+        values[f"{name}.position"] = (0.02 * index - 0.1, 0.15, 0.005)
+    return values
+
+
+def shape_name(finger: str, shape: str) -> str:
+    """Name a collision shape of the robot."""
+    return f"{finger}/{shape}"
+
+
+def base_name(finger: str) -> str:
+    """Name the frame from which a finger hangs."""
+    return f"{finger}/base"
+
+
+def wall_name(segment: int) -> str:
+    """Name a segment of the ring."""
+    return f"{STAGE}/{segment}"
+
+
+def link_shapes(finger: str, index: int) -> tuple[str, ...]:
+    """List the shapes that belong to a link; the base has one that touches nothing."""
+    shapes = {0: ("base",), 1: ("upper",), 2: ("middle",), 3: ("lower", "tip")}[index]
+    return tuple(shape_name(finger, shape) for shape in shapes)
+
+
+def contact_pairs(parts: _Parts) -> Iterator[tuple[str, str, bool]]:
+    """List which shapes can touch, and whether they slide (True) or grip (False).
+
+    Yields:
+        Two shapes, and whether their friction is the soft one.
+    """
+    walls, blocks = [wall_name(i) for i in range(WALL_SEGMENTS)], parts.blocks
+    for i, block in enumerate(blocks):
+        yield FLOOR, block, True
+        yield from ((fixed, block, True) for fixed in (*walls, *parts.obstacles))
+        yield from ((block, other, True) for other in blocks[i + 1 :])
+        for finger in FINGERS:
+            yield from ((shape_name(finger, shape), block, False) for shape in SHAPES)
+    for finger in FINGERS:
+        yield from (
+            (fixed, shape_name(finger, shape), False)
+            for fixed in (FLOOR, *parts.obstacles)
+            for shape in SHAPES[1:]
+        )
+        # Nothing but a tip reaches the ring: the knee stays within 0.232 m of the center.
+        yield from ((wall, shape_name(finger, "tip"), False) for wall in walls)
+    for i, finger in enumerate(FINGERS):
+        for other in FINGERS[i + 1 :]:
+            yield from (
+                (shape_name(finger, mine), shape_name(other, its), False)
+                for mine in SHAPES[1:]
+                for its in SHAPES[1:]
+            )
+
+
+def _write_options(spec: mujoco.MjSpec, parts: _Parts) -> None:
+    """Write everything that concerns the whole simulation."""
+    option = spec.option
+    option.timestep = parts.preset.timestep
+    # The only one besides Euler in which bodies that do not touch are solved apart, to the last
+    # digit; ``discrete`` scales by the masses of all of them.
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.impratio = IMPRATIO
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    # MuJoCo 4.0.0 factors the Hessian wrongly where the Jacobian is sparse (#3767). The price of a
+    # dense one: its sums are grouped by the numbers of the degrees of freedom, so one block more
+    # changes the last digits of the others. Parameters of what does not touch still do nothing.
+    # With many blocks it is 17 times faster in a built wall; there, in 48 states, accelerations
+    # differed by less than 1e-6 from those of a dense one, as much as either did from the truth.
+    sparse, dense = mujoco.mjtJacobian.mjJAC_SPARSE, mujoco.mjtJacobian.mjJAC_DENSE
+    option.jacobian = sparse if len(parts.blocks) > MANY else dense
+    # A simulation that explodes must say so instead of starting again. A warm start is accepted
+    # or rejected for all islands together, so that bodies that do not touch would act on each
+    # other's last digits; without it, a step is a function of positions, velocities and command
+    # alone, and a parameter of what does not touch does exactly nothing.
+    off = mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_WARMSTART
+    option.disableflags = int(off)
+    option.enableflags = 0  # sleeping islands, in particular, cannot be restored exactly
+
+
+def _add_shape(body: mujoco.MjsBody, name: str, **options: Any) -> None:
+    """Add a shape that touches what pairs say."""
+    body.add_geom(name=name, contype=0, conaffinity=0, **options)
+
+
+def _add_wall(world: mujoco.MjsBody) -> None:
+    stage = world.add_body(name=STAGE)
+    outer = WALL_RADIUS + WALL_THICKNESS
+    half = (WALL_THICKNESS / 2, outer * math.tan(math.pi / WALL_SEGMENTS), WALL_HEIGHT / 2)
+    center = WALL_RADIUS + WALL_THICKNESS / 2
+    for i in range(WALL_SEGMENTS):
+        angle = 2 * math.pi * i / WALL_SEGMENTS
+        _add_shape(
+            stage,
+            wall_name(i),
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=(center * math.cos(angle), center * math.sin(angle), WALL_HEIGHT / 2),
+            quat=_yaw(angle),
+            size=half,
+        )
+
+
+def _add_robot(spec: mujoco.MjSpec, contact: tuple[float, float], *, torques: bool) -> None:
+    """Hang each finger from the world; then add nine servos or motors, and nine dampers.
+
+    MuJoCo works in the frame of the center of mass of a kinematic tree. With a tree per finger,
+    and the links that cannot move outside of them, no mass changes the roundings elsewhere.
+    """
+    height, world = hardware.NOMINAL_HEIGHT - hardware.TABLE_OFFSET, spec.worldbody
+    cos, sin = math.cos(hardware.WORLD_YAW), math.sin(hardware.WORLD_YAW)
+    for finger, (x, y, z), yaw in zip(
+        FINGERS, hardware.FINGER_OFFSET, hardware.FINGER_YAW, strict=True
+    ):
+        pose: dict[str, Any] = {
+            "pos": (cos * x - sin * y, sin * x + cos * y, z + height),
+            "quat": _yaw(hardware.WORLD_YAW + yaw),
+        }
+        fixed = world.add_body(name=link_name(finger, 0), **pose)
+        _set_inertial(fixed, 0)
+        sphere = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": (0.01, 0.0, 0.0)}
+        _add_shape(fixed, shape_name(finger, "base"), **sphere)
+        body = world.add_body(name=base_name(finger), **pose)
+        for index in (1, 2, 3):
+            name = link_name(finger, index)
+            body = body.add_body(name=name, pos=hardware.JOINT_ORIGINS[index - 1])
+            _set_inertial(body, index)
+            reach = hardware.ENGINE_LIMITS[index - 1]
+            body.add_joint(
+                name=name,
+                type=mujoco.mjtJoint.mjJNT_HINGE,
+                axis=hardware.JOINT_AXES[index - 1],
+                limited=True,
+                range=(-reach, reach),
+                solref_limit=contact,
+                actfrclimited=True,  # the joint clips the sum of servo and damper
+                actfrcrange=(-_SPEC.limit, _SPEC.limit),
+            )
+            _add_capsule(body, finger, SHAPES[index - 1])
+        tip = body.add_body(name=f"robot_finger_{finger}_tip", pos=hardware.TIP_ORIGIN)
+        tip.mass, tip.inertia, tip.explicitinertial = hardware.TIP_MASS, hardware.TIP_INERTIA, True
+        tip.ipos = hardware.TIP_CENTER["mujoco"]
+        tip.add_site(name=f"robot_finger_{finger}_tip")
+        _add_capsule(tip, finger, "tip")
+    for purpose, limit in (("servo", _SPEC.limit), ("safety", 0.0)):
+        motor = float(torques and purpose == "servo")
+        for joint in _JOINT_NAMES:
+            spec.add_actuator(  # without gains: they are parameters and follow
+                name=f"{joint}_{purpose}",
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                target=joint,
+                gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+                gainprm=[motor, *[0.0] * 9],
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                forcelimited=limit > 0.0,
+                forcerange=(-limit, limit),
+            )
+
+
+def _set_inertial(body: mujoco.MjsBody, index: int) -> None:
+    inertial, mass = hardware.INERTIAL[index], hardware.LINK_MASS[index]
+    x, y, z, w = inertial.orientation
+    body.mass = mass
+    body.ipos = inertial.center
+    body.iquat = (w, x, y, z)
+    body.inertia = [mass * moment for moment in inertial.per_mass]
+    body.explicitinertial = True
+
+
+def _add_capsule(body: mujoco.MjsBody, finger: str, shape: str) -> None:
+    capsule = hardware.COLLISION[shape]
+    _add_shape(
+        body,
+        shape_name(finger, shape),
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        fromto=(*capsule.start, *capsule.end),
+        size=(capsule.radius, 0.0, 0.0),
+    )
+
+
+def _yaw(angle: float) -> tuple[float, float, float, float]:
+    """Give the MuJoCo quaternion (w, x, y, z) of a turn about z."""
+    return (math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2))
+
+
+# --- bindings ----------------------------------------------------------------------------------
+
+
+def _bindings(mj: mujoco.MjModel, trees: Couplings, *, parts: _Parts) -> Iterator[Field]:
+    """List the parameters: what each is, where it is written, and on which trees it acts."""
+    fingers = [trees.tree(mj.body(link_name(finger, 1)).id) for finger in FINGERS]
+    everything, touching = trees.always(trees.every), trees.touching(trees.every)
+    robot = trees.always(fingers)
+
+    def row(
+        name: str, unit: str, slot: Callable[..., Slot], effect: Effect, doc: str, **rest: Any
+    ) -> Field:
+        element, _, attribute = name.rpartition(".")
+        return Field(
+            "binding", element, attribute, unit, doc, slot, lambda: effect, name=name, **rest
+        )
+
+    def color(element: str, shapes: Sequence[str]) -> Field:
+        slot = partial(_color, shapes=tuple(shapes))
+        return row(f"{element}.color", "1", slot, NOTHING, "Red, green and blue.", visual=True)
+
+    def friction(element: str, shapes: Sequence[str], effect: Effect) -> Field:
+        slot = partial(_friction, shapes=tuple(shapes))
+        return row(f"{element}.friction", "1", slot, effect, "Factor of all its contacts.")
+
+    yield row("world.gravity", "m/s^2", _gravity, everything, "Acceleration of free fall.")
+    rigid = partial(_restitution, rigid=CONTACT[parts.preset.name])
+    yield row("world.restitution", "1", rigid, touching, "Speed after an impact over that before.")
+    yield row("world.spinning_friction", "m", _spinning, touching, "Torsional, of every contact.")
+    touched = trees.touching(fingers)
+    yield row("robot.height", "m", _height, touched, "Height of the base; see ``hardware``.")
+    links = [s for f in FINGERS for i in range(4) for s in link_shapes(f, i)]
+    yield friction("robot", links, touched)
+    yield row("robot.joint_damping", "N m s/rad", _damping, robot, "Of every joint.")
+    gains = {"safety_damping": (("biasprm", N_JOINTS, 2, -1.0),)}
+    if not parts.torques:
+        gains["position_gains"] = (("gainprm", 0, 0, 1.0), ("biasprm", 0, 1, -1.0))
+        gains["velocity_gains"] = (("biasprm", 0, 2, -1.0),)
+    for name, places in sorted(gains.items()):
+        unit = "N m/rad" if name == "position_gains" else "N m s/rad"
+        slot = partial(_gains, places=places)
+        yield row(f"controller.{name}", unit, slot, robot, "Of the three joints of a finger.")
+    yield row("controller.torque_limit", "N m", _limit, robot, "Largest torque of a joint.")
+    for tree, finger in zip(fingers, FINGERS, strict=True):
+        for index, inertial in enumerate(hardware.INERTIAL):
+            link = link_name(finger, index)
+            slot = partial(_scaled_mass, body=link, per_mass=inertial.per_mass)
+            effect = trees.always([tree]) if index else NOTHING
+            yield row(f"{link}.mass", "kg", slot, effect, "Its inertia scales with it.")
+            yield color(link, link_shapes(finger, index))
+    surfaces = {FLOOR: [FLOOR], STAGE: [wall_name(i) for i in range(WALL_SEGMENTS)]}
+    for name, shapes in surfaces.items():
+        yield friction(name, shapes, touching)
+        yield color(name, shapes)
+    for name in parts.blocks:
+        tree, hull = trees.tree(mj.body(name).id), dict(parts.hulls).get(name)
+        own, contact = trees.always([tree]), trees.touching([tree])
+        slot = (
+            partial(_box, name=name, quantity="mass")
+            if hull is None
+            else partial(_scaled_mass, body=name, per_mass=hull.moments)
+        )
+        # A free body falls and tumbles as it does whatever its mass is.
+        yield row(f"{name}.mass", "kg", slot, contact, "Its inertia follows.")
+        if hull is None:
+            slot = partial(_box, name=name, quantity="size")
+            yield row(f"{name}.size", "m", slot, own, "Full edge lengths; the inertia follows.")
+        yield friction(name, [name], contact)
+        yield color(name, [name])
+    for name in parts.obstacles:
+        effect = trees.contact_of(mj.geom(name).id)
+        for what, unit in (("size", "m"), ("position", "m"), ("orientation", "1")):
+            slot = partial(_obstacle, name=name, quantity=what)
+            nature: Any = "rotation" if what == "orientation" else "real"
+            yield row(f"{name}.{what}", unit, slot, effect, "Of the box.", nature=nature)
+        yield friction(name, [name], effect)
+        yield color(name, [name])
+
+
+def _gravity(mj: mujoco.MjModel, _: Any) -> Slot:
+    return place(mj.opt.gravity)
+
+
+def _spinning(mj: mujoco.MjModel, _: Any) -> Slot:
+    return place(mj.geom_friction[:, 1], back=first, follow_up=couple)
+
+
+def _height(mj: mujoco.MjModel, _: Any) -> Slot:
+    names = [name for finger in FINGERS for name in (base_name(finger), link_name(finger, 0))]
+    heights, offset = [mj.body_pos[mj.body(n).id, 2, ...] for n in names], hardware.TABLE_OFFSET
+    return place(*heights, to=lambda z: z - offset, back=lambda z: z + offset, constant=True)
+
+
+def _damping(mj: mujoco.MjModel, _: Any) -> Slot:
+    return place(mj.dof_damping[:N_JOINTS], back=first)
+
+
+def _limit(mj: mujoco.MjModel, _: Any) -> Slot:
+    """Find the limit of servo and joint: the joint clips the sum of servo and damper."""
+    ranges = mj.actuator_forcerange[:N_JOINTS], mj.jnt_actfrcrange[:N_JOINTS]
+    return place(*ranges, to=lambda limit: np.array([-limit, limit]), back=lambda r: r[0, 1])
+
+
+def _gains(
+    mj: mujoco.MjModel, _: Any, *, places: tuple[tuple[str, int, int, float], ...]
+) -> Slot:
+    """Find a number for each joint of a finger, shape (3,); all fingers have the same.
+
+    Args:
+        places: Array, first actuator, column and sign of each copy.
+    """
+    views = [
+        (getattr(mj, f"actuator_{array}")[start : start + N_JOINTS, column], sign)
+        for array, start, column, sign in places
+    ]
+
+    def write(value: Floats) -> None:
+        for view, sign in views:
+            view[:] = np.tile(sign * value, len(FINGERS))
+
+    view, sign = views[0]
+    return Slot(write, lambda: sign * view[: N_JOINTS // len(FINGERS)])
+
+
+def _friction(mj: mujoco.MjModel, _: Any, *, shapes: tuple[str, ...]) -> Slot:
+    """Find the factor of one body. Contact pairs get products; the factors rest in the shapes."""
+    views = (mj.geom_friction[mj.geom(name).id, 0, ...] for name in shapes)
+    return place(*views, follow_up=couple)
+
+
+def _color(mj: mujoco.MjModel, _: Any, *, shapes: tuple[str, ...]) -> Slot:
+    """Find red, green, blue, shape (3,); MuJoCo keeps 32 bits of each."""
+    return place(*(mj.geom_rgba[mj.geom(name).id, :3] for name in shapes))
+
+
+def _scaled_mass(
+    mj: mujoco.MjModel, _: Any, *, body: str, per_mass: tuple[float, ...]
+) -> Slot:
+    """Find the mass of a link or a hull [kg]; its moments of inertia scale with it."""
+    index, moments = mj.body(body).id, np.array(per_mass)
+    mass, inertia = mj.body_mass[index, ...], mj.body_inertia[index]
+
+    def write(value: Floats) -> None:
+        mass[...] = value
+        inertia[:] = value * moments
+
+    return Slot(write, mass.copy, constant=True)
+
+
+def _box(mj: mujoco.MjModel, _: Any, *, name: str, quantity: str) -> Slot:
+    """Find mass [kg] or full edge lengths [m] of a solid box; its inertia follows both."""
+    body = mj.body(name).id
+    mass, inertia = mj.body_mass[body, ...], mj.body_inertia[body]
+    half = mj.geom_size[mj.geom(name).id]
+
+    def weigh(value: Floats) -> None:
+        mass[...] = value
+        _fill_box(float(mass), half, inertia)
+
+    def resize(value: Floats) -> None:
+        np.multiply(value, 0.5, out=half)
+        _fill_box(float(mass), half, inertia)
+
+    if quantity == "mass":
+        return Slot(weigh, mass.copy, constant=True)
+    return Slot(resize, lambda: 2.0 * half, constant=True)
+
+
+def _obstacle(mj: mujoco.MjModel, _: Any, *, name: str, quantity: str) -> Slot:
+    """Find edge lengths [m], center [m] or orientation of a box that nothing moves."""
+    shape = mj.geom(name).id
+    if quantity == "position":
+        return place(mj.geom_pos[shape], constant=True)
+    if quantity == "orientation":
+        return turn(mj.geom_quat[shape])
+    return place(mj.geom_size[shape], to=lambda v: 0.5 * v, back=lambda v: 2.0 * v, constant=True)
+
+
+@numba.njit("void(f8, f8[::1], f8[::1])", cache=True)
+def _fill_box(mass: float, half: Floats, inertia: Floats) -> None:
+    """Give a solid box its moments of inertia, m/12 (b² + c²)."""
+    for axis in range(3):
+        b, c = half[(axis + 1) % 3], half[(axis + 2) % 3]
+        inertia[axis] = mass / 3.0 * (b * b + c * c)
+
+
+def _restitution(mj: mujoco.MjModel, _: Any, *, rigid: tuple[float, float]) -> Slot:
+    """Find how much of its speed a body keeps when it bounces, in [0, 1).
+
+    A contact is a spring and a damper. A damping ratio z leaves ``exp(-pi z / sqrt(1 - z²))`` of
+    the speed after half a period; the frequency stays, and with it how far a body sinks in.
+
+    Args:
+        rigid: Time constant [s] and damping ratio of a contact without restitution, which is
+            critically damped.
+    """
+    time, ratio = rigid
+    references = mj.pair_solref
+
+    def write(value: Floats) -> None:
+        loss = -math.log(value) if value > 0.0 else math.inf
+        damping = loss / math.hypot(math.pi, loss) if loss < math.inf else 1.0
+        references[:, 0], references[:, 1] = time / damping, ratio * damping
+
+    def read() -> Floats:
+        damping = float(references[0, 1]) / ratio
+        if damping >= 1.0:
+            return np.array(0.0)
+        return np.array(math.exp(-math.pi * damping / math.sqrt(1.0 - damping * damping)))
+
+    return Slot(write, read)
+
+
+SPINNING_LIMIT = 1.0
+"""At most this many times its sliding friction is the spinning friction of a pair [m]. Above about
+five times the solver of the engine speeds a spinning body up, tenfold and more in a step; a real
+patch of contact gives two thirds of its radius."""
+
+
+def couple(mj: mujoco.MjModel) -> None:
+    """Write the product of its two frictions into every contact pair, and its spinning friction."""
+    _couple(mj.geom_friction, mj.pair_geom1, mj.pair_geom2, mj.pair_friction)
+
+
+@numba.njit("void(f8[:, ::1], i4[::1], i4[::1], f8[:, ::1])", cache=True)
+def _couple(
+    factors: Floats, first: NDArray[np.int32], second: NDArray[np.int32], pairs: Floats
+) -> None:
+    for i in range(first.shape[0]):
+        product = factors[first[i], 0] * factors[second[i], 0]
+        pairs[i, 0] = product
+        pairs[i, 1] = product
+        pairs[i, 2] = min(factors[first[i], 1], SPINNING_LIMIT * product)
