@@ -24,7 +24,7 @@ from scm_world.queries.experiments.versions import versions
 from scm_world.tasks.trifinger.cameras import CAMERAS
 from scm_world.tasks.trifinger.hardware import REST
 from scm_world.tasks.trifinger.kinematics import forward, inverse_kernel
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.variables import Normal
 
 REPEATS = 9
@@ -101,7 +101,7 @@ def drawing() -> dict[str, float]:
 
 
 def _scene(n_blocks: int) -> Any:
-    return default_scene(TriFingerStructure(blocks=tuple(f"block_{i}" for i in range(n_blocks))))
+    return trifinger(blocks=tuple(f"block_{i}" for i in range(n_blocks))).default_scene()
 
 
 def discovering(backend: str) -> dict[str, float]:

@@ -274,9 +274,9 @@ def diff(now: Scene, then: Scene) -> Difference:
     Goals are not compared: no backend knows them. Neither are states that cannot be set.
 
     Example:
-        >>> from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+        >>> from scm_world.tasks.trifinger.system import trifinger
         >>> from scm_world.models import diff
-        >>> scene = default_scene(TriFingerStructure(blocks=("tool_block",)))
+        >>> scene = trifinger(blocks=("tool_block",)).default_scene()
         >>> heavy = {**scene.parameters, ("tool_block", "mass"): np.array(0.05)}
         >>> diff(scene, scene.with_(parameters=heavy)).parameters
         {('tool_block', 'mass'): array(0.05)}

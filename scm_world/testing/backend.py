@@ -23,7 +23,7 @@ from scm_world.errors import EngineFailure
 from scm_world.models.scene import ControlMode, Difference, Parameters, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import TriFingerStructure, controller_spec, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.effects import EffectConformance
 from scm_world.testing.parameters import ParameterConformance
 from scm_world.testing.scenes import (
@@ -64,7 +64,7 @@ class BackendConformance(
         play(backend, 3, mode=ControlMode.JOINT_TORQUES)
         backend.build(scene)
         again = play(backend, 20)
-        backend.build(default_scene(TriFingerStructure(("other",), preset=self.preset)))
+        backend.build(trifinger(("other",), preset=self.preset).default_scene())
         play(backend, 2)
         backend.build(scene)
         with self.built(scene) as fresh:
@@ -150,7 +150,7 @@ class BackendConformance(
     def test_contacts_carry_the_weight(self, scene: Scene) -> None:
         """A resting block touches the floor only, and the forces add up to its weight."""
         with self.built(
-            default_scene(TriFingerStructure(("block",), preset=self.preset))
+            trifinger(("block",), preset=self.preset).default_scene()
         ) as backend:
             if not backend.capabilities.physics:
                 assert backend.contacts() == ()

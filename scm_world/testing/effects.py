@@ -13,7 +13,7 @@ from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
 from scm_world.models.scene import ControlMode, ParameterKey, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import forward, inverse
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.scenes import STONE, Suite, named, same
 
 HALF = 0.0325  # [m] of the default cube
@@ -26,10 +26,10 @@ class EffectConformance(Suite):
     """Sentences about what acts, and in which direction. They are empty without physics."""
 
     def arranged(
-        self, structure: TriFingerStructure, values: Values, position: ArrayLike = ()
+        self, structure: Any, values: Values, position: ArrayLike = ()
     ) -> Scene:
         """Put one block somewhere, with some parameters."""
-        scene = default_scene(structure)
+        scene = structure.default_scene()
         if structure.blocks:
             scene.state.positions[0] = position
         return scene.with_(parameters={**scene.parameters, **values})
@@ -61,7 +61,7 @@ class EffectConformance(Suite):
             **FAR_UP,
             ("floor", "friction"): np.array(0.05),
         }
-        structure = TriFingerStructure(("block",), self.preset, obstacles=("wall",))
+        structure = trifinger(("block",), self.preset, obstacles=("wall",))
         scene = self.arranged(structure, values, [-0.08, 0.0, HALF])
         scene.state.linear_velocities[0] = [0.8, 0.0, 0.0]
         farthest = self.watched(backend, scene, 0.5)[:, 27].max()
@@ -82,7 +82,7 @@ class EffectConformance(Suite):
         plate = named("plate", {"size": [0.4, 0.4, 0.01], "position": [0.0, 0.0, top - 0.005]})
         lowest = []
         for obstacles, values in (((), {}), (("plate",), plate)):
-            scene = self.arranged(TriFingerStructure((), self.preset, obstacles), values)
+            scene = self.arranged(trifinger((), self.preset, obstacles), values)
             joints = self.watched(backend, scene, 0.6, low.joint_positions)[-1, :9]
             lowest.append(forward(joints, height).reshape(3, 3)[:, 2].min())
         radius = hardware.COLLISION["tip"].radius
@@ -96,7 +96,7 @@ class EffectConformance(Suite):
         drop, risen = 0.15, []
         for restitution in (0.0, 0.6):
             values = {**FAR_UP, ("world", "restitution"): np.array(restitution)}
-            structure = TriFingerStructure(("block",), self.preset)
+            structure = trifinger(("block",), self.preset)
             scene = self.arranged(structure, values, [0.0, 0.0, HALF + drop])
             heights = self.watched(backend, scene, 0.4)[:, 29]
             landed = int(np.argmax(heights <= HALF))
@@ -114,7 +114,7 @@ class EffectConformance(Suite):
             smooth = {("floor", "friction"): np.array(0.01)}
             values = {**FAR_UP, **smooth, ("world", "spinning_friction"): np.array(friction)}
             scene = self.arranged(
-                TriFingerStructure(("block",), self.preset), values, [0.0, 0.0, HALF]
+                trifinger(("block",), self.preset), values, [0.0, 0.0, HALF]
             )
             scene.state.angular_velocities[0] = [0.0, 0.0, 8.0]
             speeds.append(self.watched(backend, scene, 0.2)[-1, 39])
@@ -131,7 +131,7 @@ class EffectConformance(Suite):
             return
         smooth = {("floor", "friction"): np.array(sliding)}
         values = {**FAR_UP, **smooth, ("world", "spinning_friction"): np.array(spinning)}
-        scene = self.arranged(TriFingerStructure(("block",), self.preset), values, [0.0, 0.0, HALF])
+        scene = self.arranged(trifinger(("block",), self.preset), values, [0.0, 0.0, HALF])
         scene.state.angular_velocities[0] = [0.0, 0.0, 10.0]
         turns = np.abs(self.watched(backend, scene, 0.3)[:, 39])
         assert turns.max() <= 10.0 + 1e-9
@@ -140,7 +140,7 @@ class EffectConformance(Suite):
     @pytest.mark.parametrize("name", ["restitution", "spinning_friction"])
     def test_contacts_need_touch(self, backend: Backend, name: str) -> None:
         """What belongs to contacts has exactly no effect on a block in the air."""
-        structure = TriFingerStructure(("block",), self.preset, obstacles=("post",))
+        structure = trifinger(("block",), self.preset, obstacles=("post",))
         paths = []
         for value in (0.0, 0.3):
             values = {**FAR_UP, ("world", name): np.array(value)}
@@ -157,7 +157,7 @@ class EffectConformance(Suite):
         for damping in (0.0, 0.01, 0.03):
             damped = {("robot", "joint_damping"): np.array(damping)}
             values = {**FAR_UP, **damped, ("world", "gravity"): np.zeros(3)}
-            scene = self.arranged(TriFingerStructure((), self.preset), values)
+            scene = self.arranged(trifinger((), self.preset), values)
             scene.state.joint_velocities[:] = 1.0
             backend.build(scene)
             backend.step(ControlMode.JOINT_TORQUES, np.zeros(9), round(0.1 / self.preset.timestep))
@@ -170,7 +170,7 @@ class EffectConformance(Suite):
         if not backend.capabilities.physics:
             return
         limit = {("controller", "torque_limit"): np.array(0.1)}
-        scene = self.arranged(TriFingerStructure((), self.preset), {**FAR_UP, **limit})
+        scene = self.arranged(trifinger((), self.preset), {**FAR_UP, **limit})
         reach = np.tile([-1.0, 0.5, 0.9], 3)
         commands = {
             ControlMode.JOINT_TORQUES: reach,
@@ -189,7 +189,7 @@ class EffectConformance(Suite):
         """A stone that was dropped lies on three of its corners, and floor forces carry it."""
         if not backend.capabilities.physics:
             return
-        structure = TriFingerStructure(("stone",), self.preset, hulls=(("stone", STONE),))
+        structure = trifinger(("stone",), self.preset, hulls=(("stone", STONE),))
         scene = self.arranged(structure, FAR_UP, [0.0, 0.0, 0.05])
         scene.state.orientations[0] = from_rotation_vector([0.3, 0.2, 0.0])
         scene.state.angular_velocities[0] = [1.0, 0.5, 0.0]

@@ -8,7 +8,7 @@ from scm_world.backends.base import Backend
 from scm_world.models.scene import Difference, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import TriFingerStructure, parameter_keys
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.scenes import (
     STONE,
     Suite,
@@ -26,7 +26,7 @@ class ParameterConformance(Suite):
 
     def test_every_parameter_is_read_back(self, backend: Backend, scene: Scene) -> None:
         """The engine reports each parameter as it was set."""
-        keys = tuple(parameter_keys(scene.structure))
+        keys = tuple(scene.parameters)
         check_parameters(backend.parameters(keys), scene.parameters)
         other = {key: other_value(key, scene.parameters[key]) for key in keys}
         backend.apply(Difference(parameters=other))
@@ -34,7 +34,7 @@ class ParameterConformance(Suite):
 
     def test_a_parameter_changes_nothing_else(self, backend: Backend, scene: Scene) -> None:
         """Setting one parameter leaves the state and every other parameter as they were."""
-        keys = tuple(parameter_keys(scene.structure))
+        keys = tuple(scene.parameters)
         state, before = backend.state(), backend.parameters(keys)
         for key in keys:
             backend.apply(Difference(parameters={key: other_value(key, before[key])}))
@@ -183,7 +183,7 @@ class ParameterConformance(Suite):
             backend.build(scene)
             state = backend.state()
             without = PhysicalState(1, np.delete(state.vector, np.s_[27:40]))
-            fewer = TriFingerStructure(("near",), preset=self.preset)
+            fewer = trifinger(("near",), preset=self.preset)
             backend.apply(Difference(structure=fewer, state=without))
             others = np.delete(expected, np.s_[27:40], axis=1)
             np.testing.assert_allclose(play(backend, 40), others, rtol=0, atol=1e-7)

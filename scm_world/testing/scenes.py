@@ -21,7 +21,7 @@ from scm_world.models.scene import ControlMode, Difference, ParameterKey, Parame
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import FAST, PRECISE, Preset
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import CONTROLLER, TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 
 SUBSTEPS = 10
 MODES = (ControlMode.JOINT_POSITIONS, ControlMode.JOINT_TORQUES)
@@ -61,8 +61,8 @@ def busy_scene(preset: Preset = FAST) -> Scene:
     falls on a ledge.
     """
     blocks = ("near", "falling", "sliding", "stone")
-    structure = TriFingerStructure(blocks, preset, obstacles=("ledge",), hulls=(("stone", STONE),))
-    scene = default_scene(structure)
+    structure = trifinger(blocks, preset, obstacles=("ledge",), hulls=(("stone", STONE),))
+    scene = structure.default_scene()
     state = scene.state
     state.positions[:3] = [[-0.06, 0.11, 0.0325], [-0.05, 0.1, 0.12], [-0.02, -0.13, 0.0325]]
     state.positions[3] = [0.1, 0.1, 0.06]
@@ -82,7 +82,7 @@ def named(body: str, values: Mapping[str, ArrayLike]) -> dict[ParameterKey, Floa
 
 def apart_scene(preset: Preset = FAST) -> Scene:
     """Make a scene of a block that rocks alone on a ledge, and of one that a finger pushes."""
-    scene = default_scene(TriFingerStructure(("apart", "near"), preset, obstacles=("ledge",)))
+    scene = trifinger(("apart", "near"), preset, obstacles=("ledge",)).default_scene()
     state = scene.state
     state.positions[:] = [[0.1, 0.12, 0.05], [-0.06, 0.11, 0.0325]]
     state.angular_velocities[0] = [1.0, -2.0, 0.5]

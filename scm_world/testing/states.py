@@ -12,7 +12,7 @@ import pytest
 from scm_world.backends.base import Backend, EngineSnapshot
 from scm_world.errors import SnapshotMismatch
 from scm_world.models.scene import ControlMode, Difference, Scene
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene, parameter_keys
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.scenes import (
     Suite,
     another,
@@ -93,12 +93,12 @@ class StateConformance(Suite):
             check_parameters(backend.parameters(other), other)
             assert same(backend.state().settable(), before.settable())
 
-    def structures(self, scene: Scene) -> Iterator[TriFingerStructure]:
+    def structures(self, scene: Scene) -> Iterator[Any]:
         """List what can become of the busy scene: blocks, obstacles, shapes, settings."""
         whole = scene.structure
         yield replace(whole, blocks=(*whole.blocks, "new"))
-        yield TriFingerStructure(("sliding", "near"), self.preset)
-        yield TriFingerStructure((), self.preset)
+        yield trifinger(("sliding", "near"), self.preset)
+        yield trifinger((), self.preset)
         yield replace(whole, obstacles=())
         yield replace(whole, obstacles=("new", *whole.obstacles))
         yield replace(whole, hulls=())
@@ -127,7 +127,7 @@ class StateConformance(Suite):
         yield backend.snapshot()
         play(backend, 3, mode=ControlMode.JOINT_TORQUES)
         yield backend.snapshot()
-        backend.apply(Difference(structure=TriFingerStructure(("near", "new"), preset=self.preset)))
+        backend.apply(Difference(structure=trifinger(("near", "new"), preset=self.preset)))
         yield backend.snapshot()
 
     def test_a_snapshot_continues_bit_for_bit(self, backend: Backend, scene: Scene) -> None:
@@ -140,7 +140,7 @@ class StateConformance(Suite):
             assert backend.state() == state
             assert [c.bodies for c in backend.contacts()] == [c.bodies for c in touching]
             assert same(play(backend, 15), expected)
-            elsewhere = default_scene(TriFingerStructure(("stranger",), preset=self.preset))
+            elsewhere = trifinger(("stranger",), preset=self.preset).default_scene()
             with self.built(elsewhere) as other:
                 play(other, 2)
                 assert same(self.continued(other, pickle.loads(bytes_), 15), expected)  # noqa: S301
@@ -148,7 +148,7 @@ class StateConformance(Suite):
 
     def test_a_snapshot_holds_the_parameters(self, backend: Backend, scene: Scene) -> None:
         """Restoring brings back the parameters of the snapshot."""
-        keys = tuple(parameter_keys(scene.structure))
+        keys = tuple(scene.parameters)
         start, before = backend.snapshot(), backend.parameters(keys)
         other = {key: other_value(key, value) for key, value in scene.parameters.items()}
         backend.apply(Difference(parameters=other))

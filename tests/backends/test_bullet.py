@@ -21,7 +21,7 @@ from scm_world.errors import EngineFailure, SnapshotMismatch
 from scm_world.models import ControlMode, Difference, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import inverse
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene, parameter_keys
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.backend import busy_scene, changed_states, other_value, play
 
 pytestmark = pytest.mark.skipif(
@@ -110,14 +110,14 @@ def test_a_canonical_world_equals_a_new_one(
 ) -> None:
     """Whatever the fingers touched before, setting a state gives the bits of a new world."""
     blocks, command = ("block",) if touching == "block" else (), TOUCHES[touching]
-    scene = default_scene(TriFingerStructure(blocks))
+    scene = trifinger(blocks).default_scene()
     backend.build(scene)
     backend.step(POSITIONS, command, 400)
     assert fingers_touch(backend, touching)
     target = scene.with_(state=backend.state())  # in the very contact that must be forgotten
 
     if way == "remake":
-        backend.build(default_scene(TriFingerStructure(("other", "another"))))
+        backend.build(trifinger(("other", "another")).default_scene())
         play(backend, 1)
     if way == "apply":
         backend.step(POSITIONS, command, 1)
@@ -202,7 +202,7 @@ def test_a_saved_state_brings_its_parameters(backend: BulletBackend) -> None:
     scene = busy_scene()
     backend.build(scene)
     play(backend, 40)
-    snapshot, keys = backend.snapshot(), tuple(parameter_keys(scene.structure))
+    snapshot, keys = backend.snapshot(), tuple(scene.parameters)
     before = backend.parameters(keys)
     expected = play(backend, 5)
     light = {key: other_value(key, scene.parameters[key]) for key in keys if key[1] == "mass"}
@@ -311,7 +311,7 @@ def test_a_change_that_fails_changes_nothing(
         play(backend, 1)
         resize(backend, 1.0)
         play(backend, 1)
-    state, keys = backend.state(), tuple(parameter_keys(scene.structure))
+    state, keys = backend.state(), tuple(scene.parameters)
     parameters, snapshot = backend.parameters(keys), backend.snapshot()
 
     other = {key: other_value(key, scene.parameters[key]) for key in keys}
@@ -343,7 +343,7 @@ def test_a_light_change_that_fails_changes_nothing(backend: BulletBackend) -> No
     snapshot = backend.snapshot()
     expected = play(backend, 10)
     backend.restore(snapshot)
-    keys = tuple(parameter_keys(scene.structure))
+    keys = tuple(scene.parameters)
     light = {k: other_value(k, scene.parameters[k]) for k in keys if k[1] in ("mass", "friction")}
     watched.fail("changeDynamics", 9)
     with pytest.raises(EngineFailure):

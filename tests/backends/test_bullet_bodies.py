@@ -20,7 +20,7 @@ from scm_world.models import ControlMode, Difference, Scene
 from scm_world.models.scene import ParameterKey
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene, parameter_keys
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.scenes import busy_scene, named, octahedron, other_value, play
 
 pytestmark = pytest.mark.skipif(
@@ -59,7 +59,7 @@ def fresh(scene: Scene, after: Callable[[Backend], Floats]) -> Floats:
 
 def leaning(**wall: ArrayLike) -> Scene:
     """Pull a block sideways against a wall."""
-    scene = default_scene(TriFingerStructure(("block",), obstacles=("wall",)))
+    scene = trifinger(("block",), obstacles=("wall",)).default_scene()
     scene.state.positions[0] = [0.0, 0.06, HALF]
     tilt = {("world", "gravity"): np.array([0.0, -8.0, -9.81])}
     return scene.with_(
@@ -176,7 +176,7 @@ def lowest(hull: Hull, backend: Backend) -> float:
 def test_a_hull_rests_on_the_floor(backend: BulletBackend, name: str) -> None:
     """A dropped hull comes to rest with its lowest corner on the floor, in spite of margins."""
     hull = HULLS[name]
-    scene = default_scene(TriFingerStructure(("block",), hulls=(("block", hull),)))
+    scene = trifinger(("block",), hulls=(("block", hull),)).default_scene()
     scene.state.positions[0] = [0.0, 0.0, 0.09]
     scene.state.orientations[0] = from_rotation_vector([0.3, 0.2, 0.1])
     backend.build(scene.with_(parameters={**scene.parameters, **FAR_UP}))
@@ -191,7 +191,7 @@ def test_hulls_and_boxes_stack(backend: BulletBackend) -> None:
     """A tower of cubes, of which some are hulls, stands as high as its edges say."""
     blocks = ("a", "b", "c", "d")
     hulls = (("b", HULLS["cube"]), ("c", HULLS["cube"]))
-    scene = default_scene(TriFingerStructure(blocks, hulls=hulls))
+    scene = trifinger(blocks, hulls=hulls).default_scene()
     scene.state.positions[:] = [[0.0, 0.0, HALF + 0.065 * k] for k in range(4)]
     backend.build(scene.with_(parameters={**scene.parameters, **FAR_UP}))
     rest(backend, 500)
@@ -232,7 +232,7 @@ def moved(backend: Backend) -> PhysicalState:
 
 NEW = [
     key
-    for key in parameter_keys(busy_scene().structure)
+    for key in busy_scene().parameters
     if key[0] in ("controller", "ledge")
     or key[1] in ("restitution", "spinning_friction", "joint_damping")
 ]
@@ -269,7 +269,7 @@ def test_every_body_takes_part_in_contacts(backend: BulletBackend, early: bool) 
         Difference(parameters={key: np.array(value) for key, value in values.items()}),
         Difference(structure=busy_scene().structure),
     ]
-    backend.build(default_scene(TriFingerStructure(("other",))))
+    backend.build(trifinger(("other",)).default_scene())
     for change in changes if early else reversed(changes):
         backend.apply(change)
     client = backend._now()
@@ -295,7 +295,7 @@ def effective(backend: BulletBackend, restitution: float) -> float:
     """Drop a block from several heights; measure speed after an impact over speed before it."""
     ratios = []
     for drop in np.linspace(0.1, 0.12, 11):
-        scene = default_scene(TriFingerStructure(("block",)))
+        scene = trifinger(("block",)).default_scene()
         scene.state.positions[0] = [0.0, 0.0, HALF + drop]
         values: Mapping[ParameterKey, Floats] = {
             **FAR_UP,

@@ -27,7 +27,7 @@ from scm_world.backends.bullet.model.support import (
 from scm_world.backends.mujoco.reading import compiled, permutation
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
 from scm_world.models import ControlMode, Difference, Model, Parameter, Scene
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.backend import busy_scene
 from scm_world.testing.backend import play as play_robot
 
@@ -639,7 +639,7 @@ def test_parameters_that_bullet_lacks(backend: BulletBackend) -> None:
     with pytest.raises(NotIntervenable, match="keeps its default"):
         backend.build(scene.with_(parameters={**scene.parameters, **heavier}))
     assert not backend.supports(model, ("elbow", "stiffness"))
-    assert backend.supports(TriFingerStructure(), ("robot", "height"))
+    assert backend.supports(trifinger(), ("robot", "height"))
 
 
 def test_names_and_modes_that_do_not_exist(backend: BulletBackend) -> None:
@@ -659,9 +659,9 @@ def test_names_and_modes_that_do_not_exist(backend: BulletBackend) -> None:
     with pytest.raises(ValueError, match=f"expected a state of {model.layout.size} numbers"):
         backend.apply(Difference(state=wrong))
     robot = Scene(
-        TriFingerStructure(),
-        default_scene(TriFingerStructure()).parameters,
-        TriFingerStructure().empty_state(),
+        trifinger(),
+        trifinger().default_scene().parameters,
+        trifinger().empty_state(),
     )
     backend.build(robot)
     with pytest.raises(UnknownOption, match="joint_positions, joint_torques"):

@@ -23,7 +23,7 @@ from scm_world.tasks.trifinger.bullet.passive import MASSES, inverse_dynamics, m
 from scm_world.tasks.trifinger.hardware import ControllerSpec
 from scm_world.tasks.trifinger.kinematics import link_frames
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import SPINNING_FRICTION, TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.backend import busy_scene
 
 pytestmark = pytest.mark.skipif(
@@ -65,7 +65,7 @@ def robot(backend: BulletBackend) -> tuple[Any, int, int]:
 
 def test_links_are_where_kinematics_has_them(backend: BulletBackend) -> None:
     """The engine's link frames are those of the closed form."""
-    scene = default_scene(TriFingerStructure())
+    scene = trifinger().default_scene()
     scene.state.joint_positions[:] = np.random.default_rng(0).uniform(-1, 1, 9)
     backend.build(scene)
     engine, client, body = robot(backend)
@@ -82,7 +82,7 @@ def test_links_are_where_kinematics_has_them(backend: BulletBackend) -> None:
 
 def test_every_link_has_one_shape_and_its_inertia(backend: BulletBackend) -> None:
     """Compound shapes would make saved states inexact, so the tip is a link of its own."""
-    backend.build(default_scene(TriFingerStructure()))
+    backend.build(trifinger().default_scene())
     engine, client, body = robot(backend)
     for finger in range(3):
         for link in range(5):
@@ -102,7 +102,7 @@ def test_every_link_has_one_shape_and_its_inertia(backend: BulletBackend) -> Non
 
 def test_frictions_reach_the_links(backend: BulletBackend) -> None:
     """Friction lands on the colliding links, not on the base; nothing damps or bounces."""
-    backend.build(default_scene(TriFingerStructure()))
+    backend.build(trifinger().default_scene())
     backend.apply(Difference(parameters={("robot", "friction"): np.array(0.37)}))
     engine, client, body = robot(backend)
     for link in arena.COLLIDING_LINKS:
@@ -116,7 +116,7 @@ def test_frictions_reach_the_links(backend: BulletBackend) -> None:
 
 def test_nothing_slows_a_flying_block(backend: BulletBackend) -> None:
     """Without gravity and contacts, velocities stay as they are to the last bit."""
-    scene = default_scene(TriFingerStructure(("block",)))
+    scene = trifinger(("block",)).default_scene()
     scene.state.positions[0] = [0.0, 0.0, 1.0]
     scene.state.linear_velocities[0] = [0.1, 0.2, 0.3]
     scene.state.angular_velocities[0] = [0.4, 0.0, 0.0]
@@ -155,7 +155,7 @@ def test_who_may_touch_whom() -> None:
 
 def test_the_dynamics_of_a_finger_are_the_engines(backend: BulletBackend) -> None:
     """Mass matrix and bias in closed form equal those that the engine computes."""
-    backend.build(default_scene(TriFingerStructure()))
+    backend.build(trifinger().default_scene())
     engine, client, body = robot(backend)
     generator, weights = np.random.default_rng(0), np.array(hardware.LINK_MASS[1:])
     for _ in range(10):
@@ -177,7 +177,7 @@ def test_a_damped_step_is_implicit(backend: BulletBackend) -> None:
     """The engine moves as the equations of an implicit step say, tilted and with other masses."""
     damping, gravity = 0.3, np.array([1.0, -2.0, -9.0])
     masses = np.linspace(0.02, 0.2, 9)
-    scene = default_scene(TriFingerStructure())
+    scene = trifinger().default_scene()
     values = {
         ("robot", "joint_damping"): np.array(damping),
         ("world", "gravity"): gravity,
@@ -207,7 +207,7 @@ def test_a_damped_step_is_implicit(backend: BulletBackend) -> None:
 def test_a_driven_joint_reaches_its_final_speed(backend: BulletBackend) -> None:
     """With strong damping, the speed of a joint becomes torque over damping."""
     damping, torque = 0.5, 0.1
-    scene = default_scene(TriFingerStructure())
+    scene = trifinger().default_scene()
     values = {
         ("robot", "joint_damping"): np.array(damping),
         ("world", "gravity"): np.zeros(3),
@@ -253,6 +253,6 @@ def test_clients_are_given_back() -> None:
 
 def test_a_backend_without_a_scene_says_so(backend: BulletBackend) -> None:
     """Using a backend before ``build``, or after ``close``, is an error with a hint."""
-    for use in (backend.snapshot, backend.contacts, lambda: backend.read(PhysicalState(0))):
+    for use in (backend.snapshot, backend.contacts, lambda: backend.read(trifinger().empty_state())):
         with pytest.raises(EngineFailure, match="call build"):
             use()

@@ -15,7 +15,7 @@ from scm_world.models import ControlMode, Difference
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import forward
 from scm_world.tasks.trifinger.mujoco.model import compiled
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.backend import busy_scene, other_value, play
 
 REST = np.array(hardware.REST)
@@ -131,7 +131,7 @@ def test_corners_of_a_hull_are_where_the_hull_says() -> None:
     points = np.random.default_rng(2).normal(size=(12, 3), scale=0.02)
     hull = hull_of(points)
     backend = MujocoBackend()
-    backend.build(default_scene(TriFingerStructure(("stone",), hulls=(("stone", hull),))))
+    backend.build(trifinger(("stone",), hulls=(("stone", hull),)).default_scene())
     model = backend.realization.model
     shape = model.geom("stone").id
     rotation = np.empty(9)
@@ -144,8 +144,8 @@ def test_corners_of_a_hull_are_where_the_hull_says() -> None:
 
 def test_obstacles_cost_few_pairs() -> None:
     """An obstacle can meet the blocks and nine shapes of the robot, and nothing else."""
-    alone = compiled(TriFingerStructure(("a", "b")))
-    with_two = compiled(TriFingerStructure(("a", "b"), obstacles=("wall", "post")))
+    alone = compiled(trifinger(("a", "b")))
+    with_two = compiled(trifinger(("a", "b"), obstacles=("wall", "post")))
     assert with_two.npair - alone.npair == 2 * (2 + 9)
 
 
@@ -204,7 +204,7 @@ def test_fingertips_are_where_kinematics_says(backend: MujocoBackend) -> None:
 def test_nothing_intersects_in_the_published_poses() -> None:
     """Neither the rest pose nor the raised pose makes fingers touch."""
     for pose in (hardware.REST, hardware.RAISED):
-        scene = default_scene(TriFingerStructure())
+        scene = trifinger().default_scene()
         scene.state.joint_positions[:] = pose
         backend = MujocoBackend()
         backend.build(scene)

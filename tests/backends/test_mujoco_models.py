@@ -27,7 +27,7 @@ from scm_world.models import (
     Parameters,
     Scene,
 )
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 
 Floats = NDArray[np.float64]
 SUBSTEPS = 3
@@ -325,7 +325,7 @@ def test_building_forgets(name: str) -> None:
     backend.apply(Difference(parameters=others(model, scene.parameters)))
     backend.build(scene)
     assert np.array_equal(play(backend, 10), expected)
-    backend.build(default_scene(TriFingerStructure(("block",))))
+    backend.build(trifinger(("block",)).default_scene())
     backend.build(scene)
     assert np.array_equal(play(backend, 10), expected)
 
@@ -486,7 +486,7 @@ def test_unknown_names_are_errors_that_list_names() -> None:
     with pytest.raises(UnknownOption, match="controls"):
         backend.step(ControlMode.JOINT_TORQUES, np.zeros(2), 1)
     robot = make_backend("mujoco")
-    robot.build(default_scene(TriFingerStructure()))
+    robot.build(trifinger().default_scene())
     with pytest.raises(UnknownOption, match="joint_positions, joint_torques"):
         robot.step(ControlMode.CONTROLS, np.zeros(9), 1)
     with pytest.raises(EngineFailure, match=r"call build\(\) first"):

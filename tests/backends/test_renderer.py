@@ -26,7 +26,7 @@ from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
 from scm_world.tasks.trifinger.kinematics import forward, link_frames
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 
 TOP = Camera("top", eye=(0.0, 0.0, 0.25), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
 """Below the robot's hub, looking down."""
@@ -47,7 +47,7 @@ def goal(
 @pytest.fixture
 def scene() -> Scene:
     """One red block in the middle of the table."""
-    return default_scene(TriFingerStructure(blocks=("tool_block",)))
+    return trifinger(blocks=("tool_block",)).default_scene()
 
 
 def painted(scene: Scene, body: str, color: tuple[float, float, float]) -> Scene:
@@ -228,7 +228,7 @@ def test_sphere_is_round(scene: Scene) -> None:
 def test_shadow_lies_on_the_floor(scene: Scene) -> None:
     """A floating block darkens the floor beside it; without the block there is light."""
     scene.state.positions[0] = (0.05, 0.05, 0.05)
-    dark, light = render(scene, TOP), render(default_scene(TriFingerStructure()), TOP)
+    dark, light = render(scene, TOP), render(trifinger().default_scene(), TOP)
     floor = dark.shows("floor") & light.shows("floor")
 
     darker = dark.rgb.astype(int).sum(axis=2) < light.rgb.astype(int).sum(axis=2) - 20
@@ -293,7 +293,7 @@ def test_unknown_body_is_refused(scene: Scene) -> None:
 def test_many_blocks(scene: Scene) -> None:
     """Each block has its own number."""
     names = tuple(f"tool_{i}" for i in range(3))
-    image = render(default_scene(TriFingerStructure(blocks=names)), OVERVIEW)
+    image = render(trifinger(blocks=names).default_scene(), OVERVIEW)
 
     assert all(image.shows(name).any() for name in names)
 
@@ -340,9 +340,9 @@ SNIPPET = """
 import hashlib
 from dataclasses import replace
 from scm_world.backends.renderer import render
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.tasks.trifinger.cameras import OVERVIEW
-image = render(default_scene(TriFingerStructure(blocks=("tool_block",))), OVERVIEW)
+image = render(trifinger(blocks=("tool_block",)).default_scene(), OVERVIEW)
 print(hashlib.sha256(image.rgb.tobytes() + image.depth.tobytes()).hexdigest())
 """
 

@@ -18,7 +18,7 @@ from scm_world.tasks.trifinger import drawing, hardware
 from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
 from scm_world.tasks.trifinger.drawing import MOUNT, link_meshes
 from scm_world.tasks.trifinger.kinematics import link_frames
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 
 TOP = Camera("top", eye=(0.0, 0.0, 0.25), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
 SMALL = replace(OVERVIEW, width=160, height=120)
@@ -33,7 +33,7 @@ def scene_with(
 ) -> Scene:
     """Hold up one block, a box or a hull, in red."""
     hulls = () if hull is None else (("tool_block", hull),)
-    scene = default_scene(TriFingerStructure(blocks=("tool_block",), hulls=hulls))
+    scene = trifinger(blocks=("tool_block",), hulls=hulls).default_scene()
     scene.state.positions[0] = position
     scene.state.orientations[0] = TURN
     if hull is not None:
@@ -43,7 +43,7 @@ def scene_with(
 
 def with_obstacle(**properties: Floats) -> Scene:
     """Stand an obstacle, and one block, into the arena."""
-    scene = default_scene(TriFingerStructure(blocks=("tool_block",), obstacles=("barrier",)))
+    scene = trifinger(blocks=("tool_block",), obstacles=("barrier",)).default_scene()
     changes = {("barrier", name): np.asarray(value) for name, value in properties.items()}
     return scene.with_(parameters={**scene.parameters, **changes})
 
@@ -77,12 +77,12 @@ def test_obstacle_looks_like_a_block(*, turned: bool) -> None:
     """A box looks the same, shadow included, whether it can move or not."""
     position, color = np.array([0.05, 0.02, 0.08]), np.array([0.2, 0.5, 0.9])
     orientation = TURN if turned else np.array([0.0, 0.0, 0.0, 1.0])
-    block = default_scene(TriFingerStructure(blocks=("it",)))
+    block = trifinger(blocks=("it",)).default_scene()
     block.state.positions[0], block.state.orientations[0] = position, orientation
     block = block.with_(
         parameters={**block.parameters, ("it", "size"): SIZE, ("it", "color"): color}
     )
-    still = default_scene(TriFingerStructure(obstacles=("it",)))
+    still = trifinger(obstacles=("it",)).default_scene()
     pose = {("it", "position"): position, ("it", "orientation"): orientation}
     look = {("it", "size"): SIZE, ("it", "color"): color}
     still = still.with_(parameters={**still.parameters, **pose, **look})
@@ -121,7 +121,7 @@ def test_box_as_a_hull_looks_like_a_box(camera: Camera) -> None:
 
 def test_box_goal_as_a_hull_looks_like_a_box_goal() -> None:
     """Silhouettes of hulls are as translucent, and have the same edges."""
-    empty = default_scene(TriFingerStructure())
+    empty = trifinger().default_scene()
     box, hull = (empty.with_(goals=(it,)) for it in (goal("box"), goal("hull", box_hull(SIZE))))
 
     assert differing(box, empty) > 500
@@ -165,9 +165,9 @@ def test_hulls_and_boxes_side_by_side() -> None:
     stone = hull_of(0.03 * ball / np.linalg.norm(ball, axis=1, keepdims=True))
     names = ("first", "second", "third")
     hulls = (("first", TETRAHEDRON), ("third", stone))
-    scene = default_scene(TriFingerStructure(blocks=names, hulls=hulls))
+    scene = trifinger(blocks=names, hulls=hulls).default_scene()
     image = render(scene, TOP)
-    alone = default_scene(TriFingerStructure(blocks=names[:1], hulls=(("first", stone),)))
+    alone = trifinger(blocks=names[:1], hulls=(("first", stone),)).default_scene()
     alone.state.positions[:] = scene.state.positions[2]
 
     assert all(image.shows(name).any() for name in names)
@@ -182,7 +182,7 @@ def test_block_beneath_the_floor_is_hidden() -> None:
 def test_shadows_fall_away_from_the_light() -> None:
     """The floor is darker on the side of a block that is turned away from the light."""
     lit, dark = [], []
-    empty = default_scene(TriFingerStructure())
+    empty = trifinger().default_scene()
     for direction in ((1.0, 0.0, 1.0), (-1.0, 0.0, 1.0)):
         light = Light(direction=direction)
         scene = scene_with(position=(0.0, 0.0, 0.06)).with_(light=light)
@@ -207,7 +207,7 @@ def test_length_of_the_direction_does_not_matter() -> None:
 def test_default_light_is_the_published_look() -> None:
     """Without a word about light, surfaces turned away from it keep 30 % of their color."""
     below = Light(direction=(0.0, 0.0, -1.0))
-    scene = default_scene(TriFingerStructure()).with_(light=below)
+    scene = trifinger().default_scene().with_(light=below)
     image = render(scene, TOP)
     floor = image.rgb[image.shows("floor")]
 
@@ -258,7 +258,7 @@ def test_a_turned_hull_turns_in_the_picture() -> None:
 def test_fingers_cover_the_pixels_whose_rays_pass_them(camera: Camera) -> None:
     """The robot is seen where a ray comes closer to the axis of a capsule than its radius."""
     camera = replace(camera, width=80, height=60)
-    scene = default_scene(TriFingerStructure())
+    scene = trifinger().default_scene()
     image = render(scene, camera)
     frames = link_frames(scene.state.joint_positions, hardware.NOMINAL_HEIGHT)
     step = 2.0 * np.tan(np.radians(camera.field_of_view) / 2.0) / 60

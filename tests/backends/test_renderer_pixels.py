@@ -28,7 +28,7 @@ from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger.cameras import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW
 from scm_world.tasks.trifinger.hardware import JOINT_LOW
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 
 
 def pixels(
@@ -47,7 +47,7 @@ def pixels(
     return out
 
 
-STRUCTURE = TriFingerStructure(
+STRUCTURE = trifinger(
     blocks=("tool_block", "stone"),
     obstacles=("barrier",),
     hulls=(("stone", box_hull([0.05, 0.03, 0.04])),),
@@ -57,7 +57,7 @@ STRUCTURE = TriFingerStructure(
 @pytest.fixture
 def scene() -> Scene:
     """A box, a hull, an obstacle that can be seen, and a goal."""
-    scene = default_scene(STRUCTURE)
+    scene = STRUCTURE.default_scene()
     barrier = {"size": [0.1, 0.02, 0.05], "position": [0.0, -0.08, 0.025], "color": [1, 1, 0]}
     changes = {("barrier", name): np.array(value, float) for name, value in barrier.items()}
     green, upright = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0])
@@ -69,10 +69,10 @@ def scene() -> Scene:
 
 def parked(scene: Scene, *, obstacles: bool = True) -> Scene:
     """Leave the goals and the obstacles, and a robot at the lower limits of its joints."""
-    state = PhysicalState(0)
+    state = trifinger().empty_state()
     state.joint_positions[:] = JOINT_LOW
     kept = scene.structure.obstacles if obstacles else ()
-    return scene.with_(state=state, structure=TriFingerStructure(obstacles=kept))
+    return scene.with_(state=state, structure=trifinger(obstacles=kept))
 
 
 def now(scene: Scene) -> np.ndarray:
@@ -285,10 +285,10 @@ def test_scene_is_left_alone(scene: Scene) -> None:
 SNIPPET = """
 import hashlib, numpy
 from scm_world.backends.renderer import now_pixels
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.tasks.trifinger.cameras import CAMERAS
 pixels = numpy.empty((3, 3, 128, 128), numpy.uint8)
-now_pixels(default_scene(TriFingerStructure(("a", "b"))), CAMERAS, pixels)
+now_pixels(trifinger(("a", "b")).default_scene(), CAMERAS, pixels)
 print(hashlib.sha256(pixels.tobytes()).hexdigest())
 """
 
@@ -296,7 +296,7 @@ print(hashlib.sha256(pixels.tobytes()).hexdigest())
 def test_pixels_are_equal_between_processes() -> None:
     """Another process sees the same pixels, bit for bit."""
     ours = np.empty((3, 3, 128, 128), np.uint8)
-    now_pixels(default_scene(TriFingerStructure(("a", "b"))), CAMERAS, ours)
+    now_pixels(trifinger(("a", "b")).default_scene(), CAMERAS, ours)
     theirs = subprocess.run(  # noqa: S603 (our own interpreter and our own program)
         [sys.executable, "-c", SNIPPET], capture_output=True, text=True, check=True
     )

@@ -26,7 +26,7 @@ from scm_world.errors import (
     WrongShape,
 )
 from scm_world.models.scene import ControlMode, Difference, State
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 
 CONTROLS = ControlMode.CONTROLS
 DT = 0.05
@@ -187,7 +187,7 @@ def test_another_process_computes_the_same_bits(tmp_path: Path) -> None:
 def test_a_snapshot_of_another_engine_is_refused() -> None:
     """The fake's snapshot cannot be restored here."""
     fake = make_backend("fake")
-    fake.build(default_scene(TriFingerStructure()))
+    fake.build(trifinger().default_scene())
     with pytest.raises(SnapshotMismatch, match="fake 1"):
         built(MODELS["scalar"]).restore(fake.snapshot())
 
@@ -407,7 +407,7 @@ def test_what_does_not_exist_is_refused() -> None:
 def test_only_step_functions_are_realised() -> None:
     """The name "step" is known, and a robot is refused with a remedy."""
     with pytest.raises(ModelError, match="choose 'mujoco' or 'bullet'"):
-        make_backend("step").build(default_scene(TriFingerStructure()))
+        make_backend("step").build(trifinger().default_scene())
 
 
 def test_another_structure_carries_over_what_it_has_too() -> None:

@@ -36,7 +36,7 @@ from scm_world.errors import EngineError, ModelError, UnknownOption
 from scm_world.models import GoalRegion, Model, Scene
 from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 
 XML = """
 <mujoco model="everything">
@@ -235,7 +235,7 @@ def test_named_cameras_and_their_errors(scene: Scene) -> None:
     with pytest.raises(UnknownOption, match=r"'frnt'.*automatic, front, flat, rider"):
         scene_camera(scene, "frnt")
     with pytest.raises(UnknownOption, match=r"there are: overview, 60, 120, 300"):
-        picture(default_scene(TriFingerStructure()), "fron")
+        picture(trifinger().default_scene(), "fron")
 
 
 def test_the_size_of_a_picture(scene: Scene) -> None:
@@ -266,7 +266,7 @@ def test_one_camera_for_two_scenes(scene: Scene) -> None:
 
 def test_the_trifinger_looks_as_published() -> None:
     """Its pictures are those of ``render``, from the overview, and its renderer is ours."""
-    scene = default_scene(TriFingerStructure(blocks=("tool_block",)))
+    scene = trifinger(blocks=("tool_block",)).default_scene()
 
     whole = render(scene, OVERVIEW, published=True).rgb
     np.testing.assert_array_equal(picture(scene), whole)

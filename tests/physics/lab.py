@@ -12,7 +12,7 @@ from scm_world.models import ControlMode, Difference
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import PRECISE, Preset
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+from scm_world.tasks.trifinger.system import trifinger
 
 ENGINES = [
     name
@@ -42,7 +42,7 @@ class Lab:
         """Build a scene with blocks ``tool_block``, ``block_1``, … at positions (n, 3) [m]."""
         positions = np.atleast_2d(positions)
         names = ("tool_block", *(f"block_{i}" for i in range(1, len(positions))))
-        scene = default_scene(TriFingerStructure(names, preset=self.preset))
+        scene = trifinger(names, preset=self.preset).default_scene()
         changed = {key: np.asarray(value, dtype=float) for key, value in parameters.items()}
         changed["robot", "height"] = np.asarray(height)
         scene.state.positions[:] = positions

@@ -10,12 +10,7 @@ from scm_world.geometry.hulls import box_hull
 from scm_world.models import Difference, Scene, diff
 from scm_world.models.scene import complete
 from scm_world.tasks.trifinger.hardware import PRECISE, ControllerSpec
-from scm_world.tasks.trifinger.structure import (
-    TriFingerStructure,
-    controller_spec,
-    default_scene,
-    parameter_keys,
-)
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.scenes import busy_scene, other_value
 
 
@@ -32,12 +27,12 @@ def test_what_stays_keeps_everything() -> None:
     blocks = ("new", *now.structure.blocks)
     more = replace(now.structure, blocks=blocks, obstacles=("wall", "ledge"))
     change = complete(now, more, Difference(structure=more))
-    assert set(change.parameters) == set(parameter_keys(more))
+    assert set(change.parameters) == set((row.key for row in more.parameters))
     for key, value in now.parameters.items():
         assert np.array_equal(change.parameters[key], value)
     assert change.state is not None
     assert np.array_equal(change.state.blocks[1:], now.state.blocks)
-    default = default_scene(more).parameters
+    default = more.default_scene().parameters
     assert np.array_equal(change.parameters["wall", "position"], default["wall", "position"])
 
 
@@ -75,7 +70,7 @@ def test_what_is_said_counts() -> None:
 
 def test_default_parameters_specify_the_published_controller() -> None:
     """The controller of the default parameters is the default one, and it follows them."""
-    parameters = dict(default_scene(TriFingerStructure()).parameters)
+    parameters = dict(trifinger().default_scene().parameters)
     assert controller_spec(parameters) == ControllerSpec()
     parameters["controller", "torque_limit"] = np.array(0.2)
     parameters["controller", "velocity_gains"] = np.array([0.3, 0.2, 0.1])

@@ -14,12 +14,7 @@ from scm_world.models import Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.feasibility import overlaps
 from scm_world.tasks.trifinger.kinematics import inverse, link_frames
-from scm_world.tasks.trifinger.structure import (
-    WALL_HEIGHT,
-    WALL_RADIUS,
-    TriFingerStructure,
-    default_scene,
-)
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.scenes import octahedron
 
 TOLERANCE = 1e-4  # [m]
@@ -28,7 +23,7 @@ CUBE = 0.065  # [m]
 
 def _scene(*positions: ArrayLike) -> Scene:
     """Put default cubes, named a, b, …, at the given positions."""
-    scene = default_scene(TriFingerStructure(blocks=tuple("abcdefgh"[: len(positions)])))
+    scene = trifinger(blocks=tuple("abcdefgh"[: len(positions)])).default_scene()
     for block, position in zip(scene.state.positions, positions, strict=True):
         block[:] = position
     return scene
@@ -131,7 +126,7 @@ def test_the_deepest_shape_of_a_link_counts() -> None:
 @pytest.mark.parametrize("height", [0.30, 0.34, 0.38])
 def test_the_robot_alone_is_feasible(joints: tuple[float, ...], height: float) -> None:
     """Neither published pose is reported by itself, at any height the robot may have."""
-    scene = default_scene(TriFingerStructure())
+    scene = trifinger().default_scene()
     scene.state.joint_positions[:] = joints
     raised = {**scene.parameters, ("robot", "height"): np.array(height)}
     assert overlaps(scene.with_(parameters=raised), tolerance=0.0) == ()
@@ -139,7 +134,7 @@ def test_the_robot_alone_is_feasible(joints: tuple[float, ...], height: float) -
 
 def test_poses_near_rest_are_reported_only_where_a_finger_reaches_the_ring() -> None:
     """Within 0.35 rad of rest nothing but a lower link that is truly beyond the ring is found."""
-    rng, scene, reported = np.random.default_rng(0), default_scene(TriFingerStructure()), 0
+    rng, scene, reported = np.random.default_rng(0), trifinger().default_scene(), 0
     reach = WALL_RADIUS - hardware.COLLISION["tip"].radius
     for _ in range(500):
         joints = hardware.REST + rng.uniform(-0.35, 0.35, 9)
@@ -156,7 +151,7 @@ def test_poses_near_rest_are_reported_only_where_a_finger_reaches_the_ring() -> 
 
 def test_a_finger_in_the_floor_is_reported() -> None:
     """A finger stretched downwards from a low base is in the floor with its lower link."""
-    scene = default_scene(TriFingerStructure())
+    scene = trifinger().default_scene()
     scene.state.joint_positions[:3] = 0.0
     low = {**scene.parameters, ("robot", "height"): np.array(0.2)}
     depth = _found(scene.with_(parameters=low))["robot_finger_60_link_3", "floor"]
@@ -166,7 +161,7 @@ def test_a_finger_in_the_floor_is_reported() -> None:
 
 def test_fingers_in_one_another_are_reported() -> None:
     """Fingers that all reach for the middle are in one another, each pair of links once."""
-    scene = default_scene(TriFingerStructure())
+    scene = trifinger().default_scene()
     middle = np.tile([0.0, 0.0, 0.1], 3)
     solution = inverse(middle, hardware.NOMINAL_HEIGHT, near=hardware.REST)
     scene.state.joint_positions[:] = solution.joint_positions
@@ -206,7 +201,7 @@ def _with_wall(scene: Scene, size: ArrayLike, position: ArrayLike, yaw: float = 
         "orientation": from_rotation_vector([0.0, 0.0, yaw]),
     }
     structure = replace(scene.structure, obstacles=("wall",))
-    parameters = dict(default_scene(structure).parameters)
+    parameters = dict(structure.default_scene().parameters)
     parameters |= {("wall", name): value for name, value in values.items()}
     return scene.with_(structure=structure, parameters=parameters)
 
@@ -233,7 +228,7 @@ def test_size_and_orientation_of_an_obstacle_count() -> None:
 
 def test_a_finger_in_an_obstacle_is_reported() -> None:
     """Middle and lower links are compared with obstacles, upper ones are not."""
-    scene = default_scene(TriFingerStructure())
+    scene = trifinger().default_scene()
     origins, _ = link_frames(scene.state.joint_positions, hardware.NOMINAL_HEIGHT)
     at_tip = _with_wall(scene, [0.01] * 3, origins[4])
     assert set(_found(at_tip)) == {("robot_finger_60_link_3", "wall")}
@@ -244,17 +239,17 @@ def test_a_finger_in_an_obstacle_is_reported() -> None:
 
 def test_obstacles_may_stand_anywhere() -> None:
     """What cannot move may reach through the floor, the ring and other obstacles."""
-    structure = TriFingerStructure(obstacles=("wall", "post"))
-    parameters = dict(default_scene(structure).parameters)
+    structure = trifinger(obstacles=("wall", "post"))
+    parameters = dict(structure.default_scene().parameters)
     for name in structure.obstacles:
         parameters[name, "size"] = np.array([1.0, 1.0, 0.02])
         parameters[name, "position"] = np.zeros(3)
-    assert not _found(default_scene(structure).with_(parameters=parameters))
+    assert not _found(structure.default_scene().with_(parameters=parameters))
 
 
 def _stone(hull: Hull, position: ArrayLike) -> Scene:
     """Put a hull named a somewhere."""
-    scene = default_scene(TriFingerStructure(("a", "b"), hulls=(("a", hull),)))
+    scene = trifinger(("a", "b"), hulls=(("a", hull),)).default_scene()
     scene.state.positions[0], scene.state.positions[1] = position, (0.0, 0.15, CUBE / 2)
     return scene
 

@@ -159,9 +159,9 @@ def render(
         ModelError: The structure says nothing about shapes.
 
     Example:
-        >>> from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+        >>> from scm_world.tasks.trifinger.system import trifinger
         >>> from scm_world.tasks.trifinger.cameras import OVERVIEW
-        >>> picture = render(default_scene(TriFingerStructure(blocks=("tool_block",))), OVERVIEW)
+        >>> picture = render(trifinger(blocks=("tool_block",)).default_scene(), OVERVIEW)
         >>> picture.rgb.shape, bool(picture.shows("tool_block").any())
         ((480, 640, 3), True)
     """
@@ -208,8 +208,8 @@ def picture(
         ValueError: ``samples`` is not positive, or the camera has no optical axis.
 
     Example:
-        >>> from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
-        >>> picture(default_scene(TriFingerStructure()), size=(60, 80)).shape
+        >>> from scm_world.tasks.trifinger.system import trifinger
+        >>> picture(trifinger().default_scene(), size=(60, 80)).shape
         (60, 80, 3)
     """
     if samples < 1:
@@ -422,10 +422,10 @@ def now_pixels(
         ValueError: ``out`` has another shape or another dtype.
 
     Example:
-        >>> from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+        >>> from scm_world.tasks.trifinger.system import trifinger
         >>> from scm_world.tasks.trifinger.cameras import CAMERAS
         >>> out = np.empty((3, 3, 128, 128), dtype=np.uint8)
-        >>> now_pixels(default_scene(TriFingerStructure(blocks=("tool_block",))), CAMERAS, out)
+        >>> now_pixels(trifinger(blocks=("tool_block",)).default_scene(), CAMERAS, out)
         >>> out[0, :, 127, 64].tolist()  # the floor
         [74, 65, 60]
     """

@@ -195,7 +195,7 @@ class Robot(Entity):
         """Put together what moves, under the names of the whole robot."""
         parts = [list(self._quantities(joints)) for joints in self._joints]
         for index, whole in enumerate(Robot(self.action_mode, self._start).states()):
-            states = [quantities[index].declare({}) for quantities in parts]
+            states = [quantities[index].declare((), {}) for quantities in parts]
             fields = {"bounds": whole.bounds, "a": whole.a, "b": whole.b, "doc": whole.doc}
             yield bundle(whole.name, states, **fields)
 
