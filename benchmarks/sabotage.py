@@ -135,7 +135,7 @@ class Sabotaged(BackendWrapper):
         """Hold a command, and do something wrong before or after it."""
         if self.before is not None:
             command = self.before(self, np.array(command), self.memory)
-        self.engine.step(mode, command, substeps)
+        self.engine.step(command, substeps)
         if self.after is not None:
             state = self.engine.state()
             old = state.vector.copy()

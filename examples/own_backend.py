@@ -11,7 +11,6 @@ import numpy as np
 from scm_world import World
 from scm_world.backends import BackendWrapper, make_backend, register
 from scm_world.evaluation import evaluate
-from scm_world.models.scene import ControlMode
 
 AHEAD = 0.02  # [rad] that a command is ahead of the joints, at most
 
@@ -25,12 +24,11 @@ class SlowMotors(BackendWrapper):
     def __init__(self) -> None:
         super().__init__(make_backend("mujoco"))
 
-    def step(self, mode: ControlMode, command: np.ndarray, substeps: int) -> None:
+    def step(self, command: np.ndarray, substeps: int) -> None:
         """Hold a command for some physics steps."""
-        if mode is ControlMode.JOINT_POSITIONS:
-            joints = self.state().joint_positions
-            command = np.clip(command, joints - AHEAD, joints + AHEAD)
-        super().step(mode, command, substeps)
+        joints = self.state()["joint_positions"]
+        command = np.clip(command, joints - AHEAD, joints + AHEAD)
+        super().step(command, substeps)
 
 
 def main(episodes: str = "4", length: str = "250") -> None:

@@ -77,8 +77,8 @@ def actions(steps: int, worlds: int | None = None) -> NDArray[np.float32]:
 def bare(env: ScmWorldEnv) -> Callable[[NDArray[np.float64]], None]:
     """Give the engine's own step of the scene of an environment: a command, and nothing else."""
     world = env.world
-    mode, substeps, engine = world.composition.mode, world._substeps, world.backend
-    return lambda command: engine.step(mode, command, substeps)
+    substeps, engine = world.substeps, world.backend
+    return lambda command: engine.step(command, substeps)
 
 
 def commands(env: ScmWorldEnv, given: NDArray[np.float32]) -> list[NDArray[np.float64]]:

@@ -16,7 +16,6 @@ import numpy as np
 from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption, WrongShape
 from scm_world.models.scene import (
-    ControlMode,
     Difference,
     ParameterKey,
     Parameters,
@@ -137,11 +136,10 @@ class Backend(ABC):
         """Write the present state into an existing vector, without allocating."""
 
     @abstractmethod
-    def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
+    def step(self, command: Floats, substeps: int) -> None:
         """Hold a command for some physics steps.
 
         Args:
-            mode: What the command means.
             command: Shape (structure.n_commands,).
             substeps: How many steps of ``structure.timestep``.
         """
@@ -215,14 +213,11 @@ class EngineBatch(ABC):
     may_refuse: ClassVar[bool] = False
 
     @abstractmethod
-    def step(
-        self, which: Integers, mode: ControlMode, commands: Floats, substeps: int, into: Floats
-    ) -> None:
+    def step(self, which: Integers, commands: Floats, substeps: int, into: Floats) -> None:
         """Hold commands for some physics steps.
 
         Args:
             which: Numbers of the scenes that are stepped, ascending, shape (m,).
-            mode: What a command means.
             commands: One for each scene, in the first columns of its row, shape (n, at least
                 n_commands).
             substeps: How many steps of ``structure.timestep``.
@@ -246,9 +241,7 @@ class OneByOne(EngineBatch):
     def __init__(self, backends: Sequence[Backend]) -> None:
         self._backends = tuple(backends)
 
-    def step(
-        self, which: Integers, mode: ControlMode, commands: Floats, substeps: int, into: Floats
-    ) -> None:
+    def step(self, which: Integers, commands: Floats, substeps: int, into: Floats) -> None:
         """Step the scenes one after another.
 
         Raises:
@@ -259,7 +252,7 @@ class OneByOne(EngineBatch):
             backend = self._backends[index]
             structure = backend.structure
             try:
-                backend.step(mode, commands[index, : structure.n_commands], substeps)
+                backend.step(commands[index, : structure.n_commands], substeps)
             except EngineFailure as error:
                 said = f"scene {index} of the batch: {error}"
                 failed = failed or EngineFailure(said, error.engine)
@@ -321,9 +314,9 @@ class BackendWrapper(Backend, ABC):
         """Write the present state into an existing vector."""
         self.engine.read(into)
 
-    def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
+    def step(self, command: Floats, substeps: int) -> None:
         """Hold a command for some physics steps."""
-        self.engine.step(mode, command, substeps)
+        self.engine.step(command, substeps)
 
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step."""

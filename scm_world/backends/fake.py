@@ -9,7 +9,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.backends.base import Capabilities, InMemory
 from scm_world.errors import EngineFailure
-from scm_world.models.scene import ControlMode, State
+from scm_world.models.scene import State
 
 
 @final
@@ -17,8 +17,8 @@ class FakeBackend(InMemory):
     """No forces and no contacts: nothing moves.
 
     A structure can say otherwise. Its ``realization("fake")`` has three functions:
-    ``move(structure, state, command, seconds)`` and ``settle(state)``, which change a state in place,
-    and ``inertia(structure, parameters, body)``.
+    ``move(structure, state, command, seconds)`` and ``settle(state)``, which change a state in
+    place, and ``inertia(structure, parameters, body)``.
     """
 
     name: ClassVar[str] = "fake"
@@ -37,7 +37,7 @@ class FakeBackend(InMemory):
         self._check([(body, "inertia")])
         return self._parameters[body, "inertia"].copy()
 
-    def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
+    def step(self, command: Floats, substeps: int) -> None:
         """Advance time.
 
         Raises:
@@ -45,9 +45,7 @@ class FakeBackend(InMemory):
         """
         custom = self._structure.realization("fake")
         if custom is not None:
-            custom.move(
-                self._structure, self._state, command, substeps * self._structure.timestep
-            )
+            custom.move(self._structure, self._state, command, substeps * self._structure.timestep)
         if not np.isfinite(self._state.vector).all():
             raise EngineFailure("a number is not finite", self.name)
 

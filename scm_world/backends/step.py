@@ -14,7 +14,7 @@ from scm_world._types import Floats, Integers, Value
 from scm_world.backends.base import Backend, Capabilities, EngineBatch, InMemory
 from scm_world.errors import EngineFailure, ModelError, UnknownOption
 from scm_world.models.model import Numbers
-from scm_world.models.scene import ControlMode, ParameterKey, Parameters, Scene, State, StateLayout
+from scm_world.models.scene import ParameterKey, Parameters, Scene, State, StateLayout
 
 
 @final
@@ -290,15 +290,13 @@ class StepFunction(InMemory):
         """
         raise UnknownOption("body", body, ("nothing: a step function has no bodies",))
 
-    def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
+    def step(self, command: Floats, substeps: int) -> None:
         """Hold a command, which is the action and the noise, for some steps.
 
         Raises:
-            UnknownOption: The mode is not ``controls``.
             EngineFailure: See ``StepModel.advance``; or the function gives two answers to one
                 question, which is tried in the first step. The state is as before.
         """
-        _require_controls(mode)
         parameters, states, commands = self.numbers[None], self._state.vector[None], command[None]
         if self._asked is not self._structure:
             asked = (self._structure.advance(parameters, states, commands) for _ in range(2))
@@ -343,9 +341,7 @@ class StepBatch(EngineBatch):
         self._backends: tuple[Any, ...] = tuple(backends)
         self._compared: set[tuple[StepModel, int]] = set()
 
-    def step(
-        self, which: Integers, mode: ControlMode, commands: Floats, substeps: int, into: Floats
-    ) -> None:
+    def step(self, which: Integers, commands: Floats, substeps: int, into: Floats) -> None:
         """Hold commands for some steps.
 
         A vectorised function that fails is asked for each system alone, to find out which fail.
@@ -354,7 +350,6 @@ class StepBatch(EngineBatch):
             EngineFailure: As in ``StepFunction.step``; or a row of a vectorised function depends
                 on how many there are, which is asked once for every number of rows.
         """
-        _require_controls(mode)
         failed: EngineFailure | None = None
         unmoved: list[int] = []
         together: dict[StepModel, list[int]] = {}
@@ -373,7 +368,7 @@ class StepBatch(EngineBatch):
                     unmoved += rows if refused else ()
             for row, member in zip(rows, members, strict=True) if alone else ():
                 try:
-                    member.step(mode, commands[row, : model.n_commands], substeps)
+                    member.step(commands[row, : model.n_commands], substeps)
                 except EngineFailure as error:
                     said = f"scene {row} of the batch: {error}"
                     failed = failed or EngineFailure(said, error.engine)
@@ -411,8 +406,3 @@ class StepBatch(EngineBatch):
         for member, vector in zip(members, states, strict=True):
             member.vector[:] = vector
         return None
-
-
-def _require_controls(mode: ControlMode) -> None:
-    if mode is not ControlMode.CONTROLS:
-        raise UnknownOption("mode of a step function", str(mode), (str(ControlMode.CONTROLS),))

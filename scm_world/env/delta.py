@@ -126,7 +126,7 @@ class Delta:
             return measured
         now, state = world.current()
         if world.action_mode == JOINTS and self.is_set():
-            found: Floats = state["joint_positions"]
+            found: Floats = world.compiled.view("joint_positions", state)
             return found
         return np.concatenate([np.ravel(now[name]) for name in world.compiled.actions])
 

@@ -2,7 +2,6 @@
 
 from scm_world.models.model import Input, Model, Parameter, Readout, Row, StateRow
 from scm_world.models.scene import (
-    ControlMode,
     Difference,
     GoalRegion,
     Light,
@@ -17,7 +16,6 @@ from scm_world.models.scene import (
 )
 
 __all__ = [
-    "ControlMode",
     "Difference",
     "GoalRegion",
     "Input",

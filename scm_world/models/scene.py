@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from functools import cached_property
 from typing import Any, Protocol, Self, final
 
@@ -121,14 +120,6 @@ REVERSED = "the upper end comes first; give the lower end first"
 def reversed_ranges(parameters: Mapping[ParameterKey, Any]) -> list[ParameterKey]:
     """List the ranges whose lower end is above the upper one."""
     return [key for key, ends in parameters.items() if key[1] in RANGES and ends[0] > ends[1]]
-
-
-class ControlMode(StrEnum):
-    """What the numbers of a command mean."""
-
-    JOINT_POSITIONS = "joint_positions"
-    JOINT_TORQUES = "joint_torques"
-    CONTROLS = "controls"
 
 
 class Structure(Protocol):

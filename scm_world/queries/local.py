@@ -17,7 +17,6 @@ import networkx as nx
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import ContactPoint
 from scm_world.errors import UnknownOption
-from scm_world.models import ControlMode
 from scm_world.world import Simulation
 
 __all__ = ["local_graph"]
@@ -206,10 +205,10 @@ class _Listener:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._backend, name)
 
-    def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
+    def step(self, command: Floats, substeps: int) -> None:
         """Hold a command for some physics steps."""
         for _ in range(substeps):
-            self._backend.step(mode, command, 1)
+            self._backend.step(command, 1)
             self.contacts.append(self._backend.contacts())
 
 

@@ -15,7 +15,6 @@ from scm_world.geometry.hulls import Hull
 from scm_world.geometry.scalars import scalar
 from scm_world.graph import NoiseKey
 from scm_world.models import (
-    ControlMode,
     GoalRegion,
     Light,
     ParameterKey,
@@ -190,7 +189,6 @@ class Composition(ABC):
         obstacles: Names of the obstacles.
         hulls: The blocks that are no boxes.
         solid: Whether ``overlaps`` tells which bodies are in one place.
-        mode: What a command means.
         commands: What turns an action into a command; None where they are the same.
     """
 
@@ -199,7 +197,6 @@ class Composition(ABC):
     obstacles: tuple[str, ...] = ()
     hulls: tuple[tuple[str, Hull], ...] = ()
     solid: bool = False
-    mode: ControlMode = ControlMode.CONTROLS
     commands: Commands | None = None
 
     @abstractmethod

@@ -13,6 +13,7 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,14 +21,14 @@ import pytest
 from scm_world._types import Floats
 from scm_world.backends.base import Backend
 from scm_world.errors import EngineFailure
-from scm_world.models.scene import ControlMode, Difference, Parameters, Scene
+from scm_world.models.scene import Difference, Parameters, Scene
 from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.hardware import controller_spec
 from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.effects import EffectConformance
 from scm_world.testing.parameters import ParameterConformance
 from scm_world.testing.scenes import (
-    MODES,
     SEED,
     SUBSTEPS,
     apart_scene,
@@ -61,7 +62,7 @@ class BackendConformance(
         """A used backend that is built again behaves like a new one."""
         other = {key: other_value(key, value) for key, value in scene.parameters.items()}
         backend.apply(Difference(parameters=other))
-        play(backend, 3, mode=ControlMode.JOINT_TORQUES)
+        play(backend, 3, torques=True)
         backend.build(scene)
         again = play(backend, 20)
         backend.build(trifinger(("other",), preset=self.preset).default_scene())
@@ -108,25 +109,26 @@ class BackendConformance(
             for _ in range(20):
                 command = np.array(hardware.REST) + generator.uniform(-0.3, 0.3, 9)
                 for backend, rows in zip((first, second), turns, strict=True):
-                    backend.step(ControlMode.JOINT_POSITIONS, command, SUBSTEPS)
+                    backend.step(command, SUBSTEPS)
                     rows.append(backend.state().vector)
             assert same(np.array(turns[0]), alone[0])
             assert same(np.array(turns[1]), alone[1])
 
-    @pytest.mark.parametrize("mode", MODES)
-    def test_the_control_law(self, backend: Backend, scene: Scene, mode: ControlMode) -> None:
+    @pytest.mark.parametrize("torques", [False, True])
+    def test_the_control_law(self, backend: Backend, scene: Scene, torques: bool) -> None:
         """The torque of one physics step is the specified function of the state before it."""
         if not backend.capabilities.physics:
             return
-        self.check_control_law(backend, mode, scene.parameters)
+        system: Any = scene.structure
+        scene = system.with_(torques=torques).default_scene()
+        backend.build(scene)
+        self.check_control_law(backend, torques, scene.parameters)
         keys = [key for key in scene.parameters if key[0] == "controller"]
         other = {key: other_value(key, scene.parameters[key]) for key in keys}
         backend.apply(Difference(parameters=other))
-        self.check_control_law(backend, mode, other)
+        self.check_control_law(backend, torques, other)
 
-    def check_control_law(
-        self, backend: Backend, mode: ControlMode, parameters: Parameters
-    ) -> None:
+    def check_control_law(self, backend: Backend, torques: bool, parameters: Parameters) -> None:
         """Compare many single steps with the law that these parameters specify."""
         generator = np.random.default_rng(5)
         spec = controller_spec(parameters)
@@ -135,13 +137,15 @@ class BackendConformance(
             state = backend.state()
             state.joint_positions[:] = hardware.REST + generator.uniform(-0.5, 0.5, 9)
             state.joint_velocities[:] = generator.normal(size=9, scale=3.0)
-            state.positions[:, 2] = 2.0 + np.arange(state.n_blocks)
+            state.positions[:, 2] = 2.0 + np.arange(len(state.blocks))
             command = state.joint_positions + generator.uniform(-0.1, 0.1, 9)
-            if mode is ControlMode.JOINT_TORQUES:
+            if torques:
                 command = generator.uniform(-0.5, 0.5, 9)
-            expected = spec.torques(mode, command, state.joint_positions, state.joint_velocities)
+            expected = spec.torques(
+                command, state.joint_positions, state.joint_velocities, direct=torques
+            )
             backend.apply(Difference(state=state))
-            backend.step(mode, command, 1)
+            backend.step(command, 1)
             applied = backend.state().joint_torques
             np.testing.assert_allclose(applied, expected, rtol=0, atol=1e-12)
             saturated += int((np.abs(expected) == spec.limit).sum())
@@ -149,14 +153,12 @@ class BackendConformance(
 
     def test_contacts_carry_the_weight(self, scene: Scene) -> None:
         """A resting block touches the floor only, and the forces add up to its weight."""
-        with self.built(
-            trifinger(("block",), preset=self.preset).default_scene()
-        ) as backend:
+        with self.built(trifinger(("block",), preset=self.preset).default_scene()) as backend:
             if not backend.capabilities.physics:
                 assert backend.contacts() == ()
                 return
             for _ in range(40):
-                backend.step(ControlMode.JOINT_POSITIONS, np.array(hardware.REST), SUBSTEPS)
+                backend.step(np.array(hardware.REST), SUBSTEPS)
             contacts = backend.contacts()
         assert {frozenset(contact.bodies) for contact in contacts} == {
             frozenset(("floor", "block"))
@@ -174,7 +176,7 @@ class BackendConformance(
         known = {*structure.blocks, *hardware.LINK_NAMES, *structure.obstacles, "floor", "stage"}
         seen: set[str] = set()
         for _ in range(300):
-            backend.step(ControlMode.JOINT_POSITIONS, np.array(hardware.REST), 1)
+            backend.step(np.array(hardware.REST), 1)
             for contact in backend.contacts():
                 seen |= set(contact.bodies)
                 assert np.linalg.norm(contact.normal) == pytest.approx(1.0)

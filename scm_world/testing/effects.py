@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import Backend
 from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
-from scm_world.models.scene import ControlMode, ParameterKey, Scene
+from scm_world.models.scene import ParameterKey, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import forward, inverse
 from scm_world.tasks.trifinger.system import trifinger
@@ -25,9 +26,7 @@ Values = Mapping[ParameterKey, Floats]
 class EffectConformance(Suite):
     """Sentences about what acts, and in which direction. They are empty without physics."""
 
-    def arranged(
-        self, structure: Any, values: Values, position: ArrayLike = ()
-    ) -> Scene:
+    def arranged(self, structure: Any, values: Values, position: ArrayLike = ()) -> Scene:
         """Put one block somewhere, with some parameters."""
         scene = structure.default_scene()
         if structure.blocks:
@@ -41,7 +40,7 @@ class EffectConformance(Suite):
         backend.build(scene)
         rows = []
         for _ in range(round(seconds / self.preset.timestep)):
-            backend.step(ControlMode.JOINT_POSITIONS, np.array(command, dtype=float), 1)
+            backend.step(np.array(command, dtype=float), 1)
             rows.append(backend.state().vector)
         return np.array(rows)
 
@@ -113,9 +112,7 @@ class EffectConformance(Suite):
         for friction in (0.0002, 0.001, 0.01):
             smooth = {("floor", "friction"): np.array(0.01)}
             values = {**FAR_UP, **smooth, ("world", "spinning_friction"): np.array(friction)}
-            scene = self.arranged(
-                trifinger(("block",), self.preset), values, [0.0, 0.0, HALF]
-            )
+            scene = self.arranged(trifinger(("block",), self.preset), values, [0.0, 0.0, HALF])
             scene.state.angular_velocities[0] = [0.0, 0.0, 8.0]
             speeds.append(self.watched(backend, scene, 0.2)[-1, 39])
         assert speeds[0] > speeds[1] + 0.5
@@ -157,10 +154,10 @@ class EffectConformance(Suite):
         for damping in (0.0, 0.01, 0.03):
             damped = {("robot", "joint_damping"): np.array(damping)}
             values = {**FAR_UP, **damped, ("world", "gravity"): np.zeros(3)}
-            scene = self.arranged(trifinger((), self.preset), values)
+            scene = self.arranged(trifinger((), self.preset, torques=True), values)
             scene.state.joint_velocities[:] = 1.0
             backend.build(scene)
-            backend.step(ControlMode.JOINT_TORQUES, np.zeros(9), round(0.1 / self.preset.timestep))
+            backend.step(np.zeros(9), round(0.1 / self.preset.timestep))
             moved.append(np.abs(backend.state().joint_positions - hardware.REST).sum())
         assert moved[1] < 0.97 * moved[0]
         assert moved[2] < 0.9 * moved[1]
@@ -170,17 +167,13 @@ class EffectConformance(Suite):
         if not backend.capabilities.physics:
             return
         limit = {("controller", "torque_limit"): np.array(0.1)}
-        scene = self.arranged(trifinger((), self.preset), {**FAR_UP, **limit})
         reach = np.tile([-1.0, 0.5, 0.9], 3)
-        commands = {
-            ControlMode.JOINT_TORQUES: reach,
-            ControlMode.JOINT_POSITIONS: hardware.REST + reach,
-        }
-        for mode, command in commands.items():
-            backend.build(scene)
+        for direct, command in ((True, reach), (False, hardware.REST + reach)):
+            system = trifinger((), self.preset, torques=direct)
+            backend.build(self.arranged(system, {**FAR_UP, **limit}))
             torques = []
             for _ in range(20):
-                backend.step(mode, command, 1)
+                backend.step(command, 1)
                 torques.append(backend.state().joint_torques.copy())
             np.testing.assert_allclose(np.abs(torques[0]), 0.1, rtol=1e-12)
             assert np.abs(torques).max() <= 0.1 * (1.0 + 1e-12)

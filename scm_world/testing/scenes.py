@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import product
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -17,14 +17,13 @@ from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import Backend, EngineSnapshot
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import from_rotation_vector, quaternion_product
-from scm_world.models.scene import ControlMode, Difference, ParameterKey, Parameters, Scene
+from scm_world.models.scene import Difference, ParameterKey, Parameters, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import FAST, PRECISE, Preset
 from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.tasks.trifinger.system import trifinger
 
 SUBSTEPS = 10
-MODES = (ControlMode.JOINT_POSITIONS, ControlMode.JOINT_TORQUES)
 LONG = 250  # control steps
 
 SEED = 20_26
@@ -95,20 +94,23 @@ def play(
     steps: int,
     *,
     seed: int = SEED,
-    mode: ControlMode = ControlMode.JOINT_POSITIONS,
+    torques: bool = False,
 ) -> Floats:
-    """Give random commands near the rest pose.
+    """Give random commands near the rest pose, or random torques.
 
     Returns:
         The state after each control step, shape (steps, 27 + 13 n).
     """
     generator = np.random.default_rng(seed)
-    center = np.array(hardware.REST) if mode is ControlMode.JOINT_POSITIONS else np.zeros(9)
+    structure: Any = backend.structure
+    if structure.torques is not torques:
+        backend.apply(Difference(structure.with_(torques=torques)))
+    center = np.zeros(9) if torques else np.array(hardware.REST)
     state = backend.state()
     states = np.empty((steps, state.vector.size))
     for row in states:
         command = center + generator.uniform(-0.3, 0.3, 9)
-        backend.step(mode, command, SUBSTEPS)
+        backend.step(command, SUBSTEPS)
         backend.read(state.with_vector(row))
     return states
 
@@ -138,7 +140,9 @@ def other_value(key: ParameterKey, value: Floats) -> Floats:
             return quaternion_product(from_rotation_vector([0.05, -0.03, 0.1]), value)
         case "size":
             return np.asarray(value * np.array([0.8, 0.9, 0.7]))
-        case name if name in CONTROLLER:
+        case name if name in {
+            key[1] for key in trifinger().default_parameters() if key[0] == "controller"
+        }:
             return np.asarray(value * 1.2)  # with less of them, fingers reach farther
         case _:
             return np.asarray(value * 0.7)

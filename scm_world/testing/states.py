@@ -5,13 +5,14 @@ from __future__ import annotations
 import pickle
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from scm_world.backends.base import Backend, EngineSnapshot
 from scm_world.errors import SnapshotMismatch
-from scm_world.models.scene import ControlMode, Difference, Scene
+from scm_world.models.scene import Difference, Scene
 from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.scenes import (
     Suite,
@@ -64,7 +65,7 @@ class StateConformance(Suite):
 
     def test_orientations_stay_unit_quaternions(self, backend: Backend) -> None:
         """Orientations have length one and w >= 0 at every instant."""
-        states = play(backend, 60, mode=ControlMode.JOINT_TORQUES)
+        states = play(backend, 60, torques=True)
         for vector in states:
             orientations = backend.state().with_vector(vector).orientations
             np.testing.assert_allclose(np.linalg.norm(orientations, axis=1), 1.0, atol=1e-9)
@@ -72,7 +73,7 @@ class StateConformance(Suite):
 
     def test_a_new_block_moves_nothing(self, backend: Backend, scene: Scene) -> None:
         """When a block comes, the others keep their state and their parameters."""
-        more = replace(scene.structure, blocks=(*scene.structure.blocks, "new"))
+        more = scene.structure.with_(blocks=(*scene.structure.blocks, "new"))
         backend.apply(Difference(parameters={("near", "mass"): np.array(0.05)}))
         before = backend.state()
         backend.apply(Difference(structure=more))
@@ -87,7 +88,7 @@ class StateConformance(Suite):
         other = {key: other_value(key, value) for key, value in scene.parameters.items()}
         backend.apply(Difference(parameters=other))
         before = backend.state()
-        more = replace(scene.structure, obstacles=("new", "ledge"))
+        more = scene.structure.with_(obstacles=("new", "ledge"))
         for structure in (more, replace(more, preset=another(self.preset))):
             backend.apply(Difference(structure=structure))
             check_parameters(backend.parameters(other), other)
@@ -96,14 +97,14 @@ class StateConformance(Suite):
     def structures(self, scene: Scene) -> Iterator[Any]:
         """List what can become of the busy scene: blocks, obstacles, shapes, settings."""
         whole = scene.structure
-        yield replace(whole, blocks=(*whole.blocks, "new"))
+        yield whole.with_(blocks=(*whole.blocks, "new"))
         yield trifinger(("sliding", "near"), self.preset)
         yield trifinger((), self.preset)
-        yield replace(whole, obstacles=())
-        yield replace(whole, obstacles=("new", *whole.obstacles))
-        yield replace(whole, hulls=())
-        yield replace(whole, hulls=(*whole.hulls, ("near", octahedron(0.04, 0.05, 0.03))))
-        yield replace(whole, preset=another(self.preset))
+        yield whole.with_(obstacles=())
+        yield whole.with_(obstacles=("new", *whole.obstacles))
+        yield whole.with_(hulls=())
+        yield whole.with_(hulls=(*whole.hulls, ("near", octahedron(0.04, 0.05, 0.03))))
+        yield whole.with_(preset=another(self.preset))
 
     def test_bodies_that_come_and_go_leave_no_trace(self, backend: Backend, scene: Scene) -> None:
         """Changing the structure in any way and taking it back has exactly no effect."""
@@ -125,7 +126,7 @@ class StateConformance(Suite):
         *_, (_, state) = changed_states(backend.state())
         backend.apply(Difference(state=state))
         yield backend.snapshot()
-        play(backend, 3, mode=ControlMode.JOINT_TORQUES)
+        play(backend, 3, torques=True)
         yield backend.snapshot()
         backend.apply(Difference(structure=trifinger(("near", "new"), preset=self.preset)))
         yield backend.snapshot()

@@ -13,13 +13,12 @@ import pytest
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, EngineBatch, EngineSnapshot
 from scm_world.errors import EngineFailure
-from scm_world.models.scene import ControlMode, Difference, Scene
+from scm_world.models.scene import Difference, Scene
 from scm_world.tasks.trifinger.hardware import REST
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, PhysicalState
 from scm_world.testing.scenes import SUBSTEPS, Suite, other_value
 
 COUNT = 4
-MODE = ControlMode.JOINT_POSITIONS
 
 
 class TogetherConformance(Suite):
@@ -45,10 +44,9 @@ class TogetherConformance(Suite):
         into = _table(many)
         for step, commands in enumerate(_commands(8)):
             which = np.arange(COUNT) if step % 3 else np.array([0, 2])
-            mode = MODE if step < 6 else ControlMode.JOINT_TORQUES
-            batch.step(which, mode, commands, SUBSTEPS, into)
+            batch.step(which, commands, SUBSTEPS, into)
             for index in which.tolist():
-                alone[index].step(mode, commands[index], SUBSTEPS)
+                alone[index].step(commands[index], SUBSTEPS)
                 vector = alone[index].state().vector
                 np.testing.assert_array_equal(into[index, : vector.size], vector)
 
@@ -61,9 +59,9 @@ class TogetherConformance(Suite):
         into = _table(many)
         saved = [(one.snapshot(), other.snapshot()) for one, other in zip(alone, many, strict=True)]
         for step, commands in enumerate(_commands(8)):
-            batch.step(np.arange(COUNT), MODE, commands, SUBSTEPS, into)
+            batch.step(np.arange(COUNT), commands, SUBSTEPS, into)
             for index in range(COUNT):
-                alone[index].step(MODE, commands[index], SUBSTEPS)
+                alone[index].step(commands[index], SUBSTEPS)
             for backend, start in ((alone[1], saved[1][0]), (many[1], saved[1][1])):
                 _meddle(backend, step, start)
             for one, other in zip(alone, many, strict=True):
@@ -85,9 +83,9 @@ class TogetherConformance(Suite):
             if step in changes:
                 alone[2].apply(Difference(structure=changes[step]))
                 many[2].apply(Difference(structure=changes[step]))
-            batch.step(np.arange(COUNT), MODE, commands, SUBSTEPS, into)
+            batch.step(np.arange(COUNT), commands, SUBSTEPS, into)
             for index in range(COUNT):
-                alone[index].step(MODE, commands[index], SUBSTEPS)
+                alone[index].step(commands[index], SUBSTEPS)
                 vector = alone[index].state().vector
                 np.testing.assert_array_equal(into[index, : vector.size], vector)
 
@@ -109,7 +107,7 @@ class TogetherConformance(Suite):
 
 def _explode(batch: EngineBatch, many: list[Backend], state: PhysicalState) -> None:
     many[1].apply(Difference(state=state))
-    batch.step(np.arange(COUNT), MODE, next(_commands(1)), SUBSTEPS, _table(many))
+    batch.step(np.arange(COUNT), next(_commands(1)), SUBSTEPS, _table(many))
 
 
 def _other(scene: Scene, number: int) -> Scene:
@@ -141,6 +139,6 @@ def _meddle(backend: Backend, step: int, start: EngineSnapshot) -> None:
             state.positions[0, 2] += 0.01
             backend.apply(Difference(state=state))
         case 2:
-            backend.step(MODE, np.array(REST), SUBSTEPS)
+            backend.step(np.array(REST), SUBSTEPS)
         case _:
             backend.restore(start)

@@ -165,9 +165,9 @@ class Batch:
                 commands[row] = self.world(row).decided(commands[row])
         groups = self._grouped(rows)
         failed: EngineFailure | None = None
-        for (table, mode, substeps), members in groups:
+        for (table, substeps), members in groups:
             try:
-                self._step(table, mode, substeps, members, commands)
+                self._step(table, substeps, members, commands)
             except EngineFailure as error:
                 failed = failed or error
         if failed is not None:
@@ -176,9 +176,7 @@ class Batch:
             table.compiled.mechanisms.evaluate(table.names, table.matrix, members)
             self._fresh[members] = True
 
-    def _step(
-        self, table: StateTable, mode: Any, substeps: int, rows: Integers, commands: Floats
-    ) -> None:
+    def _step(self, table: StateTable, substeps: int, rows: Integers, commands: Floats) -> None:
         matrix, mechanisms = table.matrix, table.compiled.mechanisms
         if not self._translating:
             self._commands[rows] = commands[rows]
@@ -194,7 +192,7 @@ class Batch:
         self._fresh[rows] = False
         self._stepped[rows] = self._ready[rows] = True
         try:
-            self._engine.step(rows, mode, self._commands, substeps, matrix)
+            self._engine.step(rows, self._commands, substeps, matrix)
         except BaseException as error:  # or Ctrl-C: the others were stepped
             unmoved = error.unmoved if isinstance(error, EngineFailure) else ()
             for place, row in enumerate(rows.tolist()):
@@ -210,7 +208,7 @@ class Batch:
             return [(self._groups[0][0], rows)] if len(rows) else []
         found: dict[tuple[Any, ...], list[int]] = {}
         for row in rows.tolist():
-            found.setdefault(self._kinds[row] or (self.table(row), None, 0), []).append(row)
+            found.setdefault(self._kinds[row] or (self.table(row), 0), []).append(row)
         return [(kind, np.array(members)) for kind, members in found.items()]
 
     def _take(self, row: int) -> None:
@@ -220,7 +218,7 @@ class Batch:
         world.evaluate(table.names)
         if world.numbers.base is not table.matrix:
             world.move(table.matrix[row : row + 1])
-        kind = (table, *world.pace)
+        kind = (table, world.substeps)
         if self._kinds[row] != kind:
             self._kinds[row] = kind
             alike = all(other == kind for other in self._kinds)

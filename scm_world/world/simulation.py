@@ -27,7 +27,7 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.models import ControlMode, Difference, Parameters, Scene, State
+from scm_world.models import Difference, Parameters, Scene, State
 from scm_world.models.camera import Camera
 from scm_world.tasks import Task
 from scm_world.variables import Draw, Intervention, Mechanism, Subset
@@ -327,7 +327,7 @@ class Simulation(WorldAttributes):
         values.action[:] = command
         try:
             sent = self.command(command, self._index)
-            self.backend.step(self.composition.mode, sent, self._substeps)
+            self.backend.step(sent, self._substeps)
         except EngineFailure as error:
             left = self.compiled.empty_state()
             self.backend.read(left)
@@ -377,9 +377,9 @@ class Simulation(WorldAttributes):
         return commands.command(action, values.now, values.state.vector, self.noise_key(index))
 
     @property
-    def pace(self) -> tuple[ControlMode, int]:
-        """The control mode of the backend, and the physics steps of a command."""
-        return self.composition.mode, self._substeps
+    def substeps(self) -> int:
+        """The physics steps of a command."""
+        return self._substeps
 
     @property
     def holds_action(self) -> bool:

@@ -122,8 +122,8 @@ def _unpickled(content: bytes, checksum: bytes) -> WorldSnapshot:
 
 
 def reference(structure: Any) -> str | None:
-    """Say which model something is, if it is one."""
-    return structure.digest if isinstance(structure, Model | StepModel) else None
+    """Return the digest of a model, if it is one that cannot be made again from a few names."""
+    return structure.digest if type(structure) in (Model, StepModel) else None
 
 
 class _Pickler(pickle.Pickler):

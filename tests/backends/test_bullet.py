@@ -18,7 +18,7 @@ from scm_world._types import Floats
 from scm_world.backends.base import Backend
 from scm_world.backends.bullet import BulletBackend
 from scm_world.errors import EngineFailure, SnapshotMismatch
-from scm_world.models import ControlMode, Difference, Scene
+from scm_world.models import Difference, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import inverse
 from scm_world.tasks.trifinger.system import trifinger
@@ -28,7 +28,6 @@ pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="needs pybullet"
 )
 
-POSITIONS = ControlMode.JOINT_POSITIONS
 LONG = 250  # control steps
 
 
@@ -112,7 +111,7 @@ def test_a_canonical_world_equals_a_new_one(
     blocks, command = ("block",) if touching == "block" else (), TOUCHES[touching]
     scene = trifinger(blocks).default_scene()
     backend.build(scene)
-    backend.step(POSITIONS, command, 400)
+    backend.step(command, 400)
     assert fingers_touch(backend, touching)
     target = scene.with_(state=backend.state())  # in the very contact that must be forgotten
 
@@ -120,7 +119,7 @@ def test_a_canonical_world_equals_a_new_one(
         backend.build(trifinger(("other", "another")).default_scene())
         play(backend, 1)
     if way == "apply":
-        backend.step(POSITIONS, command, 1)
+        backend.step(command, 1)
         backend.apply(Difference(state=target.state))
     else:
         backend.build(target)
@@ -144,7 +143,7 @@ def held(command: Floats) -> Callable[[Backend], Floats]:
     def go(backend: Backend) -> Floats:
         rows = []
         for _ in range(20):
-            backend.step(POSITIONS, command, 10)
+            backend.step(command, 10)
             rows.append(backend.state().vector)
         return np.concatenate([np.array(rows), play(backend, 20)])
 
@@ -267,15 +266,12 @@ def test_a_snapshot_of_another_version_is_refused(backend: BulletBackend) -> Non
 # --- the engine is asked once and told once -------------------------------------------------------
 
 
-@pytest.mark.parametrize("mode", [POSITIONS, ControlMode.JOINT_TORQUES])
-def test_one_query_and_one_torque_call_per_physics_step(
-    backend: BulletBackend, mode: ControlMode
-) -> None:
+def test_one_query_and_one_torque_call_per_physics_step(backend: BulletBackend) -> None:
     """A physics step costs three engine calls."""
     watched = watch(backend)
     backend.build(busy_scene())
     watched.calls.clear()
-    backend.step(mode, np.zeros(9), 10)
+    backend.step(np.zeros(9), 10)
     assert watched.calls == {
         "getJointStates": 10,
         "setJointMotorControlArray": 10,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from scm_world.backends.bullet import BulletBackend
 from scm_world.errors import EngineFailure
 from scm_world.geometry.hulls import Hull, box_hull
 from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
-from scm_world.models import ControlMode, Difference, Scene
+from scm_world.models import Difference, Scene
 from scm_world.models.scene import ParameterKey
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.state import PhysicalState
@@ -42,7 +41,7 @@ def backend() -> Iterator[BulletBackend]:
 
 def rest(backend: Backend, substeps: int) -> None:
     """Hold the rest pose."""
-    backend.step(ControlMode.JOINT_POSITIONS, np.array(hardware.REST), substeps)
+    backend.step(np.array(hardware.REST), substeps)
 
 
 def fresh(scene: Scene, after: Callable[[Backend], Floats]) -> Floats:
@@ -138,7 +137,7 @@ def test_obstacles_come_and_go(backend: BulletBackend) -> None:
     expected = play(backend, 50)
     for obstacles in ((), ("other", "wall"), ("wall", "other"), ("other",)):
         backend.restore(start)
-        backend.apply(Difference(structure=replace(scene.structure, obstacles=obstacles)))
+        backend.apply(Difference(structure=scene.structure.with_(obstacles=obstacles)))
         backend.apply(Difference(scene.structure, scene.parameters, now))
         np.testing.assert_array_equal(play(backend, 50), expected)
 
@@ -209,7 +208,7 @@ def test_a_block_changes_its_shape_and_back(backend: BulletBackend) -> None:
     expected = play(backend, 50)
     for hulls in ((), (("stone", HULLS["needle"]),), (("near", HULLS["cube"]),)):
         backend.restore(start)
-        backend.apply(Difference(structure=replace(scene.structure, hulls=hulls)))
+        backend.apply(Difference(structure=scene.structure.with_(hulls=hulls)))
         play(backend, 2)
         backend.apply(Difference(scene.structure, scene.parameters, now))
         again = play(backend, 50)

@@ -26,7 +26,7 @@ from scm_world.backends.bullet.model.support import (
 )
 from scm_world.backends.mujoco.reading import compiled, permutation
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
-from scm_world.models import ControlMode, Difference, Model, Parameter, Scene
+from scm_world.models import Difference, Model, Parameter, Scene
 from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.backend import busy_scene
 from scm_world.testing.backend import play as play_robot
@@ -36,7 +36,6 @@ pytestmark = pytest.mark.skipif(
 )
 
 Floats = NDArray[np.float64]
-CONTROLS = ControlMode.CONTROLS
 ENGINES = ("mujoco", "bullet")
 
 FILES = {
@@ -152,7 +151,7 @@ def play(backend: Backend, steps: int, *, seed: int = 0, substeps: int = 3) -> F
     generator, rows = np.random.default_rng(seed), []
     for _ in range(steps):
         command = generator.uniform(-1.0, 1.0, backend.structure.n_commands)
-        backend.step(CONTROLS, command, substeps)
+        backend.step(command, substeps)
         rows.append(backend.state().vector)
     return np.array(rows)
 
@@ -200,7 +199,7 @@ def saved(mj: mujoco.MjModel) -> bytes:
 
 def placed(backend: BulletBackend, model: Model, data: mujoco.MjData) -> Any:
     """Put a model into MuJoCo's state, with contacts switched off; return the client."""
-    state, places = model.empty_state(), permutation(compiled(model))
+    state, places = model.empty_state(), permutation(model)
     state.vector[places.positions] = data.qpos
     state.vector[places.velocities] = data.qvel
     backend.build(model.default_scene().with_(state=state))
@@ -220,12 +219,12 @@ def placed(backend: BulletBackend, model: Model, data: mujoco.MjData) -> Any:
 def test_one_step_is_that_of_mujoco(backend: BulletBackend, name: str) -> None:
     """Joints, springs, dampers and actuators of all kinds accelerate as in MuJoCo."""
     model = described(name)
-    velocities = permutation(compiled(model)).velocities
+    velocities = permutation(model).velocities
     for seed in range(3):
         mj, data = moved(model, seed)
         before, h = data.qvel.copy(), mj.opt.timestep
         placed(backend, model, data)
-        backend.step(CONTROLS, data.ctrl, 1)
+        backend.step(data.ctrl, 1)
         mujoco.mj_step(mj, data)
         expected = (data.qvel - before) / h
         found = (backend.state().vector[velocities] - before) / h
@@ -334,7 +333,7 @@ def test_free_fall(engine: str) -> None:
     scene.state["ball.linear_velocity"][:] = [1.0, 2.0, 3.0]
     scene.state["ball.angular_velocity"][:] = [4.0, 5.0, 6.0]
     backend.build(scene)
-    backend.step(CONTROLS, np.zeros(model.n_commands), n)
+    backend.step(np.zeros(model.n_commands), n)
     after = backend.state()
     height = 9.0 + 3.0 * n * h - 9.81 * h * h * n * (n + 1) / 2
     np.testing.assert_allclose(
@@ -351,12 +350,12 @@ def test_a_sliding_box(engine: str, floor: float, box: float) -> None:
     """It slides v²/(2µg) far within 2 %, with the larger of two coefficients."""
     backend, model = make_backend(engine), read_model(SLIDER.format(floor=floor, box=box))
     backend.build(model.default_scene())
-    backend.step(CONTROLS, np.zeros(0), 100)
+    backend.step(np.zeros(0), 100)
     state = backend.state()
     state["box.linear_velocity"][:] = [2.0, 0.0, 0.0]
     start = state["box.cartesian_position"][0]
     backend.apply(Difference(state=state))
-    backend.step(CONTROLS, np.zeros(0), 600)
+    backend.step(np.zeros(0), 600)
     distance = backend.state()["box.cartesian_position"][0] - start
     assert distance == pytest.approx(2.0**2 / (2 * max(floor, box) * 9.81), rel=0.02)
     backend.close()
@@ -367,7 +366,7 @@ def test_contacts_carry_the_weight(backend: BulletBackend) -> None:
     model = read_model(SLIDER.format(floor=0.5, box=0.5))
     backend.build(model.default_scene())
     assert backend.contacts() == ()
-    backend.step(CONTROLS, np.zeros(0), 300)
+    backend.step(np.zeros(0), 300)
     contacts = backend.contacts()
     assert {frozenset(contact.bodies) for contact in contacts} == {frozenset({"world", "box"})}
     assert sum(contact.force for contact in contacts) == pytest.approx(9.81, rel=0.01)
@@ -405,10 +404,10 @@ def test_a_size_is_rebuilt_into_the_body(backend: BulletBackend) -> None:
     size = model.default_parameters()["box", "size"]
     taller = {("box", "size"): size + np.array([0.0, 0.0, 0.15])}
     backend.apply(Difference(parameters=taller, state=state))
-    backend.step(CONTROLS, np.zeros(0), 300)
+    backend.step(np.zeros(0), 300)
     assert backend.state()["box.cartesian_position"][2] == pytest.approx(0.2, abs=1e-3)
     backend.apply(Difference(parameters={("box", "size"): size}))
-    backend.step(CONTROLS, np.zeros(0), 300)
+    backend.step(np.zeros(0), 300)
     assert backend.state()["box.cartesian_position"][2] == pytest.approx(0.05, abs=1e-3)
 
 
@@ -559,10 +558,10 @@ def test_a_batch_is_its_members(backend: BulletBackend) -> None:
     commands = np.random.default_rng(0).uniform(-1.0, 1.0, (2, model.n_commands + 1))
     into = np.full((2, model.layout.size + 2), np.nan)
     batch = BulletBackend.batch(members, 1)
-    batch.step(np.arange(2), CONTROLS, commands, 20, into)
+    batch.step(np.arange(2), commands, 20, into)
     for row, command in zip(into, commands, strict=True):
         backend.build(model.default_scene())
-        backend.step(CONTROLS, command[:-1], 20)
+        backend.step(command[:-1], 20)
         np.testing.assert_array_equal(row[:-2], backend.state().vector)
     for member in members:
         member.close()
@@ -651,10 +650,8 @@ def test_names_and_modes_that_do_not_exist(backend: BulletBackend) -> None:
     np.testing.assert_allclose(
         backend.inertia("box"), model.default_parameters()["box", "inertia"], rtol=1e-12
     )
-    with pytest.raises(UnknownOption, match="controls"):
-        backend.step(ControlMode.JOINT_TORQUES, np.zeros(model.n_commands), 1)
     with pytest.raises(ValueError, match="a command has 2 numbers, got 3"):
-        backend.step(CONTROLS, np.zeros(3), 1)
+        backend.step(np.zeros(3), 1)
     wrong = described("cartpole").empty_state()
     with pytest.raises(ValueError, match=f"expected a state of {model.layout.size} numbers"):
         backend.apply(Difference(state=wrong))
@@ -665,7 +662,7 @@ def test_names_and_modes_that_do_not_exist(backend: BulletBackend) -> None:
     )
     backend.build(robot)
     with pytest.raises(UnknownOption, match="joint_positions, joint_torques"):
-        backend.step(CONTROLS, np.zeros(9), 1)
+        backend.step(np.zeros(9), 1)
 
 
 def test_a_world_leaves_out_what_bullet_lacks() -> None:

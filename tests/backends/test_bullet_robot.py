@@ -14,23 +14,20 @@ import pytest
 from scm_world.backends.bullet import BulletBackend
 from scm_world.errors import EngineFailure, MissingEngine
 from scm_world.geometry.rotations import rotation_matrix
-from scm_world.models import ControlMode, Difference
+from scm_world.models import Difference
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.bullet import arena
 from scm_world.tasks.trifinger.bullet.arena import PARTS, link_index
 from scm_world.tasks.trifinger.bullet.client import compile_law
 from scm_world.tasks.trifinger.bullet.passive import MASSES, inverse_dynamics, mass_matrix
-from scm_world.tasks.trifinger.hardware import ControllerSpec
+from scm_world.tasks.trifinger.hardware import SPINNING_FRICTION, ControllerSpec
 from scm_world.tasks.trifinger.kinematics import link_frames
-from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.backend import busy_scene
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="needs pybullet"
 )
-
-POSITIONS = ControlMode.JOINT_POSITIONS
 
 
 @pytest.fixture
@@ -41,16 +38,16 @@ def backend() -> Iterator[BulletBackend]:
     backend.close()
 
 
-@pytest.mark.parametrize("mode", [POSITIONS, ControlMode.JOINT_TORQUES])
-def test_the_law_in_plain_floats_is_the_law(mode: ControlMode) -> None:
+@pytest.mark.parametrize("torques", [False, True])
+def test_the_law_in_plain_floats_is_the_law(torques: bool) -> None:
     """The torques equal those of ``ControllerSpec`` to the last bit."""
     spec = ControllerSpec()
-    law, generator = compile_law(spec, mode), np.random.default_rng(0)
+    law, generator = compile_law(spec, commanded=torques), np.random.default_rng(0)
     for _ in range(500):
         command, positions, velocities = generator.normal(size=(3, 9), scale=0.1)
         velocities *= 10
         states = list(zip(positions.tolist(), velocities.tolist(), strict=True))
-        expected = spec.torques(mode, command, positions, velocities)
+        expected = spec.torques(command, positions, velocities, direct=torques)
         assert law(states, command.tolist()) == expected.tolist()
 
 
@@ -122,7 +119,7 @@ def test_nothing_slows_a_flying_block(backend: BulletBackend) -> None:
     scene.state.angular_velocities[0] = [0.4, 0.0, 0.0]
     backend.build(scene)
     backend.apply(Difference(parameters={("world", "gravity"): np.zeros(3)}))
-    backend.step(POSITIONS, np.array(hardware.REST), 100)
+    backend.step(np.array(hardware.REST), 100)
     after = backend.state()
     np.testing.assert_array_equal(after.linear_velocities, scene.state.linear_velocities)
     np.testing.assert_allclose(after.angular_velocities, scene.state.angular_velocities, atol=1e-14)
@@ -187,7 +184,7 @@ def test_a_damped_step_is_implicit(backend: BulletBackend) -> None:
     scene.state.joint_velocities[:] = np.linspace(-3.0, 3.0, 9)
     backend.build(scene.with_(parameters={**scene.parameters, **values}))
     command = np.linspace(-0.3, 0.3, 9)
-    backend.step(ControlMode.JOINT_TORQUES, command, 1)
+    backend.step(command, 1)
     after, before = backend.state(), scene.state
     np.testing.assert_array_equal(after.joint_torques, command)
 
@@ -207,14 +204,14 @@ def test_a_damped_step_is_implicit(backend: BulletBackend) -> None:
 def test_a_driven_joint_reaches_its_final_speed(backend: BulletBackend) -> None:
     """With strong damping, the speed of a joint becomes torque over damping."""
     damping, torque = 0.5, 0.1
-    scene = trifinger().default_scene()
+    scene = trifinger(torques=True).default_scene()
     values = {
         ("robot", "joint_damping"): np.array(damping),
         ("world", "gravity"): np.zeros(3),
         ("controller", "safety_damping"): np.zeros(3),
     }
     backend.build(scene.with_(parameters={**scene.parameters, **values}))
-    backend.step(ControlMode.JOINT_TORQUES, np.full(9, torque), 125)
+    backend.step(np.full(9, torque), 125)
     np.testing.assert_allclose(backend.state().joint_velocities, torque / damping, rtol=0.02)
 
 
@@ -253,6 +250,10 @@ def test_clients_are_given_back() -> None:
 
 def test_a_backend_without_a_scene_says_so(backend: BulletBackend) -> None:
     """Using a backend before ``build``, or after ``close``, is an error with a hint."""
-    for use in (backend.snapshot, backend.contacts, lambda: backend.read(trifinger().empty_state())):
+    for use in (
+        backend.snapshot,
+        backend.contacts,
+        lambda: backend.read(trifinger().empty_state()),
+    ):
         with pytest.raises(EngineFailure, match="call build"):
             use()

@@ -9,12 +9,12 @@ import pytest
 
 from scm_world.backends import BACKENDS, EngineSnapshot, make_backend
 from scm_world.backends.mujoco import MujocoBackend, judge
+from scm_world.backends.mujoco.reading import compiled
 from scm_world.errors import MissingEngine, MixedInstallation, SnapshotMismatch, UnknownOption
 from scm_world.geometry.hulls import hull_of
-from scm_world.models import ControlMode, Difference
+from scm_world.models import Difference
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import forward
-from scm_world.tasks.trifinger.mujoco.model import compiled
 from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.backend import busy_scene, other_value, play
 
@@ -112,7 +112,7 @@ def test_the_cached_model_is_never_changed(backend: MujocoBackend) -> None:
     before = fields(cached)
     for key, value in busy_scene().parameters.items():
         backend.apply(Difference(parameters={key: other_value(key, value)}))
-    play(backend, 2, mode=ControlMode.JOINT_TORQUES)
+    play(backend, 2, torques=True)
     assert fields(cached) == before
 
 
@@ -208,5 +208,5 @@ def test_nothing_intersects_in_the_published_poses() -> None:
         scene.state.joint_positions[:] = pose
         backend = MujocoBackend()
         backend.build(scene)
-        backend.step(ControlMode.JOINT_POSITIONS, np.array(pose), 1)
+        backend.step(np.array(pose), 1)
         assert backend.contacts() == ()

@@ -19,7 +19,6 @@ from scm_world.backends.mujoco import MujocoBackend
 from scm_world.errors import EngineFailure, Infeasible, UnknownOption
 from scm_world.geometry.rotations import from_rotation_vector, quaternion_product
 from scm_world.models import (
-    ControlMode,
     Difference,
     Model,
     Parameter,
@@ -111,7 +110,7 @@ def play(backend: MujocoBackend, steps: int, *, seed: int = 0) -> Floats:
     states = np.empty((steps, state.vector.size))
     for row in states:
         command = generator.uniform(-1.0, 1.0, backend.structure.n_commands)
-        backend.step(ControlMode.CONTROLS, command, SUBSTEPS)
+        backend.step(command, SUBSTEPS)
         backend.read(state.with_vector(row))
     return states
 
@@ -375,9 +374,9 @@ def test_sixteen_together_are_sixteen_alone(name: str, threads: int) -> None:
     for step in range(12):
         which = np.arange(count) if step % 3 else np.array([0, 3, 4, 15])
         commands = generator.uniform(-1.0, 1.0, (count, model.n_commands + 1))
-        batch.step(which, ControlMode.CONTROLS, commands, 1 + step % 2, into)
+        batch.step(which, commands, 1 + step % 2, into)
         for i in which.tolist():
-            alone[i].step(ControlMode.CONTROLS, commands[i, :-1], 1 + step % 2)
+            alone[i].step(commands[i, :-1], 1 + step % 2)
             assert np.array_equal(into[i, :-2], alone[i].state().vector)
         if step == 5:
             row = rows[-1]
@@ -407,7 +406,7 @@ def test_a_lost_state_in_a_batch_is_an_error(
     many[1].apply(Difference(state=state))
     batch, into = MujocoBackend.batch(many, 2), np.zeros((3, model.layout.size))
     with pytest.raises(EngineFailure, match="scene 1 of the batch"):
-        batch.step(np.arange(3), ControlMode.CONTROLS, np.zeros((3, 6)), 2, into)
+        batch.step(np.arange(3), np.zeros((3, 6)), 2, into)
     assert into[0].any()
     assert np.array_equal(into[0], into[2])
     assert list(tmp_path.iterdir()) == []
@@ -464,7 +463,7 @@ def test_too_little_memory_is_an_error(
     batch, into = MujocoBackend.batch([backend], 1), np.zeros((1, model.layout.size))
     backend.build(model.default_scene())
     with pytest.raises(EngineFailure, match="memory"):
-        batch.step(np.arange(1), ControlMode.CONTROLS, np.zeros((1, 0)), 20, into)
+        batch.step(np.arange(1), np.zeros((1, 0)), 20, into)
     enough = read_model(CROWD.format(memory="1M"))
     backend.build(enough.default_scene())
     assert np.isfinite(play(backend, 20)).all()
@@ -483,14 +482,12 @@ def test_unknown_names_are_errors_that_list_names() -> None:
     assert changed(before, arrays(backend.realization.model)) == []
     with pytest.raises(UnknownOption, match=r"no body is named 'foot'.*box, arm, hand"):
         backend.inertia("foot")
-    with pytest.raises(UnknownOption, match="controls"):
-        backend.step(ControlMode.JOINT_TORQUES, np.zeros(2), 1)
     robot = make_backend("mujoco")
     robot.build(trifinger().default_scene())
     with pytest.raises(UnknownOption, match="joint_positions, joint_torques"):
-        robot.step(ControlMode.CONTROLS, np.zeros(9), 1)
+        robot.step(np.zeros(9), 1)
     with pytest.raises(EngineFailure, match=r"call build\(\) first"):
-        MujocoBackend().step(ControlMode.CONTROLS, np.zeros(2), 1)
+        MujocoBackend().step(np.zeros(2), 1)
 
 
 # --- reading -----------------------------------------------------------------------------------
@@ -543,9 +540,9 @@ def test_contacts_in_the_stages_of_a_step_are_listed(together: bool) -> None:
         if together:
             into = np.zeros((1, model.layout.size))
             batch = MujocoBackend.batch([backend], 1)
-            batch.step(np.arange(1), ControlMode.CONTROLS, np.zeros((1, 0)), 1, into)
+            batch.step(np.arange(1), np.zeros((1, 0)), 1, into)
         else:
-            backend.step(ControlMode.CONTROLS, np.zeros(0), 1)
+            backend.step(np.zeros(0), 1)
         after = backend.state()["ball.cartesian_position"][2]
         moved = abs(after - free) > 1e-9
         backend.apply(Difference(parameters={("ball", "mass"): np.array(1.0)}))

@@ -27,7 +27,6 @@ from scm_world.models import GoalRegion, Light, Scene
 from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger.cameras import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW
 from scm_world.tasks.trifinger.hardware import JOINT_LOW
-from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.tasks.trifinger.system import trifinger
 
 

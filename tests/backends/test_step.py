@@ -25,10 +25,9 @@ from scm_world.errors import (
     UnknownOption,
     WrongShape,
 )
-from scm_world.models.scene import ControlMode, Difference, State
+from scm_world.models.scene import Difference, State
 from scm_world.tasks.trifinger.system import trifinger
 
-CONTROLS = ControlMode.CONTROLS
 DT = 0.05
 TABLES: dict[str, Any] = {
     "parameters": (Quantity("spring.stiffness", (2,), (3.0, 5.0)), Quantity("damping", (), 0.1)),
@@ -87,7 +86,7 @@ def play(backend: Backend, steps: int, seed: int = 1) -> Floats:
     draws[:, 2] = np.rint(draws[:, 2])
     found = []
     for command in draws:
-        backend.step(CONTROLS, command, 1)
+        backend.step(command, 1)
         found.append(backend.state().vector.copy())
     return np.array(found)
 
@@ -102,7 +101,7 @@ def test_the_function_is_the_physics(model: StepModel) -> None:
     """A step does what the function says, with parameters, action and noise in their places."""
     backend = built(model)
     backend.apply(Difference(parameters={("", "damping"): np.array(0.5)}))
-    backend.step(CONTROLS, np.array([1.0, 2.0, 3.0, 0.25]), 1)
+    backend.step(np.array([1.0, 2.0, 3.0, 0.25]), 1)
     x = np.array([0.1, -0.2])
     v = DT * (np.array([1.0, 2.0]) - np.array([3.0, 5.0]) * x + 0.25)
     np.testing.assert_allclose(backend.state()["mass.velocity"], v, rtol=1e-14)
@@ -129,9 +128,9 @@ def test_substeps_hold_the_command(model: StepModel) -> None:
     """Three steps in one call are three calls with the same command."""
     once, thrice = built(model), built(model)
     command = np.array([1.0, -1.0, 1.0, 0.3])
-    once.step(CONTROLS, command, 3)
+    once.step(command, 3)
     for _ in range(3):
-        thrice.step(CONTROLS, command, 1)
+        thrice.step(command, 1)
     assert once.state() == thrice.state()
 
 
@@ -204,9 +203,9 @@ def test_a_batch_is_one_after_another(model: StepModel) -> None:
         which = np.arange(5) if step % 2 else np.array([0, 3, 4])
         commands = draws.normal(size=(5, 4))
         commands[:, 2] = step
-        batch.step(which, CONTROLS, commands, 2, into)
+        batch.step(which, commands, 2, into)
         for row in which.tolist():
-            alone[row].step(CONTROLS, commands[row], 2)
+            alone[row].step(commands[row], 2)
             np.testing.assert_array_equal(into[row, :5], alone[row].state().vector)
             assert many[row].state() == alone[row].state()
     assert np.isnan(into[:, 5:]).all()
@@ -225,7 +224,7 @@ def test_a_vectorized_function_is_called_once_for_all() -> None:
     batch = StepFunction.batch(backends, 1)
     for _ in range(3):
         calls.clear()
-        batch.step(np.arange(8), CONTROLS, np.zeros((8, 4)), 1, np.empty((8, 5)))
+        batch.step(np.arange(8), np.zeros((8, 4)), 1, np.empty((8, 5)))
     assert calls == [8]
 
 
@@ -243,7 +242,7 @@ def test_rows_that_depend_on_one_another_are_refused() -> None:
     model = StepModel("coupled", coupled, DT, **tables, vectorized=True)
     batch = StepFunction.batch([built(model) for _ in range(3)], 1)
     with pytest.raises(EngineFailure, match="other numbers among 3 rows than alone"):
-        batch.step(np.arange(3), CONTROLS, np.arange(3.0)[:, None], 1, np.empty((3, 1)))
+        batch.step(np.arange(3), np.arange(3.0)[:, None], 1, np.empty((3, 1)))
 
 
 def test_integers_stay_integers() -> None:
@@ -260,7 +259,7 @@ def test_integers_stay_integers() -> None:
     }
     for many in (False, True):
         backend = built(StepModel("grow", grow, DT, **tables, vectorized=many))
-        backend.step(CONTROLS, np.empty(0), 1)
+        backend.step(np.empty(0), 1)
         assert backend.state().vector.tolist() == [3.0, 0.0]
         assert [np.asarray(value).dtype.kind for value in seen[-1]] == list("iif")
 
@@ -352,7 +351,7 @@ def test_a_function_that_gives_no_state_is_an_error(function: Any, message: str)
     backend = built(StepModel("broken", function, DT, **tables))
     before = backend.state()
     with pytest.raises(EngineFailure, match=message) as caught:
-        backend.step(CONTROLS, np.empty(0), 1)
+        backend.step(np.empty(0), 1)
     assert caught.value.engine == "step"
     assert backend.state() == before
 
@@ -382,7 +381,7 @@ def test_a_function_of_arrays_is_held_to_the_same(function: Any, message: str) -
     states = (Quantity("x"), Quantity("y"))
     backend = built(StepModel("broken", function, DT, (), states, signature="arrays"))
     with pytest.raises(EngineFailure, match=message):
-        backend.step(CONTROLS, np.empty(0), 1)
+        backend.step(np.empty(0), 1)
     assert backend.state().vector.tolist() == [0.0, 0.0]
 
 
@@ -398,8 +397,6 @@ def test_what_does_not_exist_is_refused() -> None:
             )
         )
     assert backend.parameters([("", "damping")])["", "damping"] == 0.1
-    with pytest.raises(UnknownOption, match="controls"):
-        backend.step(ControlMode.JOINT_TORQUES, np.zeros(4), 1)
     with pytest.raises(UnknownOption, match="no bodies"):
         backend.inertia("mass")
 

@@ -55,7 +55,7 @@ def test_readouts_are_what_the_engine_computes(name: str) -> None:
     model = read_model(model_file(name), readouts=[*wanted, *(f"{s}.value" for s in sensors)])
     model = pickle.loads(pickle.dumps(model))  # noqa: S301 # our own
     mj = compiled(model)
-    data, places, rng = mujoco.MjData(mj), permutation(mj), np.random.default_rng(0)
+    data, places, rng = mujoco.MjData(mj), permutation(model), np.random.default_rng(0)
     mujoco.mj_integratePos(mj, data.qpos, rng.normal(size=mj.nv), 0.1)
     data.qvel[:] = rng.normal(size=mj.nv)
     mujoco.mj_forward(mj, data)
@@ -273,7 +273,7 @@ def test_a_sensor_has_the_value_that_mj_forward_gives_it(kinds: tuple[str, ...])
     world = World.from_mjcf(sensed(*kinds), outcomes=[f"{kind}.value" for kind in kinds])
     world.reset(seed=0)
     mj, rng = copy.copy(compiled(world.task.system)), np.random.default_rng(3)
-    places, layout = permutation(mj), world.task.system.layout
+    places, layout = permutation(world.task.system), world.task.system.layout
     seen = set()
     for _ in range(48):
         turn = rng.normal(size=4)

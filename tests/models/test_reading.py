@@ -52,7 +52,7 @@ def test_every_file_gives_complete_tables(model: Model) -> None:
         assert (default <= high).all(), row.name
         assert row.always | row.contact <= set(range(len(model.trees)))
         assert not row.always & row.contact
-    assert all(row.tree in row.always for row in model.states)
+    assert all(row.trees <= row.always for row in model.states)
     assert not any(name in dict(model.refused) for name in names)
 
 
@@ -79,7 +79,7 @@ def test_writing_and_undoing_leaves_no_trace(model: Model) -> None:
 
 def test_the_state_vector_is_a_permutation(model: Model) -> None:
     """Every number of MuJoCo's state stands in exactly one place of the vector."""
-    mj, places = compiled(model), permutation(compiled(model))
+    mj, places = compiled(model), permutation(model)
     data, start = mujoco.MjData(mj), model.empty_state().vector
     assert sorted(np.concatenate(places).tolist()) == list(range(mj.nq + mj.nv + mj.na))
     assert np.array_equal(start[places.positions], data.qpos)

@@ -113,11 +113,11 @@ class Physics:
         self.model, self.mj = model, copy.copy(compiled(model))
         self.data, self.scratch = mujoco.MjData(self.mj), mujoco.MjData(self.mj)
         self.slots = slots(compiled(model), model.default_parameters(), self.mj, self.data)
-        self.places = permutation(self.mj)
+        self.places = permutation(model)
         self.data.warning.number[:] = 1
         self.tree = np.empty(model.layout.size, dtype=int)
         for row in model.states:
-            self.tree[model.layout.slices[row.name]] = row.tree
+            self.tree[model.layout.slices[row.name]] = min(row.trees)
         self.start = np.empty(mujoco.mj_stateSize(self.mj, INTEGRATION))
         mujoco.mj_getState(self.mj, self.data, self.start, INTEGRATION)
 

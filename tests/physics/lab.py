@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from scm_world.backends import Backend
 from scm_world.backends.base import BackendWrapper
-from scm_world.models import ControlMode, Difference
+from scm_world.models import Difference
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import PRECISE, Preset
 from scm_world.tasks.trifinger.state import PhysicalState
@@ -54,7 +54,7 @@ class Lab:
     def wait(self, seconds: float) -> PhysicalState:
         """Hold the robot still for a while."""
         steps = round(seconds / self.preset.timestep)
-        self.backend.step(ControlMode.JOINT_POSITIONS, self.rest, steps)
+        self.backend.step(self.rest, steps)
         return self.backend.state()
 
     def push(self, velocity: ArrayLike) -> None:

@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 
 from scm_world.geometry.rotations import rotation_matrix
-from scm_world.models import ControlMode
 from scm_world.tasks.trifinger import hardware
 
 Floats = NDArray[np.float64]
@@ -87,7 +86,7 @@ def test_torques_and_weight_accelerate_the_fingers(lab, seed: int) -> None:
     parameters["controller", "safety_damping"] = np.zeros(3)  # it brakes within the step
     lab.place([1.0, 0.0, 0.5], parameters, joints=joints)
     torques = random.uniform(-0.2, 0.2, 9)
-    lab.backend.step(ControlMode.JOINT_TORQUES, torques, 1)
+    lab.backend.step(torques, 1)
     found = lab.backend.state().joint_velocities / lab.preset.timestep
     expected = [
         acceleration(

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scm_world.models import ControlMode
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import forward, inverse
 
@@ -50,9 +49,7 @@ def test_lift(lab, size: float, mass: float, friction: float) -> None:
             solution = inverse((1 - share) * first + share * last, HEIGHT, joints)
             assert solution.reached.all()
             joints = solution.joint_positions
-            lab.backend.step(
-                ControlMode.JOINT_POSITIONS, joints, round(PERIOD / lab.preset.timestep)
-            )
+            lab.backend.step(joints, round(PERIOD / lab.preset.timestep))
             state = lab.backend.state()
             tips = forward(state.joint_positions, HEIGHT).reshape(3, 3)
             offsets.append(state.positions[0] - tips.mean(axis=0))

@@ -271,7 +271,7 @@ class _Wearing(BackendWrapper):
     name: ClassVar[str] = "wearing"
 
     def step(self, mode: Any, command: Any, substeps: int) -> None:
-        super().step(mode, command, substeps)
+        super().step(command, substeps)
         self.apply(Difference(parameters={FLOOR: 0.99 * self.parameters([FLOOR])[FLOOR]}))
 
 

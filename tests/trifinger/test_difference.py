@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from scm_world.geometry.hulls import box_hull
 from scm_world.models import Difference, Scene, diff
 from scm_world.models.scene import complete
-from scm_world.tasks.trifinger.hardware import PRECISE, ControllerSpec
+from scm_world.tasks.trifinger.hardware import PRECISE, ControllerSpec, controller_spec
 from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.scenes import busy_scene, other_value
 
@@ -25,9 +23,9 @@ def test_what_stays_keeps_everything() -> None:
     """When blocks and obstacles come, all that was there keeps parameters and state."""
     now = changed_scene()
     blocks = ("new", *now.structure.blocks)
-    more = replace(now.structure, blocks=blocks, obstacles=("wall", "ledge"))
+    more = now.structure.with_(blocks=blocks, obstacles=("wall", "ledge"))
     change = complete(now, more, Difference(structure=more))
-    assert set(change.parameters) == set((row.key for row in more.parameters))
+    assert set(change.parameters) == {row.key for row in more.parameters}
     for key, value in now.parameters.items():
         assert np.array_equal(change.parameters[key], value)
     assert change.state is not None
@@ -39,7 +37,7 @@ def test_what_stays_keeps_everything() -> None:
 def test_a_preset_is_a_structure() -> None:
     """Another preset is a change of structure in which every parameter and the state stay."""
     now = changed_scene()
-    finer = replace(now.structure, preset=PRECISE)
+    finer = now.structure.with_(preset=PRECISE)
     difference = diff(now, now.with_(structure=finer))
     assert difference.structure == finer
     change = complete(now, finer, Difference(structure=finer))
@@ -51,7 +49,7 @@ def test_a_shape_is_a_structure() -> None:
     """A box that becomes a hull keeps its mass and its place, and loses its size."""
     now = changed_scene()
     hulls = (*now.structure.hulls, ("near", box_hull([0.03, 0.04, 0.05])))
-    shaped = replace(now.structure, hulls=hulls)
+    shaped = now.structure.with_(hulls=hulls)
     assert diff(now, now.with_(structure=shaped)).structure == shaped
     change = complete(now, shaped, Difference(structure=shaped))
     assert change.state == now.state
@@ -63,7 +61,7 @@ def test_what_is_said_counts() -> None:
     """Parameters in the difference go before those that stay and before the defaults."""
     now = changed_scene()
     said = {("ledge", "friction"): np.array(0.9), ("wall", "size"): np.array([0.1, 0.2, 0.3])}
-    more = replace(now.structure, obstacles=("ledge", "wall"))
+    more = now.structure.with_(obstacles=("ledge", "wall"))
     change = complete(now, more, Difference(more, said))
     assert all(np.array_equal(change.parameters[key], value) for key, value in said.items())
 

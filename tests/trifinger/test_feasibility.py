@@ -13,6 +13,7 @@ from scm_world.geometry.hulls import Hull, box_hull
 from scm_world.models import Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.feasibility import overlaps
+from scm_world.tasks.trifinger.hardware import WALL_HEIGHT, WALL_RADIUS
 from scm_world.tasks.trifinger.kinematics import inverse, link_frames
 from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.scenes import octahedron
@@ -200,7 +201,7 @@ def _with_wall(scene: Scene, size: ArrayLike, position: ArrayLike, yaw: float = 
         "position": np.array(position),
         "orientation": from_rotation_vector([0.0, 0.0, yaw]),
     }
-    structure = replace(scene.structure, obstacles=("wall",))
+    structure = scene.structure.with_(obstacles=("wall",))
     parameters = dict(structure.default_scene().parameters)
     parameters |= {("wall", name): value for name, value in values.items()}
     return scene.with_(structure=structure, parameters=parameters)

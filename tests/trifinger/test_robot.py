@@ -7,21 +7,25 @@ import pytest
 
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.entities.robot import ACTIONS, RESOLUTIONS, Robot
+from scm_world.tasks.trifinger.system import trifinger
 from scm_world.variables import Action, Box
+from scm_world.world import Simulation
 
 FINER = RESOLUTIONS[1:]
 
 
 @pytest.mark.parametrize("resolution", RESOLUTIONS)
 def test_the_states_fill_the_state_vector(resolution: str) -> None:
-    """Every one of the 27 numbers belongs to one state, whose shape is that of its place."""
-    robot = Robot("joint_positions", resolution=resolution)
-    places = robot.slices(-1)
-    numbers = sorted(n for where in places.values() for n in range(where.start, where.stop))
-    assert numbers == list(range(27))
-    for state in robot.states():
-        where = places[state.name]
-        assert int(np.prod(state.shape)) == where.stop - where.start
+    """Every one of the 27 numbers belongs to one declared state, whose shape is that of its row."""
+    rows = {row.name: row for row in trifinger(resolution=resolution).states}
+    assert sum(int(np.prod(row.shape)) for row in rows.values()) == 27
+    states = tuple(Robot("joint_positions", resolution=resolution).states())
+    assert {state.name: (state.shape, state.unit) for state in states} == {
+        name: (row.shape, row.unit) for name, row in rows.items()
+    }
+    assert {state.name for state in states if not state.settable} == {
+        name for name, row in rows.items() if row.reported
+    }
 
 
 @pytest.mark.parametrize("mode", ACTIONS)
@@ -30,7 +34,8 @@ def test_parts_share_what_the_whole_has(mode: str, resolution: str) -> None:
     """Bounds, spaces and starts of the parts are together those of the whole robot."""
     whole = {state.name: state for state in Robot(mode).states()}
     finer = Robot(mode, resolution=resolution)
-    places, parts = finer.slices(-1), {state.name: state for state in finer.states()}
+    places = trifinger(resolution=resolution).layout.slices
+    parts = {state.name: state for state in finer.states()}
     for number, state in enumerate(whole.values()):
         mine = {n: w for n, w in places.items() if w.start // 9 == number}
         for what in ("bounds", "a", "b"):
@@ -80,16 +85,19 @@ def test_a_tip_is_commanded_as_a_whole() -> None:
 @pytest.mark.parametrize("resolution", FINER)
 def test_fingers_act_on_one_another_by_contact_only(resolution: str) -> None:
     """What is of one finger acts always on this finger, and on no other one."""
-    robot = Robot("joint_positions", resolution=resolution)
-    for state in robot.states():
-        finger = state.name.split("_")[1].partition(".")[0]
-        own = {name for name in state.always if "finger_" in name}
-        assert own == {n for n in robot.inputs() if f"finger_{finger}" in n}
-        assert {"gravity", "position_gains", "actuator_noise"} <= set(state.always)
-        assert not {"robot_height", "finger_friction"} & set(state.always)
+    model = Simulation("reaching", resolution=resolution, backend="fake").model
+    of_fingers = {n for n in model if "finger_" in n and n != "finger_friction"}
+    for state in (n for n in of_fingers if model.declared(n).role == "state"):
+        finger = state.split("_")[1].partition(".")[0]
+        causes = {e.cause: e.when for e in model.edges if e.effect == state and e.lag == 1}
+        always = {cause for cause, when in causes.items() if when is None}
+        assert all(f"finger_{finger}" in cause for cause in always & of_fingers)
+        assert {"gravity", "position_gains", "actuator_noise"} <= always
+        assert not {"robot_height", "finger_friction"} & always
 
 
 def test_the_height_acts_always_where_tips_are_commanded() -> None:
     """The joints that bring a tip to its place depend on the height of the robot."""
-    states = Robot("end_effector_positions").states()
-    assert all("robot_height" in state.always for state in states)
+    model = Simulation("reaching", action_mode="end_effector_positions", backend="fake").model
+    edges = {e.effect: e.when for e in model.edges if e.cause == "robot_height" and e.lag == 1}
+    assert edges == dict.fromkeys(("joint_positions", "joint_velocities", "joint_torques"))

@@ -70,7 +70,7 @@ class _Interrupted:
 
     def step(self, which: Any, mode: Any, commands: Any, substeps: int, into: Any) -> None:
         """Step, and do not come to reading."""
-        self._engine.step(which, mode, commands, substeps, into.copy())
+        self._engine.step(which, commands, substeps, into.copy())
         raise KeyboardInterrupt
 
 

@@ -12,7 +12,7 @@ from worlds import actions, play, same
 from scm_world._types import Floats
 from scm_world.backends.fake import FakeBackend
 from scm_world.errors import EngineError, EngineFailure
-from scm_world.models import ControlMode, Difference, ParameterKey, Parameters
+from scm_world.models import Difference, ParameterKey, Parameters
 from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.world import Simulation
 
@@ -68,9 +68,9 @@ class Faulty(FakeBackend):  # type: ignore[misc] # final for users; a double of 
         if fault:
             into.positions[:] += 0.01
 
-    def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
+    def step(self, command: Floats, substeps: int) -> None:
         """Step, perhaps losing the state."""
-        super().step(mode, command, substeps)
+        super().step(command, substeps)
         if self.once("step"):
             self._state.positions[:] = np.nan
             raise EngineFailure("step", self.name)

@@ -26,10 +26,9 @@ from scm_world.backends.bullet.client import (
 )
 from scm_world.backends.bullet.model.client import ModelClient
 from scm_world.backends.bullet.model.support import supports
-from scm_world.errors import EngineFailure, ModelError, UnknownOption
+from scm_world.errors import EngineFailure, ModelError
 from scm_world.models.model import Model
 from scm_world.models.scene import (
-    ControlMode,
     Difference,
     ParameterKey,
     Parameters,
@@ -40,8 +39,7 @@ from scm_world.models.scene import (
 )
 
 LONG = 200  # [physics steps] from here on, saving the engine's state is cheaper than a replay
-MODES = tuple(ControlMode)
-AHEAD = 2  # numbers of each step before its command: mode and substeps
+AHEAD = 1  # numbers of each step before its command: its substeps
 
 
 @final
@@ -66,7 +64,7 @@ class History:
 
     Attributes:
         origin: The last canonical state.
-        rows: The steps: mode, substeps and command of each.
+        rows: The steps: substeps and command of each.
         edits: Changes of parameters: the length of ``rows`` at that moment, and the new values.
         substeps: How many physics steps a replay takes.
     """
@@ -83,8 +81,8 @@ class History:
         for start in range(0, len(self.rows), row):
             while edits and edits[-1][0] == start:
                 client.edit(edits.pop()[1])
-            mode, substeps, *command = self.rows[start : start + row]
-            client.stepped(MODES[int(mode)], command, int(substeps))
+            substeps, *command = self.rows[start : start + row]
+            client.stepped(command, int(substeps))
         for _, values_ in reversed(edits):
             client.edit(values_)
 
@@ -344,15 +342,12 @@ class BulletBackend(Backend):
             raise EngineFailure("Bullet produced a state that is not finite", self.name)
         into.vector[:] = numbers
 
-    def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
+    def step(self, command: Floats, substeps: int) -> None:
         """Hold a command for some physics steps.
 
         Raises:
             UnknownOption: Commands of this structure mean something else.
         """
-        modes = self._kind(self.structure).modes
-        if mode not in modes:
-            raise UnknownOption("control mode", str(mode), map(str, modes))
         numbers, size = np.asarray(command, dtype=np.float64).tolist(), self.structure.n_commands
         if len(numbers) != size:
             raise ValueError(f"a command has {size} numbers, got {len(numbers)}")
@@ -361,12 +356,12 @@ class BulletBackend(Backend):
         self._commit()
         client, history = self._last(), self._lived()
         try:
-            reported = client.stepped(mode, numbers, substeps)
+            reported = client.stepped(numbers, substeps)
         except Exception as error:
             client.close()  # torques that were not stepped would count twice
             self._base = None
             raise EngineFailure(f"Bullet could not step: {error}", self.name) from error
-        history.rows.extend((MODES.index(mode), substeps, *numbers))
+        history.rows.extend((substeps, *numbers))
         history.substeps += substeps
         self._reported, self._resting, self._saved = reported, None, None
 
@@ -421,7 +416,7 @@ class BulletBackend(Backend):
         """
         record: Record = self.opened(snapshot)
         rows, row = record.rows[: record.length], AHEAD + record.origin.structure.n_commands
-        self._history = History(record.origin, rows, list(record.edits), int(sum(rows[1::row])))
+        self._history = History(record.origin, rows, list(record.edits), int(sum(rows[::row])))
         self._before = dict(record.origin.parameters)
         for _, edit in record.edits:
             self._before.update(edit)

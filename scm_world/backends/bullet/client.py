@@ -20,7 +20,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.backends.base import ContactPoint
 from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
-from scm_world.models.scene import ControlMode, ParameterKey, Parameters, State, Structure
+from scm_world.models.scene import ParameterKey, Parameters, State, Structure
 
 Values = dict[ParameterKey, Any]
 """All parameters, or some: plain numbers, or lists of them, which is what the engine speaks.
@@ -95,7 +95,6 @@ class Client(ABC):
         generation: Counts the canonical states; a saved state is exact within one of them.
     """
 
-    modes: ClassVar[tuple[ControlMode, ...]]
     signed: ClassVar[bool] = False
 
     def __init__(self, engine: Any) -> None:
@@ -210,7 +209,7 @@ class Client(ABC):
         """
 
     @abstractmethod
-    def advance(self, mode: ControlMode, command: Sequence[float], substeps: int) -> list[float]:
+    def advance(self, command: Sequence[float], substeps: int) -> list[float]:
         """Hold a command for some physics steps, and return the numbers that cannot be set."""
 
     @abstractmethod
@@ -290,10 +289,10 @@ class Client(ABC):
         if others:
             self.written(others)
 
-    def stepped(self, mode: ControlMode, command: Sequence[float], substeps: int) -> list[float]:
+    def stepped(self, command: Sequence[float], substeps: int) -> list[float]:
         """Hold a command for some physics steps; see ``advance``."""
         self._untouched = None
-        return self.advance(mode, command, substeps)
+        return self.advance(command, substeps)
 
     def read(self, reported: list[float]) -> list[float]:
         """Read the present state; the numbers that cannot be set are given.

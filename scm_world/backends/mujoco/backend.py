@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, final
 
 import mujoco
-import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import (
@@ -20,10 +19,9 @@ from scm_world.backends.base import (
 from scm_world.backends.mujoco.batch import BatchSlot, MujocoBatch
 from scm_world.backends.mujoco.contacts import Touches
 from scm_world.backends.mujoco.realization import Realization, refuse_callbacks
-from scm_world.errors import EngineFailure, ModelError, UnknownOption
+from scm_world.errors import EngineFailure, ModelError
 from scm_world.models.model import Model
 from scm_world.models.scene import (
-    ControlMode,
     Difference,
     ParameterKey,
     Parameters,
@@ -54,11 +52,6 @@ class Payload:
     memory: Any
     touches: Touches | None
     again: tuple[tuple[Floats, int] | None, Floats | None] = (None, None)
-
-
-def _check_mode(mode: ControlMode) -> None:
-    if mode is not ControlMode.CONTROLS:
-        raise UnknownOption("control mode", str(mode), (str(ControlMode.CONTROLS),))
 
 
 def realize(structure: Any, parameters: Parameters) -> Realization:
@@ -159,7 +152,7 @@ class MujocoBackend(Backend):
             self._return()
         self._now.read(into.vector)
 
-    def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
+    def step(self, command: Floats, substeps: int) -> None:
         """Hold a command for some physics steps.
 
         Raises:
@@ -171,7 +164,6 @@ class MujocoBackend(Backend):
             self._return()
         refuse_callbacks()
         now = self._now
-        _check_mode(mode)
         now.command[:] = command
         now.forget()
         if now.staged and substeps == 1:
@@ -229,10 +221,9 @@ class MujocoBackend(Backend):
         """The compiled model, with parameters and state of the scene when it is not in a slot."""
         return self._now
 
-    def move_to(self, slot: BatchSlot, mode: ControlMode) -> bool:
+    def move_to(self, slot: BatchSlot) -> bool:
         """Copy the state to a slot; tell whether the model has changed since the last time."""
         now = self._now
-        _check_mode(mode)
         edited = now.edited
         if self.slot is not slot:
             self._return()

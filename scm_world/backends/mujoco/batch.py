@@ -15,7 +15,6 @@ from scm_world._types import Floats, Integers
 from scm_world.backends.base import EngineBatch
 from scm_world.backends.mujoco.realization import FULL, STATE, Realization, lost, refuse_callbacks
 from scm_world.errors import EngineFailure
-from scm_world.models.scene import ControlMode
 
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.backend import MujocoBackend
@@ -115,13 +114,9 @@ class MujocoBatch(EngineBatch):
         self._groups: dict[Any, _Simulations] = {}
         self._slots: list[BatchSlot | None] = [None] * len(self._backends)
         self._process = os.getpid()
-        self._last: tuple[_Simulations, ControlMode] | None = (
-            None  # if all were stepped in one group
-        )
+        self._last: _Simulations | None = None  # if all were stepped in one group
 
-    def step(
-        self, which: Integers, mode: ControlMode, commands: Floats, substeps: int, into: Floats
-    ) -> None:
+    def step(self, which: Integers, commands: Floats, substeps: int, into: Floats) -> None:
         """Hold commands for some physics steps.
 
         Raises:
@@ -137,27 +132,27 @@ class MujocoBatch(EngineBatch):
             self._groups.clear()
             self._slots = [None] * len(self._backends)
         refuse_callbacks()
-        if self._last is not None and len(which) == len(self._backends):
-            group, last = self._last
-            if mode is last and [backend.slot for backend in self._backends] == self._slots:
-                problem = _step(group, which.astype(np.int32), commands, substeps, into)
-                if problem:
-                    raise EngineFailure(problem, "mujoco")
-                return
+        everyone = len(which) == len(self._backends)
+        slots = [backend.slot for backend in self._backends] if everyone else None
+        if self._last is not None and slots == self._slots:
+            problem = _step(self._last, which.astype(np.int32), commands, substeps, into)
+            if problem:
+                raise EngineFailure(problem, "mujoco")
+            return
         groups: dict[int, tuple[_Simulations, list[int]]] = {}
         changed: set[int] = set()
         for index in which.tolist():
             slot = self._slot(index)
             key = id(slot.group)
             groups.setdefault(key, (slot.group, []))[1].append(index)
-            if self._backends[index].move_to(slot, mode):
+            if self._backends[index].move_to(slot):
                 scene, (fingerprint, model) = self._backends[index].realization, slot.group.usual
                 alike = scene.fingerprint() == fingerprint
                 slot.group.models[index] = model if alike else scene.model
                 changed.add(key)
         problems = []
         everyone = len(groups) == 1 and len(which) == len(self._backends)
-        self._last = (next(iter(groups.values()))[0], mode) if everyone else None
+        self._last = next(iter(groups.values()))[0] if everyone else None
         for key, (group, members) in groups.items():
             if key in changed:
                 group.batch.set_models(group.models)

@@ -401,9 +401,7 @@ def _exposed(fields: Sequence[Field], patterns: Sequence[str] | None) -> set[str
     return found
 
 
-def _parameter(
-    mj: mujoco.MjModel, data: mujoco.MjData, field: Field, *, bound: bool
-) -> Parameter:
+def _parameter(mj: mujoco.MjModel, data: mujoco.MjData, field: Field, *, bound: bool) -> Parameter:
     """Describe a field, or a binding, with its value in the model as it was given."""
     if field.slot is None:
         raise TypeError(f"{field.name} has no place")
@@ -435,19 +433,30 @@ def _numbers(values: Any) -> Numbers:
 # --- states and inputs -------------------------------------------------------------------------
 
 
-def permutation(model: Model) -> tuple[Integers, Integers, Integers]:
-    """Return where in the state vector each number of ``qpos``, ``qvel`` and ``act`` stands.
+class Permutation(NamedTuple):
+    """Where each of MuJoCo's numbers stands in the state vector.
 
-    ``vector[places]`` is the array, for each of the three.
+    Attributes:
+        positions: ``vector[positions]`` is ``qpos``.
+        velocities: ``vector[velocities]`` is ``qvel``.
+        activations: ``vector[activations]`` is ``act``.
     """
+
+    positions: Integers
+    velocities: Integers
+    activations: Integers
+
+
+def permutation(model: Model) -> Permutation:
+    """Return the place of every number of MuJoCo's state in that of the tables."""
     places = model.layout.slices
     found: dict[str, list[tuple[int, int]]] = {"qpos": [], "qvel": [], "act": [], REPORTED: []}
     for row in model.states:
-        found[row.array] += zip(row.numbers, range(places[row.name].start, model.layout.size))
-    qpos, qvel, act, _ = (
-        np.array([place for _, place in sorted(pairs)], dtype=np.int64) for pairs in found.values()
-    )
-    return qpos, qvel, act
+        found[row.array] += (
+            (number, place) for place, number in enumerate(row.numbers, places[row.name].start)
+        )
+    ordered = ([place for _, place in sorted(found[array])] for array in ("qpos", "qvel", "act"))
+    return Permutation(*(np.array(one, dtype=np.int64) for one in ordered))
 
 
 class _Moving(NamedTuple):
@@ -598,7 +607,9 @@ def _grouped(
     used = Counter(part for parts in (states or {}).values() for part in parts)
     problems += [f"states: there is no state {name!r}" for name in used if name not in elements]
     problems += [f"states: {name!r} stands in {n} of them" for name, n in used.items() if n > 1]
-    problems += [f"states: {row.name!r} is left out" for row in rows if states and not used[row.name]]
+    problems += [
+        f"states: {row.name!r} is left out" for row in rows if states and not used[row.name]
+    ]
     if problems:
         raise ModelError(problems)
     found = []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Iterable
 from functools import cached_property
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from scm_world._types import Floats, Integers
+from scm_world._types import Floats
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.contacts import Touches, earlier_stages, has_stages, touches
 from scm_world.backends.mujoco.states import (
@@ -31,7 +30,6 @@ from scm_world.errors import EngineFailure, Infeasible, UnknownOption
 from scm_world.models.model import Model
 from scm_world.models.scene import (
     REVERSED,
-    ControlMode,
     ParameterKey,
     Parameters,
     reversed_ranges,
@@ -123,8 +121,6 @@ class Realization:
             taken elsewhere, so that their contacts are not in the data.
     """
 
-    mode = ControlMode.CONTROLS
-
     def __init__(self, structure: Model) -> None:
         self._compiled = compiled = reading.compiled(structure)
         self.structure = structure
@@ -196,9 +192,7 @@ class Realization:
             numbers = np.empty((len(turned.names), 7))
             into_bodies(vector, turned.vector, known, exact, numbers)
             self._written = vector.copy()
-        write_vector(
-            self._positions, self._velocities, self._activations, self._places, vector
-        )
+        write_vector(self._positions, self._velocities, self._activations, self._places, vector)
         if turned.names:
             turned.write_own(numbers, self._positions, self._velocities)
 

@@ -390,10 +390,9 @@ class Paired:
     def _touches_nothing(self, action: Floats) -> bool:
         """Take the physics steps of a control step one by one; tell whether bodies stay apart."""
         world = self._world
-        mode, substeps = world.pace
         sent = world.command(world.decided(world.compiled.clipped(action)), world.index)
-        for _ in range(substeps):
-            world.backend.step(mode, sent, 1)
+        for _ in range(world.substeps):
+            world.backend.step(sent, 1)
             if world.backend.contacts():
                 return False
         return True

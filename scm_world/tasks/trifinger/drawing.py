@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -54,9 +53,8 @@ from scm_world.models.scene import Light, Scene
 from scm_world.models.shapes import Kind, Mesh, Shape, mesh_of
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.cameras import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW
-from scm_world.tasks.trifinger.kinematics import FRAMES_PER_FINGER, link_frames
-from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.tasks.trifinger.hardware import WALL_HEIGHT, WALL_RADIUS
+from scm_world.tasks.trifinger.kinematics import FRAMES_PER_FINGER, link_frames
 from scm_world.tasks.trifinger.system import TriFinger, trifinger
 
 FLOOR, STAGE, ROBOT = range(3)

@@ -15,9 +15,9 @@ from scm_world.geometry.rotations import rotation_matrix
 from scm_world.geometry.sweep import FLOOR, OTHERS, WALL, apart_in_rows, sweep
 from scm_world.models.scene import TOLERANCE, Overlap, Scene
 from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.hardware import WALL_HEIGHT, WALL_RADIUS
 from scm_world.tasks.trifinger.kinematics import FRAMES_PER_FINGER, frames_of_rows, link_frames
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
-from scm_world.tasks.trifinger.hardware import WALL_HEIGHT, WALL_RADIUS
 
 _LINK = {"upper": 1, "middle": 2, "lower": 3, "tip": 3}
 """The link that a collision shape belongs to: the tip is a part of the lower link."""

@@ -26,7 +26,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.models.scene import ControlMode, Parameters
+from scm_world.models.scene import Parameters
 from scm_world.variables import Box, part_of
 
 FINGERS = ("60", "120", "300")
@@ -239,21 +239,21 @@ class ControllerSpec:
     limit: float = 0.36
 
     def torques(
-        self, mode: ControlMode, command: Floats, positions: Floats, velocities: Floats
+        self, command: Floats, positions: Floats, velocities: Floats, *, direct: bool = False
     ) -> Floats:
         """Evaluate the law.
 
         Args:
-            mode: What ``command`` means.
-            command: Shape (9,) [rad] or [N m].
+            command: Shape (9,) [rad], or [N m] if ``direct``.
             positions: Joint positions, shape (9,) [rad].
             velocities: Joint velocities, shape (9,) [rad/s].
+            direct: Whether torques are commanded.
 
         Returns:
             Joint torques, shape (9,) [N m].
         """
         wanted = command
-        if mode is ControlMode.JOINT_POSITIONS:
+        if not direct:
             gain, damping = np.tile(self.kp, 3), np.tile(self.kd, 3)
             wanted = gain * (command - positions) - damping * velocities
         inner = np.clip(wanted, -self.limit, self.limit)
@@ -263,7 +263,7 @@ class ControllerSpec:
 
 
 def controller_spec(parameters: Parameters) -> ControllerSpec:
-    """Read the joint controller from parameters; gains have no place where torques are commanded."""
+    """Read the joint controller from parameters; gains that they lack are the usual ones."""
     usual, found = ControllerSpec(), {}
     names = {"kp": "position_gains", "kd": "velocity_gains", "safety": "safety_damping"}
     for field, name in names.items():

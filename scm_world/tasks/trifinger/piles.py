@@ -8,7 +8,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.geometry.rotations import from_rotation_vector
-from scm_world.models import ControlMode, Difference, Scene
+from scm_world.models import Difference, Scene
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
@@ -114,7 +114,7 @@ def _dropped(lone: bytes, each: bytes) -> bytes:
         low = lowest_point(np.full(3, size), turned)
         state.positions[index] = _lifted(drop[:3], low, state.positions[:index], size)
         engine.apply(Difference(state=state.copy()))
-        engine.step(ControlMode.CONTROLS, rest.joint_positions, substeps)
+        engine.step(rest.joint_positions, substeps)
         engine.read(state)
     engine.close()
     inside = np.clip(state.positions, *numbers.POSITION_BOUNDS.bounds((3,), {}))

@@ -27,11 +27,11 @@ from scm_world._types import Floats
 from scm_world.backends.base import Capabilities, EngineSnapshot, InMemory
 from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
 from scm_world.geometry.rotations import quaternion_product, to_rotation_vector
-from scm_world.models.scene import ControlMode, Difference, Parameters, Scene
+from scm_world.models.scene import Difference, Parameters, Scene
 from scm_world.tasks.trifinger import fake, hardware
+from scm_world.tasks.trifinger.hardware import controller_spec
 from scm_world.tasks.trifinger.kinematics import forward, inverse
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.hardware import controller_spec
 from scm_world.tasks.trifinger.system import TriFinger
 
 CUBE = 0.065  # [m] edge of the platform's cube
@@ -109,7 +109,7 @@ class TriFingerPlatform(InMemory):
         """Compute the principal moments of inertia of a solid cube, shape (3,) [kg m²]."""
         return fake.inertia(self._structure, self._parameters, body)
 
-    def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
+    def step(self, command: Floats, substeps: int) -> None:
         """Let the fingertips go where a command would bring those of this package's robot.
 
         Raises:

@@ -17,8 +17,8 @@ from scm_world.errors import InterventionError
 from scm_world.tasks.base import Dice, Scenario
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.kinematics import inverse
 from scm_world.tasks.trifinger.hardware import WALL_RADIUS
+from scm_world.tasks.trifinger.kinematics import inverse
 
 TIP = hardware.COLLISION["tip"].radius  # [m]
 CLEARANCE = 2e-4  # [m] how far apart bodies are put that are about to touch

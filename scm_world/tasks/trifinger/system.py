@@ -18,8 +18,8 @@ dampers of the safety filter.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from importlib import import_module
 from typing import Any, final
@@ -42,6 +42,7 @@ from scm_world.tasks.trifinger.hardware import (
     FAST,
     FINGERS,
     N_JOINTS,
+    RESOLUTIONS,
     SPINNING_FRICTION,
     WALL_HEIGHT,
     WALL_RADIUS,
@@ -99,6 +100,25 @@ class TriFinger(Model):
     hulls: tuple[tuple[str, Hull], ...] = ()
     torques: bool = False
     published: bool = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how it is made, so that pickling costs little."""
+        return self.with_, ()
+
+    @property
+    def with_(self) -> Callable[..., TriFinger]:
+        """A function that makes this model with some arguments of ``trifinger`` replaced."""
+        names = [row.name for row in self.states]
+        return partial(
+            trifinger,
+            blocks=self.blocks,
+            preset=self.preset,
+            obstacles=self.obstacles,
+            hulls=self.hulls,
+            torques=self.torques,
+            resolution=next(r for r in RESOLUTIONS if joints_of(r)[0].names[0] in names),
+            published=self.published,
+        )
 
     def hull(self, block: str) -> Hull | None:
         """Return the shape of a block that is no box; None for a box."""
@@ -581,13 +601,10 @@ def _limit(mj: mujoco.MjModel, _: Any) -> Slot:
     return place(*ranges, to=lambda limit: np.array([-limit, limit]), back=lambda r: r[0, 1])
 
 
-def _gains(
-    mj: mujoco.MjModel, _: Any, *, places: tuple[tuple[str, int, int, float], ...]
-) -> Slot:
+def _gains(mj: mujoco.MjModel, _: Any, *, places: tuple[tuple[str, int, int, float], ...]) -> Slot:
     """Find a number for each joint of a finger, shape (3,); all fingers have the same.
 
-    Args:
-        places: Array, first actuator, column and sign of each copy.
+    ``places`` are array, first actuator, column and sign of each copy.
     """
     views = [
         (getattr(mj, f"actuator_{array}")[start : start + N_JOINTS, column], sign)
@@ -613,9 +630,7 @@ def _color(mj: mujoco.MjModel, _: Any, *, shapes: tuple[str, ...]) -> Slot:
     return place(*(mj.geom_rgba[mj.geom(name).id, :3] for name in shapes))
 
 
-def _scaled_mass(
-    mj: mujoco.MjModel, _: Any, *, body: str, per_mass: tuple[float, ...]
-) -> Slot:
+def _scaled_mass(mj: mujoco.MjModel, _: Any, *, body: str, per_mass: tuple[float, ...]) -> Slot:
     """Find the mass of a link or a hull [kg]; its moments of inertia scale with it."""
     index, moments = mj.body(body).id, np.array(per_mass)
     mass, inertia = mj.body_mass[index, ...], mj.body_inertia[index]
@@ -670,9 +685,8 @@ def _restitution(mj: mujoco.MjModel, _: Any, *, rigid: tuple[float, float]) -> S
     A contact is a spring and a damper. A damping ratio z leaves ``exp(-pi z / sqrt(1 - z²))`` of
     the speed after half a period; the frequency stays, and with it how far a body sinks in.
 
-    Args:
-        rigid: Time constant [s] and damping ratio of a contact without restitution, which is
-            critically damped.
+    ``rigid`` has time constant [s] and damping ratio of a contact without restitution, which is
+    critically damped.
     """
     time, ratio = rigid
     references = mj.pair_solref

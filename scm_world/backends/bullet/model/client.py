@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from scm_world.backends.bullet.model.support import changes, shares, unsupported
 from scm_world.errors import Infeasible, ModelError, NotIntervenable, UnknownOption
 from scm_world.models.bodies import ModelBodies
 from scm_world.models.model import Model
-from scm_world.models.scene import REVERSED, ControlMode, ParameterKey, reversed_ranges
+from scm_world.models.scene import REVERSED, ParameterKey, reversed_ranges
 
 Numbers = Sequence[float]
 
@@ -148,8 +148,6 @@ class ModelClient(Client):
 
     Springs, dampers and actuators are not in the engine, but in the forces that are applied to it.
     """
-
-    modes: ClassVar[tuple[ControlMode, ...]] = (ControlMode.CONTROLS,)
 
     def __init__(self, engine: Any) -> None:
         super().__init__(engine)
@@ -408,7 +406,7 @@ class ModelClient(Client):
 
     # --- steps -----------------------------------------------------------------------------------
 
-    def advance(self, mode: ControlMode, command: Sequence[float], substeps: int) -> list[float]:
+    def advance(self, command: Sequence[float], substeps: int) -> list[float]:
         """Hold a command for some physics steps."""
         engine, handle, forces = self.engine, self.handle, self._forces
         ask, step, tell = self.ask, engine.stepSimulation, engine.setJointMotorControlArray

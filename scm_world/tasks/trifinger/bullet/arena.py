@@ -14,12 +14,13 @@ from typing import Any
 
 from scm_world.geometry.hulls import Hull
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.hardware import Capsule, Inertial
 from scm_world.tasks.trifinger.hardware import (
     WALL_HEIGHT,
     WALL_RADIUS,
     WALL_SEGMENTS,
     WALL_THICKNESS,
+    Capsule,
+    Inertial,
 )
 
 LINKS_IN_ENGINE = 5  # of each finger, the tip included; link k of finger f has index 5 f + k

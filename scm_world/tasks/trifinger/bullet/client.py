@@ -13,7 +13,7 @@ from scm_world._types import Floats
 from scm_world.backends.bullet.client import Client, Values, arrays, known
 from scm_world.errors import EngineFailure
 from scm_world.geometry.hulls import Hull
-from scm_world.models.scene import ControlMode, ParameterKey
+from scm_world.models.scene import ParameterKey
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.bullet import arena
 from scm_world.tasks.trifinger.bullet.arena import (
@@ -26,9 +26,8 @@ from scm_world.tasks.trifinger.bullet.arena import (
     link_index,
 )
 from scm_world.tasks.trifinger.bullet.passive import MASSES, resistance
-from scm_world.tasks.trifinger.hardware import ControllerSpec
+from scm_world.tasks.trifinger.hardware import ControllerSpec, controller_spec
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
-from scm_world.tasks.trifinger.hardware import controller_spec
 from scm_world.tasks.trifinger.system import TriFinger
 
 Law = Callable[[Sequence[Any], Sequence[float]], list[float]]
@@ -151,8 +150,6 @@ class TriFingerClient(Client):
 
     signed: ClassVar[bool] = True
     block_damping: ClassVar[float] = 0.0
-
-    modes: ClassVar[tuple[ControlMode, ...]] = (ControlMode.CONTROLS,)
 
     def __init__(self, engine: Any) -> None:
         super().__init__(engine)
@@ -345,7 +342,7 @@ class TriFingerClient(Client):
         known(self.applied, [(body, "mass")])
         return self.bodies.place(body)
 
-    def advance(self, mode: ControlMode, command: Sequence[float], substeps: int) -> list[float]:
+    def advance(self, command: Sequence[float], substeps: int) -> list[float]:
         """Hold a command for some physics steps, and return the torques of the last one [N m].
 
         Each physics step asks the engine once and tells it once. The torques are those of the

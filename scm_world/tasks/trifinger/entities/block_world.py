@@ -124,12 +124,17 @@ class BlockWorld(Composition):
             for name, key in self.parameters().items()
             if not rows[key].visual
         }
-        effects |= {row.name: (row.always, row.contact) for row in system.states if not row.reported}
+        effects |= {
+            row.name: (row.always, row.contact) for row in system.states if not row.reported
+        }
         for entity in self.entities:
             for name, states in entity.actions().items():
                 reached = frozenset().union(*(trees[state] for state in states))
                 effects[name] = reached, every - reached
-        effects |= {PRESET: (every, frozenset()), **dict.fromkeys(self.deciding, (frozenset(), every))}
+        effects |= {
+            PRESET: (every, frozenset()),
+            **dict.fromkeys(self.deciding, (frozenset(), every)),
+        }
         shared: dict[tuple[str, ...], dict[str, Parent]] = {}
         causes: dict[frozenset[int], tuple[tuple[Parent, ...], dict[str, Parent]]] = {}
         for own in set(trees.values()):
