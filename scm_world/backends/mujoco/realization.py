@@ -292,7 +292,7 @@ class Realization:
     def follow(self, before: Realization) -> None:
         """Continue after the last step of another realization; then the state is written."""
         self.data.time = before.data.time
-        if self._turned.names:
+        if not (self.lean and before.lean):
             self._last = before._remembered()
         there = before.structure.layout.slices
         for row in (row for row in self.structure.states if row.reported and row.name in there):

@@ -17,6 +17,7 @@ dampers of the safety filter.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -456,7 +457,7 @@ def _add_robot(spec: mujoco.MjSpec, contact: tuple[float, float], *, torques: bo
         tip.mass, tip.inertia, tip.explicitinertial = hardware.TIP_MASS, hardware.TIP_INERTIA, True
         tip.ipos = hardware.TIP_CENTER["mujoco"]
         tip.add_site(name=f"robot_finger_{finger}_tip")
-        _add_capsule(tip, finger, "tip")
+        _add_capsule(body, finger, "tip", hardware.TIP_ORIGIN)
     for purpose, limit in (("servo", _SPEC.limit), ("safety", 0.0)):
         motor = float(torques and purpose == "servo")
         for joint in _JOINT_NAMES:
@@ -482,13 +483,16 @@ def _set_inertial(body: mujoco.MjsBody, index: int) -> None:
     body.explicitinertial = True
 
 
-def _add_capsule(body: mujoco.MjsBody, finger: str, shape: str) -> None:
+def _add_capsule(
+    body: mujoco.MjsBody, finger: str, shape: str, at: tuple[float, ...] = (0.0, 0.0, 0.0)
+) -> None:
     capsule = hardware.COLLISION[shape]
+    ends = (np.add(end, at).tolist() for end in (capsule.start, capsule.end))
     _add_shape(
         body,
         shape_name(finger, shape),
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        fromto=(*capsule.start, *capsule.end),
+        fromto=[*itertools.chain(*ends)],
         size=(capsule.radius, 0.0, 0.0),
     )
 
