@@ -17,7 +17,7 @@ from scm_world.models.camera import Camera
 from scm_world.world import Simulation
 
 if TYPE_CHECKING:
-    from scm_world.backends.mujoco.opengl import Viewer
+    from scm_world.backends.mujoco.viewer import Viewer
 
 
 @final
@@ -47,7 +47,7 @@ class Window:
     def show(self, scene: Scene) -> None:
         """Show a scene; the first time, the window opens."""
         if self._viewer is None:
-            from scm_world.backends.mujoco.opengl import Viewer
+            from scm_world.backends.mujoco.viewer import Viewer
 
             self._viewer = Viewer()
         self._viewer.show(scene)

@@ -11,6 +11,7 @@ from scm_world._types import ArrayLike, Floats, Integers
 
 Kind = Literal["box", "sphere", "capsule", "cylinder", "ellipsoid", "plane", "mesh"]
 
+GOAL_OPACITY = 0.3  # Source: CausalWorld 1.2, silhouettes
 
 _UNIT_CUBE = np.array(list(product((0.0, 1.0), repeat=3)))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any, final
 from weakref import WeakKeyDictionary
 
@@ -19,15 +19,13 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.backends.mujoco.backend import MujocoBackend
 from scm_world.backends.mujoco.reading import body_names
-from scm_world.geometry import rotation_matrix
 from scm_world.models.camera import Camera
-from scm_world.models.scene import GoalRegion, Scene
+from scm_world.models.scene import Scene
 from scm_world.models.shapes import Kind, Mesh, Shape, Tiles, mesh_of
 
 MOST_SHAPES = 10_000
 MOST_STAGES = 4  # models that are kept compiled, in each thread
 SHOWN_GROUPS, HIDDEN_GROUP = 3, 5  # Source: MuJoCo, mjv_defaultOption
-GOAL_OPACITY = 0.3  # Source: CausalWorld 1.2, silhouettes
 FAR = 100.0  # times the height of the picture of an orthographic camera: it is drawn from there
 
 _GEOM, _OBJECT, _ROLE = mujoco.mjtGeom, mujoco.mjtObj, mujoco.mjtTextureRole
@@ -244,22 +242,6 @@ def drawn(scene: Scene) -> tuple[VisibleModel, mujoco.MjData]:
     if now not in shown:
         shown[now] = VisibleModel(now.model)
     return shown[now], now.data
-
-
-def draw_goals(scene: mujoco.MjvScene, goals: Iterable[GoalRegion]) -> None:
-    """Add goals to an abstract scene as silhouettes; of a hull, the box around it."""
-    for goal in goals:
-        if scene.ngeom >= scene.maxgeom:
-            return
-        mujoco.mjv_initGeom(
-            scene.geoms[scene.ngeom],
-            _GEOM.mjGEOM_SPHERE if goal.shape == "sphere" else _GEOM.mjGEOM_BOX,
-            np.asarray(goal.size, dtype=np.float64) / 2.0,
-            np.asarray(goal.position, dtype=np.float64),
-            rotation_matrix(goal.orientation).ravel(),
-            np.array([*goal.color, GOAL_OPACITY], dtype=np.float32),
-        )
-        scene.ngeom += 1
 
 
 def _triangles(model: mujoco.MjModel, mesh: int) -> Mesh:

@@ -4,7 +4,6 @@ from scm_world.backends.renderer.bodies import NOTHING
 from scm_world.backends.renderer.picture import (
     ORIGINAL,
     PLAIN,
-    RENDERERS,
     Convention,
     Drawing,
     RenderedImage,
@@ -27,7 +26,6 @@ __all__ = [
     "NOTHING",
     "ORIGINAL",
     "PLAIN",
-    "RENDERERS",
     "Convention",
     "Drawing",
     "RenderedImage",

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.backends.renderer.bodies import model_camera, model_shapes
 from scm_world.backends.renderer.kernels import Canvas, Colors
-from scm_world.backends.renderer.shapes import SKY, corners_of_what_moves, draw_shapes, goal_shapes
-from scm_world.errors import EngineError, UnknownOption
+from scm_world.backends.renderer.shapes import corners_of_what_moves, draw_shapes, goal_shapes
+from scm_world.errors import UnknownOption
 from scm_world.models.camera import Camera
 from scm_world.models.model import Model
 from scm_world.models.scene import Scene
@@ -104,8 +104,6 @@ FIELD_OF_VIEW = 40.0  # [deg] of an automatic camera
 MARGIN = 1.3  # how much more an automatic camera sees than it has to
 STILL = 0.05  # of the distance: how far from the middle of a picture is near it
 
-RENDERERS = ("software", "mujoco")
-
 
 @final
 @dataclass(frozen=True)
@@ -180,7 +178,6 @@ def picture(
     scene: Scene,
     camera: Camera | str | None = None,
     size: tuple[int, int] | None = None,
-    renderer: str | None = None,
     *,
     samples: int = 1,
 ) -> NDArray[np.uint8]:
@@ -192,18 +189,13 @@ def picture(
         scene: What to show.
         camera: Where from: see ``scene_camera``.
         size: Height and width [pixels]; if not given, those of the camera.
-        renderer: ``"mujoco"`` for MuJoCo's own, which needs EGL or OSMesa and draws models only;
-            ``"software"`` for ours, whose pictures are the same on all machines. If not given,
-            models are drawn by MuJoCo's where that works, and all else by ours.
-        samples: How many samples per pixel and axis colors are averaged over. MuJoCo's renderer
-            takes two at least.
+        samples: How many samples per pixel and axis colors are averaged over.
 
     Returns:
         Red, green and blue, shape (h, w, 3).
 
     Raises:
-        UnknownOption: There is no such camera, or no such renderer for this scene.
-        EngineError: MuJoCo's renderer was asked for, and cannot draw here.
+        UnknownOption: There is no such camera.
         ModelError: The structure says nothing about shapes.
         ValueError: ``samples`` is not positive, or the camera has no optical axis.
 
@@ -212,30 +204,7 @@ def picture(
         >>> picture(default_scene(TriFingerStructure()), size=(60, 80)).shape
         (60, 80, 3)
     """
-    if samples < 1:
-        raise ValueError(f"samples: expected a positive number, got {samples}")
-    modeled = isinstance(scene.structure, Model)
-    known = RENDERERS if modeled else RENDERERS[:1]
-    if renderer not in (None, *known):
-        raise UnknownOption("renderer", renderer, known)
-    camera = scene_camera(scene, camera, size)
-    library = None
-    if modeled and renderer != "software":
-        from scm_world.backends.mujoco.opengl import draw_scene as draw_by_mujoco
-        from scm_world.backends.mujoco.opengl import opengl
-
-        library = opengl()
-    if library is None:
-        if renderer == "mujoco":
-            raise EngineError(
-                "MuJoCo cannot draw here: neither EGL nor OSMesa works (or MUJOCO_GL forbids it); "
-                "install libegl1 or libosmesa6, or use renderer='software'",
-                "mujoco",
-            )
-        return render(scene, camera, samples=samples, published=True).rgb
-    samples = max(samples, 2)
-    fine = replace(camera, height=camera.height * samples, width=camera.width * samples)
-    return _average(draw_by_mujoco(scene, fine, SKY, library), samples)
+    return render(scene, scene_camera(scene, camera, size), samples=samples, published=True).rgb
 
 
 def scene_camera(

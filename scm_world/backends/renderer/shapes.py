@@ -33,7 +33,7 @@ from scm_world.geometry import rotation_matrix
 from scm_world.geometry.arrays import compact, rows
 from scm_world.models.camera import Camera
 from scm_world.models.scene import GoalRegion, Light
-from scm_world.models.shapes import Kind, Mesh, Shape, corners, mesh_of
+from scm_world.models.shapes import GOAL_OPACITY, Kind, Mesh, Shape, corners, mesh_of
 
 SOLIDS = {
     "box": BOX,
@@ -43,7 +43,6 @@ SOLIDS = {
     "cylinder": CYLINDER,
 }
 SHADOW_TEXELS = 256
-GOAL_OPACITY = 0.3  # Source: CausalWorld 1.2, silhouettes
 SKY = (178, 199, 222)  # red, green, blue
 
 AROUND = 2.0  # how much larger the square of a shadow is than that of what moves

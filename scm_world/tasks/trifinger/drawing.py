@@ -46,12 +46,12 @@ from scm_world.backends.renderer.meshes import (
     shadow_map,
 )
 from scm_world.backends.renderer.picture import Drawing
-from scm_world.backends.renderer.shapes import GOAL_OPACITY, goal_shapes
+from scm_world.backends.renderer.shapes import goal_shapes
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import rotation_kernel, rotation_matrix
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Light, Scene
-from scm_world.models.shapes import Kind, Mesh, Shape, mesh_of
+from scm_world.models.shapes import GOAL_OPACITY, Kind, Mesh, Shape, mesh_of
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.cameras import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW
 from scm_world.tasks.trifinger.kinematics import FRAMES_PER_FINGER, link_frames
