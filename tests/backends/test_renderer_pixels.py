@@ -71,8 +71,9 @@ def parked(scene: Scene, *, obstacles: bool = True) -> Scene:
     """Leave the goals and the obstacles, and a robot at the lower limits of its joints."""
     state = PhysicalState(0)
     state.joint_positions[:] = JOINT_LOW
-    kept = scene.structure.obstacles if obstacles else ()
-    return scene.with_(state=state, structure=TriFingerStructure(obstacles=kept))
+    structure = TriFingerStructure(obstacles=scene.structure.obstacles if obstacles else ())
+    kept = {key: scene.parameters[key] for key in structure.default_scene().parameters}
+    return scene.with_(state=state, structure=structure, parameters=kept)
 
 
 def now(scene: Scene) -> np.ndarray:

@@ -261,13 +261,12 @@ def test_one_camera_for_two_scenes(scene: Scene) -> None:
     assert following_camera(camera, scene).eye != camera.eye
 
 
-def test_the_trifinger_looks_as_published() -> None:
-    """Its pictures are those of ``render``, from the overview, with links as published."""
+def test_pictures_of_the_trifinger_are_those_of_render() -> None:
+    """They are taken from the overview."""
     scene = default_scene(TriFingerStructure(blocks=("tool_block",)))
 
-    whole = render(scene, OVERVIEW, published=True).rgb
-    np.testing.assert_array_equal(picture(scene), whole)
-    fine = render(scene, CAMERAS[0], samples=2, published=True).rgb
+    np.testing.assert_array_equal(picture(scene), render(scene, OVERVIEW).rgb)
+    fine = render(scene, CAMERAS[0], samples=2).rgb
     np.testing.assert_array_equal(picture(scene, "60", (128, 128), samples=2), fine)
 
 

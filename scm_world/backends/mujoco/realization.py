@@ -217,6 +217,8 @@ class Realization(ABC):
 
     Attributes:
         structure: What was compiled.
+        bodies: What was given.
+        owners: What was given.
         model: With the present parameters.
         data: With the present state.
         kept: The parameters in force; at first, none has been written.
@@ -248,7 +250,7 @@ class Realization(ABC):
         self._scratch = mujoco.MjData(model)
         self._slots = slots(model, data)
         self._constant = frozenset(key for key, slot in self._slots.items() if slot.constant)
-        self._bodies, self._owners = bodies, owners
+        self.bodies, self.owners = bodies, owners
         self.kept: dict[ParameterKey, Floats] = {}
         self.applied: Parameters | None = None
         self._numbers: bytes | None = None  # of what is kept, if nothing was written since
@@ -314,11 +316,11 @@ class Realization(ABC):
     def touches(self) -> Touches:
         """Copy the contacts of the last physics step, with those of earlier stages where known."""
         if self.replay is None:
-            found = touches(self.model, self.data, self._owners)
+            found = touches(self.model, self.data, self.owners)
         else:
             found = self._replayed(*self.replay)
         if self.began is not None:
-            for earlier in earlier_stages(self.model, self.began, self._owners):
+            for earlier in earlier_stages(self.model, self.began, self.owners):
                 found = found.extended(earlier)
         return found
 
@@ -330,7 +332,7 @@ class Realization(ABC):
             mujoco.mj_step(self.model, data, steps)
         except (mujoco.FatalError, mujoco.UnexpectedError):
             mujoco.mj_resetData(self.model, data)  # it failed then, too, and left no contacts
-        found = touches(self.model, data, self._owners)
+        found = touches(self.model, data, self.owners)
         mujoco.mj_resetData(self.model, data)
         data.warning.number[:] = 1
         return found
@@ -373,9 +375,9 @@ class Realization(ABC):
         Raises:
             UnknownOption: There is no such body.
         """
-        if body not in self._bodies:
-            raise UnknownOption("body", body, self._bodies)
-        moments: Floats = self.model.body_inertia[self._bodies.index(body)].copy()
+        if body not in self.bodies:
+            raise UnknownOption("body", body, self.bodies)
+        moments: Floats = self.model.body_inertia[self.bodies.index(body)].copy()
         return moments
 
     def remarks(self, before: Parameters) -> tuple[str, ...]:

@@ -86,7 +86,7 @@ class TriFingerStructure:
                 blocks[index] = before.state.blocks[before.structure.blocks.index(name)]
 
     def realization(self, backend: str) -> Any:
-        """Return how the robot is realised on a backend, or drawn."""
+        """Return how the robot is realised on a backend, or seen."""
         return _realization("published" if self.published and backend == "bullet" else backend)
 
     def hull(self, block: str) -> Hull | None:
@@ -99,7 +99,7 @@ _REALIZATIONS = {
     "bullet": ("bullet.client", "TriFingerClient"),
     "published": ("bullet.published", "PublishedClient"),
     "fake": ("fake", None),
-    "renderer": ("drawing", "DRAWING"),
+    "renderer": ("cameras", "VIEWS"),
 }
 
 

@@ -45,6 +45,13 @@ from scm_world.tasks.trifinger.structure import (
 
 FLOOR = "floor"
 STAGE = "stage"
+ROBOT = "robot"  # the hub that carries the fingers; nothing touches it
+UNSEEN = 3  # the first group of shapes that no picture shows
+HUB_COLOR = (0.35, 0.35, 0.38, 1.0)
+HUB_HALVES = (0.034, 0.034, 0.012)  # [m] of an ellipsoid
+MOUNT = hardware.Capsule((0.012, 0.0, 0.0), (-0.004, 0.0, 0.0), 0.0235)
+"""How link 0 looks; its published mesh is a frame that hides the arena from above."""
+
 SHAPES = ("upper", "middle", "lower", "tip")  # in the order of the links 1, 2, 3 and 3
 
 CONTACT = {"fast": (0.010, 1.0), "precise": (0.004, 1.0)}
@@ -127,8 +134,9 @@ def link_shapes(finger: str, index: int) -> tuple[str, ...]:
 
 def shape_owners(structure: TriFingerStructure) -> dict[str, str]:
     """Map every shape to the published name of its body."""
-    owners = {FLOOR: FLOOR}
+    owners = {FLOOR: FLOOR, ROBOT: ROBOT}
     owners |= {wall_name(i): STAGE for i in range(WALL_SEGMENTS)}
+    owners |= {f"{wall_name(i)}/inside": STAGE for i in range(WALL_SEGMENTS)}
     for finger in FINGERS:
         for index in range(hardware.LINKS_PER_FINGER):
             owners |= {name: link_name(finger, index) for name in link_shapes(finger, index)}
@@ -197,7 +205,8 @@ def _add_shape(body: mujoco.MjsBody, name: str, **options: Any) -> None:
 
 
 def _add_arena(world: mujoco.MjsBody) -> None:
-    _add_shape(world, FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1.0, 1.0, 0.1))
+    plane = mujoco.mjtGeom.mjGEOM_PLANE  # without an end where it collides
+    _add_shape(world, FLOOR, type=plane, size=(WALL_RADIUS, WALL_RADIUS, 0.1))
     stage = world.add_body(name=STAGE)
     outer = WALL_RADIUS + WALL_THICKNESS
     half = (WALL_THICKNESS / 2, outer * math.tan(math.pi / WALL_SEGMENTS), WALL_HEIGHT / 2)
@@ -211,6 +220,16 @@ def _add_arena(world: mujoco.MjsBody) -> None:
             pos=(center * math.cos(angle), center * math.sin(angle), WALL_HEIGHT / 2),
             quat=_yaw(angle),
             size=half,
+            group=UNSEEN,
+        )
+        w, _, _, z = _yaw(angle)
+        _add_shape(  # seen from within only
+            stage,
+            f"{wall_name(i)}/inside",
+            type=plane,
+            pos=(WALL_RADIUS * math.cos(angle), WALL_RADIUS * math.sin(angle), WALL_HEIGHT / 2),
+            quat=(w, z, -w, z),
+            size=(WALL_HEIGHT / 2, WALL_RADIUS * math.tan(math.pi / WALL_SEGMENTS), 0.1),
         )
 
 
@@ -221,6 +240,9 @@ def _add_robot(spec: mujoco.MjSpec, contact: tuple[float, float]) -> None:
     and the links that cannot move outside of them, no mass changes the roundings elsewhere.
     """
     height, world = hardware.NOMINAL_HEIGHT - hardware.TABLE_OFFSET, spec.worldbody
+    hub = world.add_body(name=ROBOT, pos=(0.0, 0.0, height))
+    ellipsoid = mujoco.mjtGeom.mjGEOM_ELLIPSOID
+    _add_shape(hub, ROBOT, type=ellipsoid, size=HUB_HALVES, rgba=HUB_COLOR)
     cos, sin = math.cos(hardware.WORLD_YAW), math.sin(hardware.WORLD_YAW)
     for finger, (x, y, z), yaw in zip(
         FINGERS, hardware.FINGER_OFFSET, hardware.FINGER_YAW, strict=True
@@ -231,8 +253,7 @@ def _add_robot(spec: mujoco.MjSpec, contact: tuple[float, float]) -> None:
         }
         fixed = world.add_body(name=link_name(finger, 0), **pose)
         _set_inertial(fixed, 0)
-        sphere = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": (0.01, 0.0, 0.0)}
-        _add_shape(fixed, shape_name(finger, "base"), **sphere)
+        _add_capsule(fixed, shape_name(finger, "base"), MOUNT)
         body = world.add_body(name=base_name(finger), **pose)
         for index in (1, 2, 3):
             name = link_name(finger, index)
@@ -249,11 +270,12 @@ def _add_robot(spec: mujoco.MjSpec, contact: tuple[float, float]) -> None:
                 actfrclimited=True,  # the joint clips the sum of servo and damper
                 actfrcrange=(-_TORQUE_LIMIT, _TORQUE_LIMIT),
             )
-            _add_capsule(body, finger, SHAPES[index - 1])
+            shape = SHAPES[index - 1]
+            _add_capsule(body, shape_name(finger, shape), hardware.COLLISION[shape])
         tip = body.add_body(name=f"robot_finger_{finger}_tip", pos=hardware.TIP_ORIGIN)
         tip.mass, tip.inertia, tip.explicitinertial = hardware.TIP_MASS, hardware.TIP_INERTIA, True
         tip.ipos = hardware.TIP_CENTER["mujoco"]
-        _add_capsule(tip, finger, "tip")
+        _add_capsule(tip, shape_name(finger, "tip"), hardware.COLLISION["tip"])
     for purpose, limit in (("servo", _TORQUE_LIMIT), ("safety", 0.0)):
         for joint in (link_name(finger, index) for finger in FINGERS for index in (1, 2, 3)):
             spec.add_actuator(  # without gains: they are parameters and follow
@@ -278,11 +300,10 @@ def _set_inertial(body: mujoco.MjsBody, index: int) -> None:
     body.explicitinertial = True
 
 
-def _add_capsule(body: mujoco.MjsBody, finger: str, shape: str) -> None:
-    capsule = hardware.COLLISION[shape]
+def _add_capsule(body: mujoco.MjsBody, name: str, capsule: hardware.Capsule) -> None:
     _add_shape(
         body,
-        shape_name(finger, shape),
+        name,
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
         fromto=(*capsule.start, *capsule.end),
         size=(capsule.radius, 0.0, 0.0),
@@ -300,7 +321,7 @@ _POSITION, _VELOCITY = 1, 2  # where gains rest among the parameters of a gain t
 def slots(model: mujoco.MjModel, structure: TriFingerStructure) -> dict[ParameterKey, Slot]:
     """Find the place of every parameter of this structure in this model."""
     hanging = [name(f) for f in hardware.FINGERS for name in (base_name, _fixed_link)]
-    heights = [model.body_pos[model.body(name).id, 2, ...] for name in hanging]
+    heights = [model.body_pos[model.body(name).id, 2, ...] for name in (ROBOT, *hanging)]
     offset = hardware.TABLE_OFFSET
     rest = model.actuator_gainprm[:N_JOINTS]
     ranges = model.actuator_forcerange[:N_JOINTS], model.jnt_actfrcrange[:N_JOINTS]
@@ -327,7 +348,7 @@ def slots(model: mujoco.MjModel, structure: TriFingerStructure) -> dict[Paramete
             link = hardware.link_name(finger, index)
             found[link, "mass"] = _scaled_mass(model, link, inertial.per_mass)
             found[link, "color"] = _color(model, link_shapes(finger, index))
-    surfaces = {FLOOR: [FLOOR], STAGE: [wall_name(i) for i in range(WALL_SEGMENTS)]}
+    surfaces = {FLOOR: [FLOOR], STAGE: [name for name, owner in owners.items() if owner == STAGE]}
     surfaces |= {name: [name] for name in (*structure.blocks, *structure.obstacles)}
     for name, shapes in surfaces.items():
         found[name, "friction"] = _friction(model, shapes)
