@@ -1,8 +1,7 @@
 """What MuJoCo shows of a model, as shapes that any renderer can draw.
 
-Geoms and sites come from the arrays of the model, tendons, flexes and skins from MuJoCo's abstract
-scene; neither needs OpenGL. Groups, colors and decorations are the ones that MuJoCo shows by
-default.
+Geoms come from the arrays of the model, all else from MuJoCo's abstract scene, without OpenGL.
+Groups, colors and decorations are the ones that MuJoCo shows by default.
 """
 
 from __future__ import annotations
@@ -12,13 +11,13 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._types import Floats, Integers
+from scm_world._types import Floats
 from scm_world.backends.mujoco.backend import realize
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Parameters, Scene
@@ -61,34 +60,6 @@ _KINDS: dict[int, tuple[int, tuple[int, int, int]]] = {
 """How we draw a type of MuJoCo's, and which of its three sizes are half its edges."""
 
 
-class _Rows(NamedTuple):
-    """Geoms, or sites, that are shown: views of MuJoCo's arrays, and what does not change.
-
-    Attributes:
-        positions: Of all, shape (m, 3) [m].
-        rotations: Of all, shape (m, 9).
-        sizes: Of all, shape (m, 3) [m].
-        colors: Of all, shape (m, 4).
-        rows: Which are shown, shape (n,).
-        kinds: Of these, shape (n,).
-        columns: Which of its sizes are half the edges of each, shape (n, 3).
-        materials: Of these, -1 without one, shape (n,).
-        bodies: Numbers of these in MuJoCo, shape (n,).
-        owners: Numbers of their names, shape (n,).
-    """
-
-    positions: Floats
-    rotations: Floats
-    sizes: Floats
-    colors: Floats
-    rows: Integers
-    kinds: Integers
-    columns: Integers
-    materials: Integers
-    bodies: Integers
-    owners: Integers
-
-
 @final
 class VisibleModel:
     """What can be seen of a model.
@@ -106,66 +77,57 @@ class VisibleModel:
 
     def __init__(self, structure: Any, parameters: Parameters) -> None:
         self._now = now = realize(structure, parameters)
-        self._given = dict(parameters)
-        self.model, self.data = model, data = now.model, now.data
+        self._given: tuple[Any, bytes] = ((), b"")  # the parameters that were written last
+        self.model, self.data = now.model, now.data
+        model = now.model
         self.names = tuple(dict.fromkeys((*now.bodies, *now.owners)))
         numbers = {name: number for number, name in enumerate(self.names)}
-        bodies = np.array([numbers[name] for name in now.bodies], dtype=np.int64)
+        self._numbers = np.array([numbers[name] for name in now.bodies], dtype=np.int64)
         owners = np.array([numbers[name] for name in now.owners[: model.ngeom]], dtype=np.int64)
-        known = np.isin(model.geom_type, list(_KINDS)) & _looks(model)
-        self._geoms = _rows(model, data, "geom", known, owners)
-        shown = model.site_group < SHOWN_GROUPS
-        self._sites = _rows(model, data, "site", shown, bodies[model.site_bodyid])
-        self._meshes = _meshes(model, self._geoms.rows.tolist())
+        mocap = model.body_mocapid[model.body_rootid] >= 0
+        self._moves: NDArray[np.bool_] = (model.body_weldid != 0) | mocap
+        self._rows = rows = np.flatnonzero(np.isin(model.geom_type, list(_KINDS)) & _looks(model))
+        known = [_KINDS[code] for code in model.geom_type[rows].tolist()]
+        self._kinds = np.array([kind for kind, _ in known], dtype=np.int64)
+        columns = [columns for _, columns in known]
+        self._columns = np.array(columns, dtype=np.int64).reshape(-1, 3)
+        self._materials, self._owners = model.geom_matid[rows], owners[rows]
+        self._meshes = _meshes(model, rows.tolist())
         self._textures = [_texture(model, i) for i in range(model.nmat)]
-        of = np.concatenate([self._geoms.bodies, self._sites.bodies])
-        mocap = model.body_mocapid[model.body_rootid[of]] >= 0
-        self._moves: NDArray[np.bool_] = (model.body_weldid[of] != 0) | mocap
-        self._bends = bool(model.ntendon or model.nflex or model.nskin)
+        sites = (model.site_group < SHOWN_GROUPS).any()
+        self._more = bool(sites or model.ntendon or model.nflex or model.nskin)
 
     def place(self, scene: Scene) -> None:
         """Write parameters and state of a scene of the same structure."""
-        now, given = self._now, self._given
-        changed = {
-            key: value for key, value in scene.parameters.items() if given.get(key) is not value
-        }
-        if changed:
-            now.edit(changed)
-            given.update(changed)
+        now, parameters = self._now, scene.parameters
+        given = tuple(parameters), b"".join(value.tobytes() for value in parameters.values())
+        if given != self._given:
+            now.edit(parameters)
+            self._given = given
         now.place(scene.state.vector)
         mujoco.mj_kinematics(self.model, self.data)
 
     def shapes(self) -> Shapes:
         """Copy what is shown: geoms, sites, tendons, height fields, flexes and skins."""
-        first, tiles = self._table(self._geoms)
-        found = Shapes(first, self._moves, self._meshes, tiles)
-        if len(self._sites.rows):
-            second, _ = self._table(self._sites)
-            pairs = zip(first, second, strict=True)
-            found = found._replace(table=Table(*(np.concatenate(pair) for pair in pairs)))
-        return found.joined(Shapes.of(list(self._bent()))) if self._bends else found
-
-    def _table(self, of: _Rows) -> tuple[Table, dict[int, Tiles]]:
-        """Copy the numbers of geoms or sites, and the checkerboards on planes."""
-        halves = of.sizes[of.rows[:, None], of.columns]
-        long = of.kinds == CAPSULE
-        halves[long, 2] += halves[long, 0]
-        colors, tiles = of.colors[of.rows], dict[int, Tiles]()
+        model, data, rows, kinds = self.model, self.data, self._rows, self._kinds
+        halves = model.geom_size[rows[:, None], self._columns]
+        halves[kinds == CAPSULE, 2] += halves[kinds == CAPSULE, 0]
+        colors, tiles = model.geom_rgba[rows], dict[int, Tiles]()
         if self._textures:
-            plain = (colors == UNCOLORED).all(axis=1) & (of.materials >= 0)
-            colors[plain] = self.model.mat_rgba[of.materials[plain]]
+            plain = (colors == UNCOLORED).all(axis=1) & (self._materials >= 0)
+            colors[plain] = model.mat_rgba[self._materials[plain]]
         colors = colors.astype(np.float64)
-        for row, material in enumerate(of.materials.tolist() if self._textures else ()):
+        for row, material in enumerate(self._materials.tolist() if self._textures else ()):
             texture = self._textures[material] if material >= 0 else None
-            if texture is None:
-                continue
-            if of.kinds[row] == PLANE:
+            if texture is not None and kinds[row] == PLANE:
                 tiles[row] = self._tiles(material, halves[row], colors[row, :3] * texture[1])
                 colors[row, :3] *= texture[0]
-            else:
+            elif texture is not None:
                 colors[row, :3] *= texture.mean(axis=0)
-        places = of.positions[of.rows], of.rotations[of.rows].reshape(-1, 3, 3)
-        return Table(of.kinds, halves, *places, colors, of.owners), tiles
+        places = data.geom_xpos[rows], data.geom_xmat[rows].reshape(-1, 3, 3)
+        table = Table(kinds, halves, *places, colors, self._owners)
+        found = Shapes(table, self._moves[model.geom_bodyid[rows]], self._meshes, tiles)
+        return found.joined(Shapes.of(list(self._others()))) if self._more else found
 
     def _tiles(self, material: int, halves: Floats, color: Floats) -> Tiles:
         """Measure the tiles on a plane: a texture holds two by two."""
@@ -207,13 +169,13 @@ class VisibleModel:
 
     @cached_property
     def _abstract(self) -> tuple[mujoco.MjvScene, mujoco.MjvOption]:
-        """The abstract scene, and what it shows: neither geoms nor sites."""
+        """The abstract scene, and what it shows: no geoms."""
         option = mujoco.MjvOption()
-        option.geomgroup[:] = option.sitegroup[:] = 0
+        option.geomgroup[:] = 0
         return mujoco.MjvScene(self.model, MOST_SHAPES), option
 
-    def _bent(self) -> Iterator[Shape]:
-        """List tendons, flexes and skins."""
+    def _others(self) -> Iterator[Shape]:
+        """List sites, tendons, flexes and skins."""
         model, data, (scene, option) = self.model, self.data, self._abstract
         mujoco.mj_comPos(model, data)
         mujoco.mj_flex(model, data)
@@ -221,25 +183,26 @@ class VisibleModel:
         everything, camera = int(mujoco.mjtCatBit.mjCAT_ALL), mujoco.MjvCamera()
         mujoco.mjv_updateScene(model, data, option, None, camera, everything, scene)
         for geom in scene.geoms[: scene.ngeom]:
-            color = np.array(geom.rgba, dtype=np.float64)
+            halves, position, rotation, color = (
+                np.array(numbers, dtype=np.float64)
+                for numbers in (geom.size, geom.pos, geom.mat, geom.rgba)
+            )
             texture = self._textures[geom.matid] if geom.matid >= 0 else None
             if texture is not None:
                 color[:3] *= texture.mean(axis=0)
+            body, moves = -1, True
+            if geom.objtype == _OBJECT.mjOBJ_SITE:
+                number = model.site_bodyid[geom.objid]
+                body, moves = int(self._numbers[number]), bool(self._moves[number])
             if geom.type == _GEOM.mjGEOM_FLEX and scene.flexfaceused[geom.objid] == 0:
                 yield from self._edges(scene, geom, color)
             elif geom.type in (_GEOM.mjGEOM_FLEX, _GEOM.mjGEOM_SKIN):  # they stand in the world
-                mesh = self._surface(scene, geom)
-                yield Shape(
-                    "mesh", np.zeros(3), np.zeros(3), np.eye(3), color, moves=True, mesh=mesh
-                )
+                mesh, place = self._surface(scene, geom), (np.zeros(3), np.eye(3))
+                yield Shape("mesh", halves, *place, color, moves=True, mesh=mesh)
             elif geom.type in _KINDS:
                 kind = _KINDS[geom.type][0]
-                halves, position, rotation = (
-                    np.array(numbers, dtype=np.float64)
-                    for numbers in (geom.size, geom.pos, geom.mat)
-                )
                 halves[2] += halves[0] if kind == CAPSULE else 0.0
-                yield Shape(KINDS[kind], halves, position, rotation, color, moves=True)
+                yield Shape(KINDS[kind], halves, position, rotation, color, body, moves)
 
     def _edges(
         self, scene: mujoco.MjvScene, geom: mujoco.MjvGeom, color: Floats
@@ -310,30 +273,6 @@ def _looks(model: mujoco.MjModel) -> NDArray[np.bool_]:
         if looks - touches:
             shown = shown & ~(mine & collides)
     return shown
-
-
-def _rows(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    kind: str,
-    shown: NDArray[np.bool_],
-    owners: Integers,
-) -> _Rows:
-    """Choose the geoms or the sites that are shown."""
-    rows = np.flatnonzero(shown)
-    known = [_KINDS[int(code)] for code in getattr(model, f"{kind}_type")[rows]]
-    return _Rows(
-        getattr(data, f"{kind}_xpos"),
-        getattr(data, f"{kind}_xmat"),
-        getattr(model, f"{kind}_size"),
-        getattr(model, f"{kind}_rgba"),
-        rows,
-        np.array([code for code, _ in known], dtype=np.int64),
-        np.array([columns for _, columns in known], dtype=np.int64).reshape(-1, 3),
-        getattr(model, f"{kind}_matid")[rows],
-        getattr(model, f"{kind}_bodyid")[rows],
-        owners[rows],
-    )
 
 
 def _meshes(model: mujoco.MjModel, geoms: list[int]) -> dict[int, Mesh]:
