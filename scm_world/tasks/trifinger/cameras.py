@@ -76,7 +76,7 @@ OVERVIEW = Camera(
 def background(scene: Scene, obstacles: bool) -> tuple[Scene, frozenset[str]]:
     """Park the robot, and leave out the blocks, and the obstacles unless they are wanted."""
     structure, state = scene.structure, scene.state.copy()
-    state.vector[structure.layout.slices["joint_positions"]] = JOINT_LOW
+    state.joint_positions[:] = JOINT_LOW
     left_out = structure.blocks if obstacles else (*structure.blocks, *structure.obstacles)
     return scene.with_(state=state), frozenset(left_out)
 
