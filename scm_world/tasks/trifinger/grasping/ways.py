@@ -191,17 +191,17 @@ class Planner:
         *,
         wanted: float,
         release: bool,
-        swings: bool = False,
     ) -> Move | None:
         """Find the best way to bring a block to one of some places.
+
+        Two fingers rather than three lift it from the floor: each of the two on one side of three
+        presses half as much, and slips sooner.
 
         Args:
             start: The block as it is.
             ends: Where it may go, and by how much it turns on the way [rad].
             wanted: With which force it should be pressed [N].
             release: Whether it is let go there.
-            swings: Whether two fingers rather than three lift it from the floor: each of the two
-                on one side of three presses half as much, and slips sooner.
 
         Returns:
             The best way, or None if the fingers can go none.
@@ -235,7 +235,7 @@ class Planner:
                 rows, held = rows[held > 0.0], held[held > 0.0]
             share = held / wanted
             enough = np.minimum(share, 1.0) + PLENTY * np.minimum(share, 3.0)
-            loose = 2.0 * FIRMNESS * (swings and height > start.place[2] + CLEARANCE)
+            loose = 2.0 * FIRMNESS * (height > start.place[2] + CLEARANCE)
             worths[rows, way] = (
                 ease[rows] - loose * table.used[rows].all(axis=1) - TURNING * abs(turn) + enough
             )
@@ -248,24 +248,21 @@ class Planner:
         numbers = float(strengths[row, way]), float(worths[row, way])
         return Move(table.grip(row), start, end, turn, height, above, *numbers, release)
 
-    def place(self, grip: Grip, body: Cuboid, opening: float, above: float | None = None) -> Floats:
+    def place(self, grip: Grip, body: Cuboid, opening: float) -> Floats:
         """Place the fingertips about a block.
 
         Args:
             grip: How it is held.
             body: Where it is.
             opening: How far from its faces the fingertips are [m].
-            above: Their height, if they are not yet beside it [m].
 
         Returns:
-            Shape (9,) [m]; unused fingers are out of the way.
+            Shape (3, 3) [m]; unused fingers are out of the way.
         """
         tips = body.world(grip.points(opening))
-        if above is not None:
-            tips[:, 2] = above
         idle = ~np.array(grip.used)
         tips[idle] = self._aside[idle]
-        return tips.ravel()
+        return tips
 
     # --- heights ------------------------------------------------------------------------------
 
