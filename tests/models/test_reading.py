@@ -330,8 +330,8 @@ def test_exact_settings_are_in_force() -> None:
     [
         (PENDULUM, "EULER", 0),
         (pile(2), "IMPLICITFAST", 1),
-        (pile(2, '<option integrator="RK4"/>'), "RK4", 0),
-        (pile(2, '<option integrator="RK4" solver="PGS"/>'), "RK4", 1),
+        (pile(2, '<option integrator="RK4"/>'), "RK4", 1),
+        (pile(2, '<option integrator="RK4" solver="PGS"/>'), "RK4", 2),
     ],
 )
 def test_only_several_trees_change_the_integrator(text: str, integrator: str, notes: int) -> None:

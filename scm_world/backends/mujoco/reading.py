@@ -127,6 +127,7 @@ def read_model(
             if field.name not in chosen
         ),
         notes=(*replaced, *changed, *drift, *_notes(mj, keyframe)),
+        staged=_is_staged(mj),
         describe=described,
     )
 
@@ -272,6 +273,11 @@ def _notes(mj: mujoco.MjModel, keyframe: str | int | None) -> Iterator[str]:
     """Say what acts without having a variable, and what is not used."""
     if mj.nflex:
         yield f"{mj.nflex} flex(es) act through their vertices; their material has no variables."
+    if _is_staged(mj):
+        yield (
+            "RK4 looks for contacts in four stages of a physics step; those of the last one are "
+            "listed, and an edge by contact may act in an earlier one."
+        )
     if mj.nskin:
         yield f"{mj.nskin} skin(s) act on pictures only."
     if mj.nkey and keyframe is None:
@@ -279,6 +285,12 @@ def _notes(mj: mujoco.MjModel, keyframe: str | int | None) -> Iterator[str]:
             f"{mj.nkey} keyframe(s) are not used: episodes begin in the pose of the file; "
             "keyframe='name' begins with one."
         )
+
+
+def _is_staged(mj: mujoco.MjModel) -> bool:
+    """Return whether bodies may touch in several stages of a physics step."""
+    touch = mj.nflex > 0 or bool(Couplings(mj).touches.any())
+    return touch and int(mj.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
 
 
 # --- parameters --------------------------------------------------------------------------------

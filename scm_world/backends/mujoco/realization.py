@@ -18,7 +18,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from scm_world._types import Floats, Integers
-from scm_world.backends.mujoco.contacts import Touches, earlier_stages, has_stages, touches
+from scm_world.backends.mujoco.contacts import Touches, touches
 from scm_world.backends.mujoco.slots import Slot
 from scm_world.errors import EngineFailure, Infeasible, UnknownOption
 from scm_world.models.scene import (
@@ -224,8 +224,6 @@ class Realization(ABC):
         mode: What a command means.
         command: Where it is written, shape (n_commands,).
         edited: Whether the model has changed since someone last cleared this.
-        staged: Whether a physics step has stages, each with contacts of its own.
-        began: ``mjSTATE_INTEGRATION`` before the last step, if it had stages and was taken alone.
         lean: Whether ``mjSTATE_INTEGRATION`` is all that a scene has to keep.
         replay: ``mjSTATE_INTEGRATION`` before the last steps and how many these were, if they were
             taken elsewhere, so that their contacts are not in the data.
@@ -254,8 +252,6 @@ class Realization(ABC):
         self._numbers: bytes | None = None  # of what is kept, if nothing was written since
         self.mode = self.modes[0]
         self.edited = True
-        self.staged = has_stages(model)
-        self.began: Floats | None = None
         self.replay: tuple[Floats, int] | None = None
         self.command = data.ctrl[: structure.n_commands]
         self._positions, self._velocities, self._activations = data.qpos, data.qvel, data.act
@@ -285,12 +281,12 @@ class Realization(ABC):
         places, turns = data.mocap_pos.copy(), data.mocap_quat.copy()
         mujoco.mj_resetData(self.model, data)
         data.mocap_pos[:], data.mocap_quat[:] = places, turns
-        self.began = self.replay = None
+        self.replay = None
         self._counts[:] = 1
 
     def forget(self) -> None:
         """Forget what was before a step that is made now."""
-        self.began = self.replay = None
+        self.replay = None
 
     def problem(self) -> str:
         """Say what is wrong with what a step left, or nothing."""
@@ -312,15 +308,10 @@ class Realization(ABC):
         self._counts[:] = 1
 
     def touches(self) -> Touches:
-        """Copy the contacts of the last physics step, with those of earlier stages where known."""
-        if self.replay is None:
-            found = touches(self.model, self.data, self._owners)
-        else:
-            found = self._replayed(*self.replay)
-        if self.began is not None:
-            for earlier in earlier_stages(self.model, self.began, self._owners):
-                found = found.extended(earlier)
-        return found
+        """Copy the contacts of the last physics step; of Runge-Kutta, those of its last stage."""
+        if self.replay is not None:
+            return self._replayed(*self.replay)
+        return touches(self.model, self.data, self._owners)
 
     def _replayed(self, numbers: Floats, steps: int) -> Touches:
         """Take steps again on other data, and copy the contacts of the last one."""
@@ -349,7 +340,7 @@ class Realization(ABC):
         """Restore what was kept."""
         mujoco.mj_setState(self.model, self.data, numbers, STATE)
         self._counts[:] = 1
-        self.began = self.replay = None
+        self.replay = None
 
     def follow(self, before: Realization) -> None:
         """Continue after the last step of another realization; then the state is written."""

@@ -129,7 +129,7 @@ class Program:
         self._sight = Sight(world)
         self._tool: str | None = None
         self._move: Move | None = None
-        self._goals: Floats | None = None  # for which the job was chosen
+        self._goals = np.empty((0, 4))  # for which the job was chosen
         self._idle = self._waiting = self._back = 0
         self._opens = False
         self._unit, self._next = unit(world), world.index
