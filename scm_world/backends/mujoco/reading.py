@@ -88,7 +88,7 @@ def read_model(
     )
     with understood(where):
         mj, changed = realized(sealed)
-    _check(mj, sealed, where)
+    _check(mj, where)
     start = _start(mj, keyframe)
     trees = Couplings(mj)
     names = element_names(mj)
@@ -145,7 +145,7 @@ def described(model: Model) -> ModelBodies:
     return describe(compiled(model))
 
 
-def _check(mj: mujoco.MjModel, source: Source, where: str) -> None:
+def _check(mj: mujoco.MjModel, where: str) -> None:
     """Refuse what has effects that no graph could declare.
 
     Raises:
@@ -155,14 +155,6 @@ def _check(mj: mujoco.MjModel, source: Source, where: str) -> None:
     if mj.nv == 0:
         hint = "add a joint, or a freejoint; for a URDF, fixed_base=False lets its root link move"
         problems.append(f"{where} has no joint, so that nothing in it can move; {hint}")
-    if mj.nplugin:
-        shown = ""
-        if source.text:
-            spec = mujoco.MjSpec.from_string(source.text, assets=dict(source.assets))
-            shown = f" ({', '.join(sorted({p.plugin_name for p in spec.plugins}))})"
-        problems.append(
-            f"{where} uses {mj.nplugin} plugin(s){shown}: what they act on is unknown; remove them"
-        )
     labels = element_names(mj)["actuator"]
     for i in range(mj.nactuator):
         kinds = mj.actuator_dyntype[i], mj.actuator_gaintype[i], mj.actuator_biastype[i]
