@@ -281,11 +281,11 @@ def test_a_grip_is_seen_from_where_fingertips_are() -> None:
     block = Cuboid("block", np.array([0.03, 0.035, 0.0325]), np.zeros(3), 0.0)
     table = gripped(*block.half.tolist())
     for row in range(len(table.opening)):
-        grip = table.grip(row)
+        grip = table.only(row)
         found = held(block, np.where(grip.inward == 0.0, 0.9, 1.0) * grip.touch)
         assert found is not None
-        np.testing.assert_array_equal(found.inward[list(grip.used)], grip.inward[list(grip.used)])
-        assert held(block, grip.points(1.1 * TOUCHING)) is None
+        np.testing.assert_array_equal(found.inward[grip.used], grip.inward[grip.used])
+        assert held(block, grip.touch - 1.1 * TOUCHING * np.sign(grip.inward)) is None
     corner = np.array([[0.0395, 0.0, 0.0], [0.0, 0.0445, 0.0], [0.2, 0.0, 0.0]])
     assert held(block, corner) is None
 

@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ActionError
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, smallest, turn_about_z, unit
@@ -22,7 +22,6 @@ from scm_world.tasks.trifinger.grasping.ways import (
     SAMPLES,
     Grip,
     Move,
-    Planner,
 )
 
 FREE = np.zeros((3, 3))
@@ -166,7 +165,7 @@ class Program:
             place = tips.copy()
             place[:, 2] = np.maximum(tips[:, 2], 0.09)
             return self._to(place, TRAVEL, tips, before)
-        body, grip, used = self._body(), move.grip, np.array(move.grip.used)
+        body, grip, used = self._body(), move.grip, move.grip.used
         own = body.own(tips)
         inward, away = np.sign(grip.inward), own - grip.touch
         across = -(away * inward).sum(axis=1)
@@ -185,7 +184,7 @@ class Program:
             return self._carry(move, body, tips, before)
         self._waiting += 1
         if gap < grip.opening + BESIDE and side < ASIDE:
-            opening = float(np.interp(side, (STRAIGHT, OBLIQUE), (-INTO, grip.opening)))
+            opening = float(np.interp(side, (STRAIGHT, OBLIQUE), (-INTO, float(grip.opening))))
             return self._to(self._place(move, body, opening), CLOSE, tips, before)
         return self._to(self._way(move, body, tips, own), TRAVEL, tips, before)
 
@@ -221,7 +220,7 @@ class Program:
 
     def _open(self, move: Move, body: Cuboid) -> bool:
         """Tell whether fingers have let go."""
-        used = np.array(move.grip.used)
+        used = move.grip.used
         tips = self._sight.hand.tips(self._sight.joints).reshape(3, 3)
         away = np.abs(tips - self._place(move, body, 0.0))[used].max(axis=1)
         return bool(away.min() > 0.8 * move.grip.opening)
@@ -233,9 +232,8 @@ class Program:
 
     # --- fingers without a block -------------------------------------------------------------
 
-    def _place(self, move: Move, body: Cuboid, opening: float) -> Floats:
-        planner = Planner(self._sight.hand, self._sight.joints, ())
-        return planner.place(move.grip, body, opening)
+    def _place(self, move: Move, body: Cuboid, opening: ArrayLike) -> Floats:
+        return move.grip.place(self._sight.hand, body, opening)
 
     def _to(self, place: Floats, rate: float, tips: Floats, before: Floats) -> Floats:
         """Bring fingertips nearer to places, shape (3, 3) [m]."""
@@ -252,7 +250,7 @@ class Program:
 
         They go away from faces first, then up, then above the grip, then down a funnel.
         """
-        used = np.array(move.grip.used)
+        used = move.grip.used
         place = self._place(move, body, move.grip.opening)
         far = float(np.linalg.norm((place - tips)[used, :2], axis=1).max())
         rise = np.minimum(move.above - place[used, 2], FUNNEL * max(far - NEAR, 0.0))
@@ -281,7 +279,7 @@ class Program:
         """Press, and bring the block nearer to its end."""
         sight, grip = self._sight, move.grip
         hand, joints, tool = sight.hand, sight.joints, str(self._tool)
-        used, shares = np.array(grip.used), np.abs(grip.inward).max(axis=1)
+        used, shares = grip.used, np.abs(grip.inward).max(axis=1)
         wanted, strength, follows = sight.wanted(tool), move.strength, 1.0
         turn = turn_about_z(body.yaw).T
         if sight.walls:  # a block that is carried over a wall must not slip
@@ -373,8 +371,7 @@ def held(body: Cuboid, own: Floats) -> Grip | None:
             touch, inward = own.copy(), np.zeros((3, 3))
             touch[touches, axis] = side[touches] * out
             inward[each, axis] = two / two.sum() - one / one.sum()
-            first, second, third = touches.tolist()
-            return Grip(touch, inward, (first, second, third), OPENINGS[0])
+            return Grip(touch, inward, touches, np.array(OPENINGS[0]))
     return None
 
 

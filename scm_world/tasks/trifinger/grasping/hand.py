@@ -161,30 +161,25 @@ def pressing(joints: Floats, height: float, forces: Floats) -> Floats:
 
 
 @njit(cache=True)
-def _poses_kernel(
-    tips: Floats,
-    near: Floats,
-    height: float,
-    halves: Floats,
-    centers: Floats,
-    turns: Floats,
-    joints: Floats,
-    reached: NDArray[np.bool_],
-    depths: Floats,
-) -> None:
-    """Write what ``Hand.poses`` returns into the last three."""
-    fingers = np.empty(N_FINGERS, dtype=np.bool_)
+def _poses(
+    tips: Floats, near: Floats, height: float, halves: Floats, centers: Floats, turns: Floats
+) -> tuple[Floats, NDArray[np.bool_], Floats]:
+    """Compute what ``Hand.poses`` returns."""
+    joints, fingers = np.empty(tips.shape), np.empty(N_FINGERS, dtype=np.bool_)
+    reached, depths = np.empty(len(tips), dtype=np.bool_), np.empty(len(tips))
     for row in range(len(tips)):
         inverse_kernel(tips[row], height, near[row], joints[row], fingers)
         reached[row] = fingers.all()
         depths[row] = deepest_kernel(joints[row], height, halves, centers, turns)
+    return joints, reached, depths
 
 
 @njit(cache=True)
-def _strengths_kernel(
-    joints: Floats, height: float, weights: Floats, limit: float, forces: Floats, out: Floats
-) -> None:
-    """Write what ``Hand.strengths`` returns into ``out`` (n,)."""
+def _strengths(
+    joints: Floats, height: float, weights: Floats, limit: float, forces: Floats
+) -> Floats:
+    """Compute what ``Hand.strengths`` returns."""
+    out = np.empty(len(joints))
     for row in range(len(joints)):
         own, unit = carrying(joints[row], weights), pressing(joints[row], height, forces[row])
         least = math.inf
@@ -193,6 +188,7 @@ def _strengths_kernel(
                 room = limit - own[joint] * np.sign(unit[joint])
                 least = min(least, room / abs(unit[joint]))
         out[row] = max(least, 0.0)
+    return out
 
 
 @final
@@ -201,6 +197,9 @@ class Hand:
 
     Args:
         values: Of the variables of a world.
+
+    Attributes:
+        aside: Where unused fingertips are, shape (3, 3) [m].
     """
 
     def __init__(self, values: Mapping[str, Value]) -> None:
@@ -214,6 +213,7 @@ class Hand:
                 for finger in hardware.FINGERS
             ]
         )
+        self.aside = self.tips(np.array(hardware.ASIDE)).reshape(3, 3)
 
     def solve(self, tips: Floats, near: Floats) -> Floats:
         """Compute the joints for fingertips, shape (9,) [m], as near as they are reached."""
@@ -259,21 +259,15 @@ class Hand:
             Joints, shape (n, 9) [rad]; whether all fingertips are reached, shape (n,); and the
             depths, shape (n,) [m].
         """
-        joints, reached, depths = (
-            np.empty(tips.shape),
-            np.empty(len(tips), bool),
-            np.empty(len(tips)),
-        )
-        _poses_kernel(tips, near, self.height, *boxes, joints, reached, depths)
-        return joints, reached, depths
+        found: tuple[Floats, NDArray[np.bool_], Floats] = _poses(tips, near, self.height, *boxes)
+        return found
 
     def strengths(self, joints: Floats, forces: Floats) -> Floats:
-        """Tell how many times some forces the fingers can exert, shape (n,).
+        """Compute how many times some forces the fingers can exert, shape (n,).
 
         Args:
             joints: Shape (n, 9) [rad].
             forces: Shape (n, 3, 3).
         """
-        strengths = np.empty(len(joints))
-        _strengths_kernel(joints, self.height, self.weights, self._limit, forces, strengths)
-        return strengths
+        found: Floats = _strengths(joints, self.height, self.weights, self._limit, forces)
+        return found

@@ -12,8 +12,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._types import Floats
-from scm_world.tasks.trifinger import hardware
+from scm_world._types import ArrayLike, Floats
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, solids, turn_about_z
 from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand
 
@@ -33,41 +32,13 @@ _Point = tuple[float, float, float]
 @final
 @dataclass(frozen=True)
 class Grip:
-    """Where fingertips touch a block, in its own frame.
+    """Where fingertips touch a block, in its own frame; or n such grips, with a leading axis.
 
     Attributes:
         touch: Centers of the fingertips as they touch, shape (3, 3) [m].
         inward: In which direction they press, each force as a share of the grip's, shape (3, 3).
-        used: Which fingers take part.
-        opening: How far from there they are while open [m].
-    """
-
-    touch: Floats
-    inward: Floats
-    used: tuple[bool, bool, bool]
-    opening: float
-
-    @property
-    def firm(self) -> bool:
-        """Whether all fingers take part, so that the block cannot swing."""
-        return all(self.used)
-
-    def points(self, opening: float) -> Floats:
-        """Give the fingertips at a distance from the faces, shape (3, 3) [m]."""
-        points: Floats = self.touch - opening * np.sign(self.inward)
-        return points
-
-
-@final
-@dataclass(frozen=True)
-class Grips:
-    """A table of grips; see ``Grip``.
-
-    Attributes:
-        touch: Shape (n, 3, 3) [m].
-        inward: Shape (n, 3, 3).
-        used: Shape (n, 3).
-        opening: Shape (n,) [m].
+        used: Which fingers take part, shape (3,).
+        opening: How far from there they are while open, shape () [m].
     """
 
     touch: Floats
@@ -75,18 +46,30 @@ class Grips:
     used: NDArray[np.bool_]
     opening: Floats
 
-    def only(self, rows: Any) -> Grips:
-        """Return some of them, by a mask or by their numbers."""
-        return Grips(self.touch[rows], self.inward[rows], self.used[rows], self.opening[rows])
+    @property
+    def firm(self) -> Any:
+        """Whether all fingers take part, so that the block cannot swing."""
+        return self.used.all(axis=-1)
 
-    def grip(self, row: int) -> Grip:
-        """Return one of them."""
-        one, two, three = self.used[row].tolist()
-        return Grip(self.touch[row], self.inward[row], (one, two, three), float(self.opening[row]))
+    def only(self, rows: Any) -> Grip:
+        """Return some of n grips, by a mask or by their numbers."""
+        return Grip(self.touch[rows], self.inward[rows], self.used[rows], self.opening[rows])
+
+    def place(self, hand: Hand, body: Cuboid, opening: ArrayLike) -> Floats:
+        """Place the fingertips about a block, shape (3, 3) [m]; unused ones are out of the way.
+
+        Args:
+            hand: The robot.
+            body: The block.
+            opening: How far from its faces the fingertips are, shape () [m].
+        """
+        points = self.touch - np.reshape(opening, (-1, 1, 1)) * np.sign(self.inward)
+        tips = np.where(self.used[..., None], body.world(points), hand.aside)
+        return tips.reshape(self.touch.shape)
 
 
 @lru_cache(maxsize=64)
-def gripped(x: float, y: float, z: float) -> Grips:
+def gripped(x: float, y: float, z: float) -> Grip:
     """List the ways to hold a block with these half edges [m]: one finger against two, or one."""
     half, found = (x, y, z), list[tuple[Floats, Floats, float]]()
     for axis, level, opening in product((0, 1), LEVELS, OPENINGS):
@@ -109,7 +92,7 @@ def gripped(x: float, y: float, z: float) -> Grips:
     touches, presses, openings = zip(*found, strict=True)
     inwards: Floats = np.array(presses)
     used: NDArray[np.bool_] = np.any(inwards != 0.0, axis=2)
-    return Grips(np.array(touches), inwards, used, np.array(openings))
+    return Grip(np.array(touches), inwards, used, np.array(openings))
 
 
 Way = tuple[Cuboid, float]
@@ -148,7 +131,6 @@ class Move:
         height: Of its center as it is carried [m].
         above: Of the fingertips on their way to it, and away [m].
         strength: With which it can be pressed everywhere on the way [N].
-        worth: How good the way is; more is better.
         release: Whether it is let go at the end.
     """
 
@@ -159,7 +141,6 @@ class Move:
     height: float
     above: float
     strength: float
-    worth: float
     release: bool
 
     @property
@@ -182,7 +163,6 @@ class Planner:
         self._hand, self._joints = hand, joints
         self._others = tuple(others)
         self._boxes = solids(self._others, CLEAR)
-        self._aside = hand.tips(np.array(hardware.ASIDE)).reshape(3, 3)
 
     def best(
         self,
@@ -217,7 +197,7 @@ class Planner:
         table = table.only(self._opens(table, start, over))
         first = self._strengths(table, start)
         table, first = table.only(first > 0.0), first[first > 0.0]
-        ease = FIRMNESS * table.used.all(axis=1) - TIGHT * (table.opening < max(OPENINGS))
+        ease = FIRMNESS * table.firm - TIGHT * (table.opening < max(OPENINGS))
         ease += self._transit(table, start, over)
         worths, strengths = (
             np.full((len(ease), len(ways)), -np.inf),
@@ -236,33 +216,15 @@ class Planner:
             share = held / wanted
             enough = np.minimum(share, 1.0) + PLENTY * np.minimum(share, 3.0)
             loose = 2.0 * FIRMNESS * (height > start.place[2] + CLEARANCE)
-            worths[rows, way] = (
-                ease[rows] - loose * table.used[rows].all(axis=1) - TURNING * abs(turn) + enough
-            )
+            worths[rows, way] = ease[rows] - loose * table.firm[rows] - TURNING * abs(turn) + enough
             strengths[rows, way] = held
         if not np.isfinite(worths).any():
             return None
         row, way = divmod(int(worths.argmax()), len(ways))
         _, turn, height, end = ways[way]
         above = self._above(start, *[end] * release)
-        numbers = float(strengths[row, way]), float(worths[row, way])
-        return Move(table.grip(row), start, end, turn, height, above, *numbers, release)
-
-    def place(self, grip: Grip, body: Cuboid, opening: float) -> Floats:
-        """Place the fingertips about a block.
-
-        Args:
-            grip: How it is held.
-            body: Where it is.
-            opening: How far from its faces the fingertips are [m].
-
-        Returns:
-            Shape (3, 3) [m]; unused fingers are out of the way.
-        """
-        tips = body.world(grip.points(opening))
-        idle = ~np.array(grip.used)
-        tips[idle] = self._aside[idle]
-        return tips
+        strength = float(strengths[row, way])
+        return Move(table.only(row), start, end, turn, height, above, strength, release)
 
     # --- heights ------------------------------------------------------------------------------
 
@@ -284,42 +246,29 @@ class Planner:
 
     # --- judging ------------------------------------------------------------------------------
 
-    def _tips(
-        self, table: Grips, body: Cuboid, opening: Floats | float, above: float | None = None
-    ) -> Floats:
-        """Place the fingertips about a block for each grip, shape (n, 9) [m]; see ``place``."""
-        points = table.touch - np.reshape(opening, (-1, 1, 1)) * np.sign(table.inward)
-        tips = body.place + points @ turn_about_z(body.yaw).T
-        if above is not None:
-            tips[..., 2] = above
-        placed: Floats = np.where(table.used[..., None], tips, self._aside).reshape(-1, 9)
-        return placed
-
-    def _strengths(self, table: Grips, body: Cuboid) -> Floats:
+    def _strengths(self, table: Grip, body: Cuboid) -> Floats:
         """Find with which force grips can hold a block somewhere, shape (n,) [N]; 0 if not."""
-        joints, reached, depth = self._poses(
-            self._tips(table, body, 0.0), block=body, margin=-TOUCH
-        )
+        tips = table.place(self._hand, body, 0.0)
+        joints, reached, depth = self._poses(tips, block=body, margin=-TOUCH)
         forces = table.inward @ turn_about_z(body.yaw).T
         strengths = self._hand.strengths(joints, forces)
         return np.where(reached & (depth <= 0.0), strengths, 0.0)
 
-    def _opens(self, table: Grips, body: Cuboid, above: float) -> NDArray[np.bool_]:
+    def _opens(self, table: Grip, body: Cuboid, above: float) -> NDArray[np.bool_]:
         """Tell whether open fingers can be about a block, and above it, shape (n,)."""
-        tips = self._tips(table, body, table.opening)
+        tips = table.place(self._hand, body, table.opening)
         joints, reached, depth = self._poses(tips, block=body, margin=OPEN)
         opens = reached & (depth <= 0.0)
-        tips = self._tips(table.only(opens), body, table.opening[opens], above)
-        _, reached, depth = self._poses(tips, near=joints[opens])
+        _, reached, depth = self._poses(_above(tips, table, above)[opens], near=joints[opens])
         opens[opens] = reached & (depth <= 0.0)
         return opens
 
-    def _transit(self, table: Grips, body: Cuboid, above: float) -> Floats:
+    def _transit(self, table: Grip, body: Cuboid, above: float) -> Floats:
         """Judge ways to the block: fingers should not meet; the shorter, the better. Shape (n,)."""
-        first = self._hand.tips(self._joints)
-        first[2::3] = np.maximum(first[2::3], above)
-        last = self._tips(table, body, table.opening, above)
-        worth: Floats = -REACHING * np.abs(last - first).max(axis=1, initial=0.0)
+        first = self._hand.tips(self._joints).reshape(3, 3)
+        first[:, 2] = np.maximum(first[:, 2], above)
+        last = _above(table.place(self._hand, body, table.opening), table, above)
+        worth: Floats = -REACHING * np.abs(last - first).max(axis=(1, 2), initial=0.0)
         for share in (0.3, 0.6, 0.9):
             _, _, depth = self._poses((1.0 - share) * first + share * last)
             worth -= MEETING * (depth > 0.0)
@@ -341,5 +290,13 @@ class Planner:
                 np.concatenate([boxes[1], place]),
                 np.concatenate([boxes[2], axes]),
             )
-        begin = np.broadcast_to(self._joints, tips.shape) if near is None else near
-        return self._hand.poses(tips, np.ascontiguousarray(begin), boxes)
+        rows = np.ascontiguousarray(tips).reshape(-1, 9)
+        begin = np.tile(self._joints, (len(rows), 1)) if near is None else near
+        return self._hand.poses(rows, np.ascontiguousarray(begin), boxes)
+
+
+def _above(tips: Floats, table: Grip, height: float) -> Floats:
+    """Bring the fingertips of grips to a height, shape (n, 3, 3) [m]; unused ones stay."""
+    raised = tips.copy()
+    raised[..., 2] = np.where(table.used, height, tips[..., 2])
+    return raised
