@@ -227,16 +227,13 @@ def tendon_unit(mj: mujoco.MjModel, tendon: int) -> str:
 
 def _length_unit(mj: mujoco.MjModel, actuator: int) -> str:
     """Return the unit of the length of an actuator; ``"1"`` where a gear or several axes mix it."""
-    target = int(mj.actuator_trnid[actuator, 0])
+    kind, target = int(mj.actuator_trntype[actuator]), int(mj.actuator_trnid[actuator, 0])
     if mj.actuator_gear[int(mj.actuator_outadr[actuator]), 0] != 1.0:
         return "1"
-    match mujoco.mjtTrn(int(mj.actuator_trntype[actuator])):
-        case _TRN.mjTRN_JOINT:
-            return {HINGE: "rad", SLIDE: "m"}.get(int(mj.jnt_type[target]), "1")
-        case _TRN.mjTRN_TENDON:
-            return tendon_unit(mj, target)
-        case _:
-            return "1"
+    if kind == int(_TRN.mjTRN_TENDON):
+        return tendon_unit(mj, target)
+    joint = int(mj.jnt_type[target]) if kind == int(_TRN.mjTRN_JOINT) else FREE
+    return {HINGE: "rad", SLIDE: "m"}.get(joint, "1")
 
 
 def servo(mj: mujoco.MjModel, actuator: int) -> str:
@@ -413,6 +410,7 @@ def _pose(kind: str, what: str) -> tuple[Row, Row]:
 
 def _solver(prefix: str, suffix: str = "", **rest: Any) -> tuple[Row, Row]:
     """List how stiff and how hard a constraint is."""
+    rest["usual"] = False
 
     def doc(e: Element) -> str:
         if (getattr(e.mj, f"{prefix}_solref")[e.i] < 0.0).any():
@@ -423,11 +421,11 @@ def _solver(prefix: str, suffix: str = "", **rest: Any) -> tuple[Row, Row]:
         return -math.inf if (v < 0.0).any() else (_positive(v[0]), _positive(v[1]))
 
     return (
-        Row(f"solref{suffix}", "1", doc, f"{prefix}_solref", usual=False, low=low,
+        Row(f"solref{suffix}", "1", doc, f"{prefix}_solref", low=low,
             high=lambda v: 0.0 if (v < 0.0).any() else math.inf, **rest),
         Row(f"solimp{suffix}", "1",
             "Smallest and largest impedance, width of the transition, its midpoint and power.",
-            f"{prefix}_solimp", usual=False, low=(0.0, 0.0, 0.0, 0.0, 1.0),
+            f"{prefix}_solimp", low=(0.0, 0.0, 0.0, 0.0, 1.0),
             high=(1.0, 1.0, math.inf, 1.0, math.inf), **rest),
     )  # fmt: skip
 
@@ -520,6 +518,13 @@ def _scalar(e: Element) -> bool:
     return e["type"] in (SLIDE, HINGE)
 
 
+_LIMITED: dict[str, Any] = {
+    "exists": _scalar,
+    "usual": False,
+    "flags": _LIMIT,
+    "acts": lambda e: e["limited"],
+    "reason": _UNLIMITED,
+}
 _JOINT = (
     Row("damping", "{F} s/{L}", "Force against the motion, for each unit of velocity.",
         "dof_damping", lambda e: e.dofs, low=0.0, usual=_resisted, flags=_DAMPER,
@@ -537,14 +542,10 @@ _JOINT = (
         usual=lambda e, v: bool(e["stiffness"])),
     Row("ref", "{L}", "Position of the joint in the pose of the file.", "qpos0",
         lambda e: int(e["qposadr"]), constant=True, exists=_scalar, usual=False),
-    Row("range", "{L}", "Lower and upper limit of the joint.", "jnt_range",
-        exists=_scalar, usual=False, flags=_LIMIT, acts=lambda e: e["limited"],
-        reason=_UNLIMITED),
-    Row("margin", "{L}", "Distance from the limits at which they begin to act.",
-        "jnt_margin", low=0.0, exists=_scalar, usual=False, flags=_LIMIT,
-        acts=lambda e: e["limited"], reason=_UNLIMITED),
-    *_solver("jnt", "limit", exists=_scalar, flags=_LIMIT, acts=lambda e: e["limited"],
-             reason=_UNLIMITED),
+    Row("range", "{L}", "Lower and upper limit of the joint.", "jnt_range", **_LIMITED),
+    Row("margin", "{L}", "Distance from the limits at which they begin to act.", "jnt_margin",
+        low=0.0, **_LIMITED),
+    *_solver("jnt", "limit", **_LIMITED),
     Row("actuatorfrcrange", "{F}", "Range of the force of all its actuators.",
         "jnt_actfrcrange", exists=_scalar, usual=False, acts=lambda e: e["actfrclimited"],
         reason=_UNLIMITED),
@@ -866,44 +867,32 @@ def _free(name: str, taken: set[str]) -> str:
 def _made(
     mj: mujoco.MjModel, kind: str, i: int, names: list[str], found: Mapping[str, tuple[str, ...]]
 ) -> str:
-    """Name an element that has no name."""
+    """Name an element that has no name: after its body, its shapes or what it acts on."""
     match kind:
         case "body":
             parent = int(mj.body_parentid[i])
-            siblings = np.flatnonzero(mj.body_parentid == parent).tolist()
-            return f"{names[parent]}_body_{[s for s in siblings if s].index(i)}"
-        case "joint":
-            body = int(mj.jnt_bodyid[i])
-            if mj.body_jntnum[body] == 1:
-                return found["body"][body]
-            return f"{found['body'][body]}_joint_{i - int(mj.body_jntadr[body])}"
-        case "geom":
-            body = int(mj.geom_bodyid[i])
-            return f"{found['body'][body]}_geom_{i - int(mj.body_geomadr[body])}"
-        case "site":
-            body = int(mj.site_bodyid[i])
-            before = int(np.count_nonzero(mj.site_bodyid[:i] == body))
-            return f"{found['body'][body]}_site_{before}"
+            before = int(np.count_nonzero(mj.body_parentid[1:i] == parent))
+            return f"{names[parent]}_body_{before}"
+        case "joint" | "geom" | "site":
+            bodies = getattr(mj, f"{KINDS[kind].prefix}_bodyid")
+            body = found["body"][int(bodies[i])]
+            if kind == "joint" and mj.body_jntnum[bodies[i]] == 1:
+                return body
+            return f"{body}_{kind}_{int(np.count_nonzero(bodies[:i] == bodies[i]))}"
         case "actuator":
-            return _target(mj, i, found)
+            acts, (target, second) = int(mj.actuator_trntype[i]), mj.actuator_trnid[i].tolist()
+            on_site = acts == int(_TRN.mjTRN_SO3) and second >= 0
+            of = "site" if on_site else _ACTS_ON.get(acts, "joint")
+            return found[of][int(target)]
         case "pair":
-            geoms = found["geom"]
-            return f"{geoms[int(mj.pair_geom1[i])]}_{geoms[int(mj.pair_geom2[i])]}"
+            return "_".join(found["geom"][pair[i]] for pair in (mj.pair_geom1, mj.pair_geom2))
         case _:
             return f"{kind}_{i}"
 
 
-def _target(mj: mujoco.MjModel, actuator: int, found: Mapping[str, tuple[str, ...]]) -> str:
-    """Name what an actuator acts on."""
-    target = int(mj.actuator_trnid[actuator, 0])
-    match mujoco.mjtTrn(int(mj.actuator_trntype[actuator])):
-        case _TRN.mjTRN_TENDON:
-            return found["tendon"][target]
-        case _TRN.mjTRN_SITE | _TRN.mjTRN_SLIDERCRANK:
-            return found["site"][target]
-        case _TRN.mjTRN_BODY:
-            return found["body"][target]
-        case _TRN.mjTRN_SO3 if mj.actuator_trnid[actuator, 1] >= 0:
-            return found["site"][target]
-        case _:
-            return found["joint"][target]
+_ACTS_ON = {
+    int(_TRN.mjTRN_TENDON): "tendon",
+    int(_TRN.mjTRN_SITE): "site",
+    int(_TRN.mjTRN_SLIDERCRANK): "site",
+    int(_TRN.mjTRN_BODY): "body",
+}
