@@ -124,15 +124,20 @@ def turns(block: Cuboid, goal: Cuboid) -> tuple[float, ...]:
     return tuple(sorted(fitting, key=abs))
 
 
-def solids(bodies: Iterable[Cuboid], grow: float = 0.0) -> tuple[Floats, Floats, Floats]:
-    """Gather half edges, centers and axes of boxes: shapes (n, 3), (n, 3) and (n, 3, 3)."""
+def solids(bodies: Iterable[tuple[Cuboid, float]]) -> tuple[Floats, Floats, Floats]:
+    """Gather half edges, centers and axes of boxes: shapes (n, 3), (n, 3) and (n, 3, 3).
+
+    Args:
+        bodies: Each with a length by which its sides are moved outwards [m].
+    """
     listed = list(bodies)
-    if not listed:
-        return np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3))
+    halves = [body.half + grow for body, grow in listed]
+    centers = [body.place for body, _ in listed]
+    axes = [turn_about_z(body.yaw) for body, _ in listed]
     return (
-        np.array([body.half + grow for body in listed]),
-        np.array([body.place for body in listed]),
-        np.array([turn_about_z(body.yaw) for body in listed]),
+        np.array(halves).reshape(-1, 3),
+        np.array(centers).reshape(-1, 3),
+        np.array(axes).reshape(-1, 3, 3),
     )
 
 

@@ -112,8 +112,6 @@ SAMPLES = 9
 FIRMNESS = 0.5
 TURNING = 0.3  # [1/rad]
 TIGHT = 0.1
-REACHING = 0.5  # [1/m]
-MEETING = 0.3
 PLENTY = 0.05
 """What makes a way better or worse. A force that is just enough is worth 1."""
 
@@ -162,7 +160,6 @@ class Planner:
     def __init__(self, hand: Hand, joints: Floats, others: Iterable[Cuboid]) -> None:
         self._hand, self._joints = hand, joints
         self._others = tuple(others)
-        self._boxes = solids(self._others, CLEAR)
 
     def best(
         self,
@@ -198,7 +195,6 @@ class Planner:
         first = self._strengths(table, start)
         table, first = table.only(first > 0.0), first[first > 0.0]
         ease = FIRMNESS * table.firm - TIGHT * (table.opening < max(OPENINGS))
-        ease += self._transit(table, start, over)
         worths, strengths = (
             np.full((len(ease), len(ways)), -np.inf),
             np.zeros((len(ease), len(ways))),
@@ -249,7 +245,7 @@ class Planner:
     def _strengths(self, table: Grip, body: Cuboid) -> Floats:
         """Find with which force grips can hold a block somewhere, shape (n,) [N]; 0 if not."""
         tips = table.place(self._hand, body, 0.0)
-        joints, reached, depth = self._poses(tips, block=body, margin=-TOUCH)
+        joints, reached, depth = self._poses(tips, None, (body, -TOUCH))
         forces = table.inward @ turn_about_z(body.yaw).T
         strengths = self._hand.strengths(joints, forces)
         return np.where(reached & (depth <= 0.0), strengths, 0.0)
@@ -257,42 +253,20 @@ class Planner:
     def _opens(self, table: Grip, body: Cuboid, above: float) -> NDArray[np.bool_]:
         """Tell whether open fingers can be about a block, and above it, shape (n,)."""
         tips = table.place(self._hand, body, table.opening)
-        joints, reached, depth = self._poses(tips, block=body, margin=OPEN)
+        joints, reached, depth = self._poses(tips, None, (body, OPEN))
         opens = reached & (depth <= 0.0)
-        _, reached, depth = self._poses(_above(tips, table, above)[opens], near=joints[opens])
+        _, reached, depth = self._poses(_above(tips, table, above)[opens], joints[opens])
         opens[opens] = reached & (depth <= 0.0)
         return opens
 
-    def _transit(self, table: Grip, body: Cuboid, above: float) -> Floats:
-        """Judge ways to the block: fingers should not meet; the shorter, the better. Shape (n,)."""
-        first = self._hand.tips(self._joints).reshape(3, 3)
-        first[:, 2] = np.maximum(first[:, 2], above)
-        last = _above(table.place(self._hand, body, table.opening), table, above)
-        worth: Floats = -REACHING * np.abs(last - first).max(axis=(1, 2), initial=0.0)
-        for share in (0.3, 0.6, 0.9):
-            _, _, depth = self._poses((1.0 - share) * first + share * last)
-            worth -= MEETING * (depth > 0.0)
-        return worth
-
     def _poses(
-        self,
-        tips: Floats,
-        near: Floats | None = None,
-        block: Cuboid | None = None,
-        margin: float = 0.0,
+        self, tips: Floats, near: Floats | None = None, *more: tuple[Cuboid, float]
     ) -> tuple[Floats, NDArray[np.bool_], Floats]:
         """Find joints for fingertips, and how deep fingers then lie in anything; see ``Hand``."""
-        boxes = self._boxes
-        if block is not None:
-            half, place, axes = solids([block], margin)
-            boxes = (
-                np.concatenate([boxes[0], half]),
-                np.concatenate([boxes[1], place]),
-                np.concatenate([boxes[2], axes]),
-            )
         rows = np.ascontiguousarray(tips).reshape(-1, 9)
         begin = np.tile(self._joints, (len(rows), 1)) if near is None else near
-        return self._hand.poses(rows, np.ascontiguousarray(begin), boxes)
+        clear = ((other, CLEAR) for other in self._others)
+        return self._hand.poses(rows, begin, solids((*clear, *more)))
 
 
 def _above(tips: Floats, table: Grip, height: float) -> Floats:
