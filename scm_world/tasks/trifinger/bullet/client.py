@@ -10,7 +10,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.bullet.client import Client, Values, arrays, known
+from scm_world.backends.bullet.client import Values, arrays, known
 from scm_world.errors import EngineFailure
 from scm_world.geometry.hulls import Hull
 from scm_world.models.scene import ParameterKey
@@ -25,6 +25,7 @@ from scm_world.tasks.trifinger.bullet.arena import (
     Shape,
     link_index,
 )
+from scm_world.tasks.trifinger.bullet.base import Client
 from scm_world.tasks.trifinger.bullet.passive import MASSES, resistance
 from scm_world.tasks.trifinger.hardware import ControllerSpec, controller_spec
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
@@ -157,6 +158,7 @@ class TriFingerClient(Client):
         self._timestep = 0.0
         self._laws: dict[bool, Law] = {}
         self._torques = False
+        self.furnish()
 
     @staticmethod
     def keys(structure: TriFinger) -> Iterable[ParameterKey]:

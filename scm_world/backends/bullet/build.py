@@ -1,0 +1,394 @@
+"""The bodies of a compiled model in a physics client.
+
+What can move is one multibody for each kinematic tree. A body is one link for each of its joints,
+all but the last without mass, and each of its shapes is a further link without mass that is fixed
+to the last. So shapes of one body can differ in what they touch, have frames of their own, and no
+link has two of them. A shape that cannot move is a body by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, final
+
+import mujoco
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.backends.mujoco.trees import Couplings
+
+Handle = tuple[int, int]
+"""A multibody and a link of it; -1 is its base."""
+
+MOVING, STATIC = 1, 2
+"""Collision groups. What cannot move never touches what cannot move."""
+
+FASTEST = 1e4  # [rad/s] or [m/s]; the engine would cut at 100
+HULL_MARGIN = 1e-5  # [m] a mesh is inflated by so much
+GEAR_ERP = 0.2  # share of the error of a coupling that a step takes away
+STRONGEST = 1e9  # [N m] or [N] of a coupling
+
+FREE, BALL, SLIDE, HINGE = (
+    int(mujoco.mjtJoint.mjJNT_FREE),
+    int(mujoco.mjtJoint.mjJNT_BALL),
+    int(mujoco.mjtJoint.mjJNT_SLIDE),
+    int(mujoco.mjtJoint.mjJNT_HINGE),
+)
+PLANE, SPHERE, CAPSULE, CYLINDER, BOX, MESH = (
+    int(mujoco.mjtGeom.mjGEOM_PLANE),
+    int(mujoco.mjtGeom.mjGEOM_SPHERE),
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE),
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER),
+    int(mujoco.mjtGeom.mjGEOM_BOX),
+    int(mujoco.mjtGeom.mjGEOM_MESH),
+)
+SHAPES = (PLANE, SPHERE, CAPSULE, CYLINDER, BOX, MESH)
+"""The shapes that the engine has."""
+
+UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@final
+@dataclass
+class Built:
+    """The engine's numbers of everything.
+
+    Attributes:
+        bodies: The link that carries the mass of each body that can move, by its number.
+        joints: The link of each joint, by its number; the base of a free body.
+        geoms: The link of each shape that can touch something, by its number.
+        groups: Link, group and mask of each shape that can move.
+    """
+
+    bodies: dict[int, Handle] = field(default_factory=dict)
+    joints: dict[int, Handle] = field(default_factory=dict)
+    geoms: dict[int, Handle] = field(default_factory=dict)
+    groups: list[tuple[int, int, int, int]] = field(default_factory=list)
+
+
+def build(engine: Any, client: int, mj: mujoco.MjModel) -> Built:
+    """Make everything, in an empty client; without motors, damping and sleep."""
+    built, data = Built(), mujoco.MjData(mj)
+    mujoco.mj_kinematics(mj, data)
+    touches = Couplings(mj).touches
+    shapes = np.flatnonzero(touches.any(axis=1)).tolist()
+    turn = np.empty(4)
+    for geom in shapes:
+        if mj.body_treeid[mj.geom_bodyid[geom]] < 0:
+            mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
+            fixed = engine.createMultiBody(
+                0,
+                _shape(engine, client, mj, geom),
+                basePosition=data.geom_xpos[geom].tolist(),
+                baseOrientation=plain(turn),
+                useMaximalCoordinates=True,
+                physicsClientId=client,
+            )
+            built.geoms[geom] = (fixed, -1)
+    for tree in range(mj.ntree):
+        _add_tree(engine, client, mj, data, tree, shapes, built)
+    for geom, handle in built.geoms.items():
+        if mj.geom_type[geom] == MESH:
+            engine.changeDynamics(*handle, collisionMargin=HULL_MARGIN, physicsClientId=client)
+    for equality in couplings(mj):
+        _couple(engine, client, mj, equality, built)
+    _choose_pairs(engine, client, mj, touches, built)
+    return built
+
+
+def plain(turn: Floats) -> list[float]:
+    """Turn a quaternion of MuJoCo (w, x, y, z) into one of the engine (x, y, z, w)."""
+    w, x, y, z = turn.tolist()
+    return [x, y, z, w]
+
+
+def joints_of(mj: mujoco.MjModel, body: int) -> range:
+    """List the joints between a body and its parent."""
+    first = int(mj.body_jntadr[body])
+    return range(first, first + int(mj.body_jntnum[body]))
+
+
+def couplings(mj: mujoco.MjModel) -> Iterator[int]:
+    """List the equality constraints that are in force."""
+    off = mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    if not mj.opt.disableflags & int(off):
+        yield from np.flatnonzero(mj.eq_active0).tolist()
+
+
+def _shape(engine: Any, client: int, mj: mujoco.MjModel, geom: int) -> int:
+    """Make a collision shape."""
+    radius, half, _ = size = mj.geom_size[geom].tolist()
+    kind, options = {
+        PLANE: (engine.GEOM_PLANE, {"planeNormal": [0.0, 0.0, 1.0]}),
+        SPHERE: (engine.GEOM_SPHERE, {"radius": radius}),
+        CAPSULE: (engine.GEOM_CAPSULE, {"radius": radius, "height": 2.0 * half}),
+        CYLINDER: (engine.GEOM_CYLINDER, {"radius": radius, "height": 2.0 * half}),
+        BOX: (engine.GEOM_BOX, {"halfExtents": size}),
+        MESH: (engine.GEOM_MESH, {}),
+    }[int(mj.geom_type[geom])]
+    if kind == engine.GEOM_MESH:
+        options["vertices"] = _corners(mj, int(mj.geom_dataid[geom]))
+    shape: int = engine.createCollisionShape(kind, physicsClientId=client, **options)
+    return shape
+
+
+def _corners(mj: mujoco.MjModel, mesh: int) -> list[list[float]]:
+    """List the corners of the convex hull of a mesh [m]."""
+    first, count = int(mj.mesh_vertadr[mesh]), int(mj.mesh_vertnum[mesh])
+    vertices = mj.mesh_vert[first : first + count]
+    graph = int(mj.mesh_graphadr[mesh])
+    if graph >= 0:  # number of corners and faces, where their edges begin, which vertices
+        n = int(mj.mesh_graph[graph])
+        vertices = vertices[mj.mesh_graph[graph + 2 + n : graph + 2 + 2 * n]]
+    return _kept(vertices.tobytes())
+
+
+@lru_cache(maxsize=1024)
+def _kept(vertices: bytes) -> list[list[float]]:
+    """Make a list, always the same one: the engine never lets go of what it is given."""
+    found: list[list[float]] = np.frombuffer(vertices, np.float32).reshape(-1, 3).tolist()
+    return found
+
+
+COLUMNS = (
+    "linkMasses",
+    "linkCollisionShapeIndices",
+    "linkVisualShapeIndices",
+    "linkPositions",
+    "linkOrientations",
+    "linkInertialFramePositions",
+    "linkInertialFrameOrientations",
+    "linkParentIndices",
+    "linkJointTypes",
+    "linkJointAxis",
+)
+"""Arguments of ``createMultiBody`` for every link."""
+
+
+@final
+class _Links:
+    """The links of a multibody that is not made yet.
+
+    Args:
+        engine: The module ``pybullet``.
+
+    Attributes:
+        rows: Arguments for each: see ``COLUMNS``.
+    """
+
+    def __init__(self, engine: Any) -> None:
+        self._fixed = engine.JOINT_FIXED
+        self.rows: list[list[Any]] = []
+
+    def add(
+        self,
+        parent: int,
+        position: Floats,
+        turn: Floats,
+        *,
+        shape: int = -1,
+        kind: int | None = None,
+        axis: Sequence[float] = (0.0, 0.0, 1.0),
+    ) -> int:
+        """Add a link without mass whose frame is given in that of its parent."""
+        frame = [position.tolist(), plain(turn), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+        joint = [self._fixed if kind is None else kind, list(axis)]
+        # The engine counts parents from the base.
+        self.rows.append([0.0, shape, -1, *frame, parent + 1, *joint])
+        return len(self.rows) - 1
+
+    def load(self, link: int, mass: float, center: Floats, axes: Floats) -> None:
+        """Give a link a mass, whose center and principal axes are in the frame of the link."""
+        row = self.rows[link]
+        row[0], row[5], row[6] = mass, center.tolist(), plain(axes)
+
+
+def rotated(turn: Floats, vector: Floats) -> Floats:
+    """Rotate a vector by a quaternion of MuJoCo."""
+    found = np.empty(3)
+    mujoco.mju_rotVecQuat(found, vector, turn)
+    return found
+
+
+def composed(first: Floats, then: Floats) -> Floats:
+    """Compose two quaternions of MuJoCo: the second turns within the frame of the first."""
+    found = np.empty(4)
+    mujoco.mju_mulQuat(found, first, then)
+    return found
+
+
+def _add_tree(
+    engine: Any,
+    client: int,
+    mj: mujoco.MjModel,
+    data: mujoco.MjData,
+    tree: int,
+    shapes: list[int],
+    built: Built,
+) -> None:
+    """Make a multibody of a body that hangs on the world, and of all that hangs on it."""
+    links, base = _Links(engine), dict[str, Any](baseMass=0.0)
+    kinds = {
+        HINGE: engine.JOINT_REVOLUTE,
+        SLIDE: engine.JOINT_PRISMATIC,
+        BALL: engine.JOINT_SPHERICAL,
+    }
+    carrier: dict[int, int] = {}  # the link whose frame moves with a body
+    origin: dict[int, Floats] = {}  # of that frame, in the frame of the body
+    joint_links: dict[int, int] = {}
+    geom_links: dict[int, int] = {}
+    for body in np.flatnonzero(mj.body_treeid == tree).tolist():
+        joints, parent = joints_of(mj, body), int(mj.body_parentid[body])
+        mass, center = float(mj.body_mass[body]), mj.body_ipos[body]
+        _, axes = solid(mj, body)
+        if joints and mj.jnt_type[joints[0]] == FREE:
+            base = {
+                "baseMass": mass,
+                "baseInertialFramePosition": center.tolist(),
+                "baseInertialFrameOrientation": plain(axes),
+            }
+            carrier[body], origin[body], joint_links[joints[0]] = -1, np.zeros(3), -1
+        else:
+            start, turn = mj.body_pos[body], mj.body_quat[body]
+            if parent in carrier:
+                link, start = carrier[parent], start - origin[parent]
+            else:  # the parent cannot move
+                link, start = -1, data.xpos[parent] + rotated(data.xquat[parent], start)
+                turn = composed(data.xquat[parent], turn)
+            at = np.zeros(3)
+            for joint in joints:
+                kind, axis = kinds[int(mj.jnt_type[joint])], mj.jnt_axis[joint].tolist()
+                anchor = mj.jnt_pos[joint]
+                position = start + rotated(turn, anchor - at)
+                joint_links[joint] = link = links.add(link, position, turn, kind=kind, axis=axis)
+                start, turn, at = np.zeros(3), UNTURNED, anchor
+            if not joints:
+                link = links.add(link, start, turn)
+            links.load(link, mass, center - at, axes)
+            carrier[body], origin[body] = link, at
+        for geom in shapes:
+            if mj.geom_bodyid[geom] == body:
+                position, shape = mj.geom_pos[geom] - origin[body], _shape(engine, client, mj, geom)
+                turn = mj.geom_quat[geom]
+                geom_links[geom] = links.add(carrier[body], position, turn, shape=shape)
+    # What touches what is said by pairs alone, also within the multibody.
+    flags = engine.URDF_USE_SELF_COLLISION | engine.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
+    made = engine.createMultiBody(
+        flags=flags,
+        physicsClientId=client,
+        **base,
+        **dict(zip(COLUMNS, map(list, zip(*links.rows, strict=True)), strict=bool(links.rows))),
+    )
+    found = (built.bodies, carrier), (built.joints, joint_links), (built.geoms, geom_links)
+    for table, rows in found:
+        table.update((number, (made, link)) for number, link in rows.items())
+    _settle(engine, client, mj, made, joint_links)
+
+
+def _settle(
+    engine: Any, client: int, mj: mujoco.MjModel, made: int, joints: dict[int, int]
+) -> None:
+    """Take away what the engine does by itself: damping, motors, sleep, a highest speed."""
+    # One property a call: beside damping or maxJointVelocity, all others would land on the base.
+    engine.changeDynamics(made, -1, linearDamping=0, physicsClientId=client)
+    engine.changeDynamics(made, -1, angularDamping=0, physicsClientId=client)
+    engine.changeDynamics(made, -1, maxJointVelocity=FASTEST, physicsClientId=client)
+    engine.changeDynamics(
+        made, -1, activationState=engine.ACTIVATION_STATE_DISABLE_SLEEPING, physicsClientId=client
+    )
+    for joint, link in joints.items():
+        if mj.jnt_type[joint] == BALL:
+            engine.setJointMotorControlMultiDof(
+                made,
+                link,
+                engine.POSITION_CONTROL,
+                targetPosition=[0.0, 0.0, 0.0, 1.0],
+                positionGain=0.0,
+                velocityGain=0.0,
+                force=[0.0, 0.0, 0.0],
+                physicsClientId=client,
+            )
+        elif link >= 0:
+            engine.setJointMotorControl2(
+                made, link, engine.VELOCITY_CONTROL, force=0.0, physicsClientId=client
+            )
+
+
+def _couple(engine: Any, client: int, mj: mujoco.MjModel, equality: int, built: Built) -> None:
+    """Let a joint follow another one in proportion."""
+    offset, ratio = mj.eq_data[equality, :2].tolist()
+    gear = engine.createConstraint(
+        *built.joints[int(mj.eq_obj1id[equality])],
+        *built.joints[int(mj.eq_obj2id[equality])],
+        engine.JOINT_GEAR,
+        [1.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0],
+        physicsClientId=client,
+    )
+    engine.changeConstraint(
+        gear,
+        gearRatio=-ratio,
+        relativePositionTarget=offset,
+        erp=GEAR_ERP,
+        maxForce=STRONGEST,
+        physicsClientId=client,
+    )
+
+
+def _choose_pairs(engine: Any, client: int, mj: mujoco.MjModel, touches: Any, built: Built) -> None:
+    """Say which shapes may touch: by groups what most pairs do, and one by one the others."""
+    moving = {geom: bool(mj.body_treeid[mj.geom_bodyid[geom]] >= 0) for geom in built.geoms}
+    pairs = [
+        (first, second)
+        for first in sorted(moving)
+        for second in sorted(moving)
+        if first < second and (moving[first] or moving[second])
+    ]
+    most = 2 * sum(bool(touches[pair]) for pair in pairs) > len(pairs)
+    for geom, handle in built.geoms.items():
+        group, mask = (MOVING, MOVING | STATIC) if moving[geom] else (STATIC, MOVING)
+        if not most:
+            group = mask = 0
+        engine.setCollisionFilterGroupMask(*handle, group, mask, physicsClientId=client)
+        if moving[geom]:
+            built.groups.append((*handle, group, mask))
+    for first, second in pairs:
+        if touches[first, second] != most:
+            one, other = built.geoms[first], built.geoms[second]
+            engine.setCollisionFilterPair(
+                one[0], other[0], one[1], other[1], int(not most), physicsClientId=client
+            )
+
+
+def solid(mj: mujoco.MjModel, body: int) -> tuple[Floats, Floats]:
+    """Give the principal moments [kg m²] and axes of a body, with the armature of its hinge.
+
+    The motor of the only hinge of a body that hangs on the world turns as fast as the body: it is
+    as if the body had more inertia about the axis.
+    """
+    moments, axes = mj.body_inertia[body], mj.body_iquat[body]
+    if not takes_armature(mj, body):
+        return moments, axes
+    joint = int(mj.body_jntadr[body])
+    armature, axis = mj.dof_armature[mj.jnt_dofadr[joint]], mj.jnt_axis[joint]
+    if not armature:
+        return moments, axes
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, axes)
+    frame = turn.reshape(3, 3)
+    tensor = (frame * moments) @ frame.T + armature * np.outer(axis, axis)
+    moments, frame = np.linalg.eigh(tensor)
+    frame[:, 2] *= np.sign(np.linalg.det(frame))
+    axes = np.empty(4)
+    mujoco.mju_mat2Quat(axes, frame.ravel())
+    return moments, axes
+
+
+def takes_armature(mj: mujoco.MjModel, body: int) -> bool:
+    """Tell whether the armature of the joint of a body is as if the body had more inertia."""
+    joints = joints_of(mj, body)
+    fixed = mj.body_treeid[mj.body_parentid[body]] < 0
+    return bool(fixed and len(joints) == 1 and mj.jnt_type[joints[0]] == HINGE)
