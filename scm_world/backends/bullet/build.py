@@ -9,7 +9,7 @@ link has two of them. A shape that cannot move is a body by itself.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, final
 
@@ -17,13 +17,9 @@ import mujoco
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.mujoco.trees import Couplings
 
 Handle = tuple[int, int]
 """A multibody and a link of it; -1 is its base."""
-
-MOVING, STATIC = 1, 2
-"""Collision groups. What cannot move never touches what cannot move."""
 
 FASTEST = 1e4  # [rad/s] or [m/s]; the engine would cut at 100
 HULL_MARGIN = 1e-5  # [m] a mesh is inflated by so much
@@ -52,50 +48,153 @@ UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 
 @final
 @dataclass
+class Unit:
+    """A multibody, or a body that cannot move.
+
+    Attributes:
+        made_of: Everything that cannot be changed while it is there.
+        multibody: Its number in the engine.
+        bodies: The links that carry the masses of its bodies.
+        joints: The links of its joints; -1 for that of a free body.
+        geoms: The links that are its shapes.
+    """
+
+    made_of: tuple[Any, ...]
+    multibody: int
+    bodies: list[int]
+    joints: list[int]
+    geoms: list[int]
+
+
+@final
+@dataclass(frozen=True)
+class Plan:
+    """What becomes a unit, by the numbers in the compiled model."""
+
+    bodies: list[int]
+    joints: list[int]
+    geoms: list[int]
+
+
+@final
 class Built:
-    """The engine's numbers of everything.
+    """Everything that a compiled model has in the engine.
 
     Attributes:
         bodies: The link that carries the mass of each body that can move, by its number.
         joints: The link of each joint, by its number; the base of a free body.
         geoms: The link of each shape that can touch something, by its number.
-        groups: Link, group and mask of each shape that can move.
     """
 
-    bodies: dict[int, Handle] = field(default_factory=dict)
-    joints: dict[int, Handle] = field(default_factory=dict)
-    geoms: dict[int, Handle] = field(default_factory=dict)
-    groups: list[tuple[int, int, int, int]] = field(default_factory=list)
+    def __init__(self, engine: Any, client: int) -> None:
+        self._engine, self._client = engine, client
+        self._units: list[Unit] = []
+        self.bodies: dict[int, Handle] = {}
+        self.joints: dict[int, Handle] = {}
+        self.geoms: dict[int, Handle] = {}
+
+    def make(self, mj: mujoco.MjModel, touching: list[int]) -> set[int]:
+        """Make what there is not yet. Everything stays in one order: what comes later is new, too.
+
+        Args:
+            mj: With the parameters in force.
+            touching: The shapes that can touch something.
+
+        Returns:
+            The multibodies that are gone.
+        """
+        data = mujoco.MjData(mj)
+        mujoco.mj_kinematics(mj, data)
+        plans = list(_plans(mj, touching))
+        wanted = [_made_of(mj, data, plan) for plan in plans]
+        kept = 0
+        while kept < min(len(self._units), len(wanted)):
+            if self._units[kept].made_of != wanted[kept]:
+                break
+            kept += 1
+        gone = [unit.multibody for unit in self._units[kept:]]
+        for multibody in reversed(gone):
+            self._engine.removeBody(multibody, physicsClientId=self._client)
+        del self._units[kept:]
+        for plan, made_of in zip(plans[kept:], wanted[kept:], strict=True):
+            self._units.append(_made(self._engine, self._client, mj, data, plan, made_of))
+        self.bodies, self.joints, self.geoms = {}, {}, {}
+        for plan, unit in zip(plans, self._units, strict=True):
+            for table, numbers, links in (
+                (self.bodies, plan.bodies, unit.bodies),
+                (self.joints, plan.joints, unit.joints),
+                (self.geoms, plan.geoms, unit.geoms),
+            ):
+                table |= {n: (unit.multibody, link) for n, link in zip(numbers, links, strict=True)}
+        return set(gone)
 
 
-def build(engine: Any, client: int, mj: mujoco.MjModel) -> Built:
-    """Make everything, in an empty client; without motors, damping and sleep."""
-    built, data = Built(), mujoco.MjData(mj)
-    mujoco.mj_kinematics(mj, data)
-    touches = Couplings(mj).touches
-    shapes = np.flatnonzero(touches.any(axis=1)).tolist()
-    turn = np.empty(4)
-    for geom in shapes:
-        if mj.body_treeid[mj.geom_bodyid[geom]] < 0:
-            mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
-            fixed = engine.createMultiBody(
-                0,
-                _shape(engine, client, mj, geom),
-                basePosition=data.geom_xpos[geom].tolist(),
-                baseOrientation=plain(turn),
-                useMaximalCoordinates=True,
-                physicsClientId=client,
-            )
-            built.geoms[geom] = (fixed, -1)
+def _plans(mj: mujoco.MjModel, touching: list[int]) -> Iterator[Plan]:
+    """List what becomes a unit: shapes that cannot move, and kinematic trees."""
+    tree_of = mj.body_treeid[mj.geom_bodyid].tolist()
+    yield from (Plan([], [], [geom]) for geom in touching if tree_of[geom] < 0)
     for tree in range(mj.ntree):
-        _add_tree(engine, client, mj, data, tree, shapes, built)
-    for geom, handle in built.geoms.items():
+        bodies = np.flatnonzero(mj.body_treeid == tree).tolist()
+        joints = [joint for body in bodies for joint in joints_of(mj, body)]
+        yield Plan(bodies, joints, [geom for geom in touching if tree_of[geom] == tree])
+
+
+def _made_of(mj: mujoco.MjModel, data: mujoco.MjData, plan: Plan) -> tuple[Any, ...]:
+    """List everything in a unit that cannot be changed while it is there."""
+    bodies, joints, geoms = plan.bodies, plan.joints, plan.geoms
+    found: list[Any] = [
+        *(len(bodies), len(joints), mj.opt.disableflags, mj.jnt_limited[joints]),
+        np.isin(geoms, [mj.pair_geom1, mj.pair_geom2]),
+        *(mj.geom_type[geoms], mj.geom_size[geoms]),
+        *(_corners(mj, geom) for geom in geoms),
+    ]
+    if not bodies:
+        found += [data.geom_xpos[geoms], data.geom_xmat[geoms]]
+    else:
+        root, free = bodies[0], int(bool(joints) and mj.jnt_type[joints[0]] == FREE)
+        parent = mj.body_parentid[root]
+        found += [
+            *(mj.body_parentid[bodies] - root, mj.body_ipos[bodies], mj.body_jntnum[bodies]),
+            *(solid(mj, body)[1] for body in bodies),
+            *(mj.body_pos[bodies[free:]], mj.body_quat[bodies[free:]]),
+            *(data.xpos[parent], data.xquat[parent]),
+            *(mj.jnt_type[joints], mj.jnt_pos[joints], mj.jnt_axis[joints]),
+            *(mj.geom_bodyid[geoms] - root, mj.geom_pos[geoms], mj.geom_quat[geoms]),
+            *(mj.eq_data[equality, :2] for equality in couplings(mj, joints)),
+        ]
+    return tuple(part.tobytes() if isinstance(part, np.ndarray) else part for part in found)
+
+
+def _made(
+    engine: Any,
+    client: int,
+    mj: mujoco.MjModel,
+    data: mujoco.MjData,
+    plan: Plan,
+    made_of: tuple[Any, ...],
+) -> Unit:
+    """Make a unit, without motors, damping and sleep."""
+    if plan.bodies:
+        unit = _tree(engine, client, mj, data, plan, made_of)
+    else:
+        (geom,), turn = plan.geoms, np.empty(4)
+        mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
+        multibody = engine.createMultiBody(
+            0,
+            _shape(engine, client, mj, geom),
+            basePosition=data.geom_xpos[geom].tolist(),
+            baseOrientation=plain(turn),
+            useMaximalCoordinates=True,
+            physicsClientId=client,
+        )
+        unit = Unit(made_of, multibody, [], [], [-1])
+    for geom, link in zip(plan.geoms, unit.geoms, strict=True):
+        place = unit.multibody, link
+        # By itself, a shape touches nothing: pairs say what it does.
+        engine.setCollisionFilterGroupMask(*place, 0, 0, physicsClientId=client)
         if mj.geom_type[geom] == MESH:
-            engine.changeDynamics(*handle, collisionMargin=HULL_MARGIN, physicsClientId=client)
-    for equality in couplings(mj):
-        _couple(engine, client, mj, equality, built)
-    _choose_pairs(engine, client, mj, touches, built)
-    return built
+            engine.changeDynamics(*place, collisionMargin=HULL_MARGIN, physicsClientId=client)
+    return unit
 
 
 def plain(turn: Floats) -> list[float]:
@@ -110,11 +209,12 @@ def joints_of(mj: mujoco.MjModel, body: int) -> range:
     return range(first, first + int(mj.body_jntnum[body]))
 
 
-def couplings(mj: mujoco.MjModel) -> Iterator[int]:
-    """List the equality constraints that are in force."""
+def couplings(mj: mujoco.MjModel, joints: Sequence[int]) -> Iterator[int]:
+    """List the equality constraints in force that begin at some joints."""
     off = mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    if not mj.opt.disableflags & int(off):
-        yield from np.flatnonzero(mj.eq_active0).tolist()
+    for equality in np.flatnonzero(mj.eq_active0).tolist():
+        if not mj.opt.disableflags & int(off) and int(mj.eq_obj1id[equality]) in joints:
+            yield equality
 
 
 def _shape(engine: Any, client: int, mj: mujoco.MjModel, geom: int) -> int:
@@ -129,20 +229,24 @@ def _shape(engine: Any, client: int, mj: mujoco.MjModel, geom: int) -> int:
         MESH: (engine.GEOM_MESH, {}),
     }[int(mj.geom_type[geom])]
     if kind == engine.GEOM_MESH:
-        options["vertices"] = _corners(mj, int(mj.geom_dataid[geom]))
+        options["vertices"] = _kept(_corners(mj, geom))
     shape: int = engine.createCollisionShape(kind, physicsClientId=client, **options)
     return shape
 
 
-def _corners(mj: mujoco.MjModel, mesh: int) -> list[list[float]]:
-    """List the corners of the convex hull of a mesh [m]."""
+def _corners(mj: mujoco.MjModel, geom: int) -> bytes:
+    """Return the corners of the convex hull of a mesh [m]; nothing for another shape."""
+    if mj.geom_type[geom] != MESH:
+        return b""
+    mesh = int(mj.geom_dataid[geom])
     first, count = int(mj.mesh_vertadr[mesh]), int(mj.mesh_vertnum[mesh])
     vertices = mj.mesh_vert[first : first + count]
     graph = int(mj.mesh_graphadr[mesh])
     if graph >= 0:  # number of corners and faces, where their edges begin, which vertices
         n = int(mj.mesh_graph[graph])
         vertices = vertices[mj.mesh_graph[graph + 2 + n : graph + 2 + 2 * n]]
-    return _kept(vertices.tobytes())
+    found: bytes = vertices.tobytes()
+    return found
 
 
 @lru_cache(maxsize=1024)
@@ -219,15 +323,14 @@ def composed(first: Floats, then: Floats) -> Floats:
     return found
 
 
-def _add_tree(
+def _tree(
     engine: Any,
     client: int,
     mj: mujoco.MjModel,
     data: mujoco.MjData,
-    tree: int,
-    shapes: list[int],
-    built: Built,
-) -> None:
+    plan: Plan,
+    made_of: tuple[Any, ...],
+) -> Unit:
     """Make a multibody of a body that hangs on the world, and of all that hangs on it."""
     links, base = _Links(engine), dict[str, Any](baseMass=0.0)
     kinds = {
@@ -239,7 +342,7 @@ def _add_tree(
     origin: dict[int, Floats] = {}  # of that frame, in the frame of the body
     joint_links: dict[int, int] = {}
     geom_links: dict[int, int] = {}
-    for body in np.flatnonzero(mj.body_treeid == tree).tolist():
+    for body in plan.bodies:
         joints, parent = joints_of(mj, body), int(mj.body_parentid[body])
         mass, center = float(mj.body_mass[body]), mj.body_ipos[body]
         _, axes = solid(mj, body)
@@ -268,7 +371,7 @@ def _add_tree(
                 link = links.add(link, start, turn)
             links.load(link, mass, center - at, axes)
             carrier[body], origin[body] = link, at
-        for geom in shapes:
+        for geom in plan.geoms:
             if mj.geom_bodyid[geom] == body:
                 position, shape = mj.geom_pos[geom] - origin[body], _shape(engine, client, mj, geom)
                 turn = mj.geom_quat[geom]
@@ -281,10 +384,13 @@ def _add_tree(
         **base,
         **dict(zip(COLUMNS, map(list, zip(*links.rows, strict=True)), strict=bool(links.rows))),
     )
-    found = (built.bodies, carrier), (built.joints, joint_links), (built.geoms, geom_links)
-    for table, rows in found:
-        table.update((number, (made, link)) for number, link in rows.items())
     _settle(engine, client, mj, made, joint_links)
+    for equality in couplings(mj, plan.joints):
+        _couple(engine, client, mj, equality, made, joint_links)
+    carriers = [carrier[body] for body in plan.bodies]
+    joints = [joint_links[joint] for joint in plan.joints]
+    geoms = [geom_links[geom] for geom in plan.geoms]
+    return Unit(made_of, made, carriers, joints, geoms)
 
 
 def _settle(
@@ -316,12 +422,19 @@ def _settle(
             )
 
 
-def _couple(engine: Any, client: int, mj: mujoco.MjModel, equality: int, built: Built) -> None:
+def _couple(
+    engine: Any,
+    client: int,
+    mj: mujoco.MjModel,
+    equality: int,
+    multibody: int,
+    links: dict[int, int],
+) -> None:
     """Let a joint follow another one in proportion."""
     offset, ratio = mj.eq_data[equality, :2].tolist()
     gear = engine.createConstraint(
-        *built.joints[int(mj.eq_obj1id[equality])],
-        *built.joints[int(mj.eq_obj2id[equality])],
+        *(multibody, links[int(mj.eq_obj1id[equality])]),
+        *(multibody, links[int(mj.eq_obj2id[equality])]),
         engine.JOINT_GEAR,
         [1.0, 0.0, 0.0],
         [0.0, 0.0, 0.0],
@@ -336,31 +449,6 @@ def _couple(engine: Any, client: int, mj: mujoco.MjModel, equality: int, built: 
         maxForce=STRONGEST,
         physicsClientId=client,
     )
-
-
-def _choose_pairs(engine: Any, client: int, mj: mujoco.MjModel, touches: Any, built: Built) -> None:
-    """Say which shapes may touch: by groups what most pairs do, and one by one the others."""
-    moving = {geom: bool(mj.body_treeid[mj.geom_bodyid[geom]] >= 0) for geom in built.geoms}
-    pairs = [
-        (first, second)
-        for first in sorted(moving)
-        for second in sorted(moving)
-        if first < second and (moving[first] or moving[second])
-    ]
-    most = 2 * sum(bool(touches[pair]) for pair in pairs) > len(pairs)
-    for geom, handle in built.geoms.items():
-        group, mask = (MOVING, MOVING | STATIC) if moving[geom] else (STATIC, MOVING)
-        if not most:
-            group = mask = 0
-        engine.setCollisionFilterGroupMask(*handle, group, mask, physicsClientId=client)
-        if moving[geom]:
-            built.groups.append((*handle, group, mask))
-    for first, second in pairs:
-        if touches[first, second] != most:
-            one, other = built.geoms[first], built.geoms[second]
-            engine.setCollisionFilterPair(
-                one[0], other[0], one[1], other[1], int(not most), physicsClientId=client
-            )
 
 
 def solid(mj: mujoco.MjModel, body: int) -> tuple[Floats, Floats]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import ContactPoint
-from scm_world.backends.bullet.build import BALL, FREE, build, solid
+from scm_world.backends.bullet.build import BALL, FREE, Built, Handle, solid
 from scm_world.backends.bullet.honoured import check, heavy, keys, rotations, settle
 from scm_world.backends.bullet.joints import parts
 from scm_world.backends.mujoco import reading
@@ -28,6 +28,9 @@ from scm_world.models.scene import ParameterKey, Parameters
 Values = dict[ParameterKey, Any]
 """All parameters, or some: plain numbers, or lists of them.
 Neither they nor their values are ever changed in place."""
+
+WORLD: Handle = (-1, -1)
+"""Where what holds for all bodies is."""
 
 _OFF = mujoco.mjtDisableBit
 SMOOTH = int(_OFF.mjDSBL_CONSTRAINT) | int(_OFF.mjDSBL_AUTORESET)
@@ -123,6 +126,30 @@ def usual_friction(mj: mujoco.MjModel) -> float:
     return float(statistics.median_low(found.tolist() or [0.0]))
 
 
+def spinning_shares(mj: mujoco.MjModel) -> dict[int, float]:
+    """Give each shape in a pair what it gets of the spinning friction of its pairs.
+
+    The engine combines two shapes to ``s1 f2 + s2 f1`` with the factors f of sliding friction. With
+    these shares that is the spinning friction of the pair where one of the two has the largest
+    factor, at the factors of the compiled model.
+    """
+    shapes = {*mj.pair_geom1.tolist(), *mj.pair_geom2.tolist()}
+    largest = max((float(mj.geom_friction[geom, 0]) for geom in shapes), default=0.0)
+    if largest == 0.0:
+        return dict.fromkeys(shapes, 0.0)
+    return {
+        geom: (1.0 - float(mj.geom_friction[geom, 0]) / (2.0 * largest)) / largest
+        for geom in sorted(shapes)
+    }
+
+
+def restitution(damping: float) -> float:
+    """Give what is left of the speed after half a period of a spring with a damping ratio."""
+    if not 0.0 <= damping < 1.0:
+        return 0.0
+    return math.exp(-math.pi * damping / math.sqrt(1.0 - damping * damping))
+
+
 def _pulled(mj: mujoco.MjModel) -> Integers:
     """List the bodies of trees that actuators or tendons reach."""
     trees = Couplings(mj)
@@ -159,13 +186,23 @@ class Client:
             raise EngineFailure("Bullet has no physics client left; close some backends", "bullet")
         self.generation = 0
         self._model: Model | None = None
-        self._told: dict[tuple[str, int], Any] = {}  # what the engine was told of live bodies
-        self._inside: Values = {}  # parameters that were built into the bodies
+        self._told: dict[tuple[str, Handle], Any] = {}  # what the engine was told of live bodies
+        self._inside: Values | None = None  # parameters that were built into the bodies
+        self._connected: set[tuple[int, int, int, int]] = set()  # pairs of shapes that may touch
         self._untouched: list[float] | None = None
         self._saved: dict[int, tuple[int, Floats]] = {}  # engine's number and activations
         self._tickets = 0
         self._doomed: list[int] = []
         self._close = weakref.finalize(self, _disconnect, engine, self.handle)
+        self._built = Built(engine, self.handle)
+        engine.setPhysicsEngineParameter(
+            numSolverIterations=SOLVER_ITERATIONS,
+            # An early end, decided for all bodies together, would let bodies act on each
+            # other without touching.
+            solverResidualThreshold=0.0,
+            deterministicOverlappingPairs=1,
+            physicsClientId=self.handle,
+        )
 
     def close(self) -> None:
         """Disconnect. Closing twice is harmless."""
@@ -187,10 +224,9 @@ class Client:
         self._twin.place(np.array(instant.state))
         for part in self._parts:
             part.put(self._twin.data)
-        for body, link, group, mask in self._built.groups:
-            self.engine.setCollisionFilterGroupMask(
-                body, link, group, mask, physicsClientId=self.handle
-            )
+        for place in self._built.geoms.values():
+            if place[1] >= 0:  # what moves
+                self.engine.setCollisionFilterGroupMask(*place, 0, 0, physicsClientId=self.handle)
         self._check(instant.state)
         self._untouched = instant.state
 
@@ -198,29 +234,38 @@ class Client:
         """Make everything again, unless live bodies can take on what differs from what is there."""
         if self._model != model:
             compiled = reading.compiled(model)
-            self._model, self._inside = model, {}
+            self._model, self._inside = model, None
             self._twin = realize(model, arrays(parameters))
             self._names, self._pulled = reading.body_names(compiled), _pulled(compiled)
-            self._usual = usual_friction(compiled)
+            self._usual, self._spinning = usual_friction(compiled), spinning_shares(compiled)
+            trees = Couplings(compiled)
+            self._dynamic = np.flatnonzero(trees.dynamic.any(axis=1)).tolist()
+            self._touching = np.argwhere(np.triu(trees.touches)).tolist()
+            self._shapes = np.flatnonzero(trees.touches.any(axis=1)).tolist()
+            ends = zip(compiled.pair_geom1.tolist(), compiled.pair_geom2.tolist(), strict=True)
+            self._paired = {geom: pair for pair, both in enumerate(ends) for geom in both}
             self._rotations = rotations(model)
             self._reported = np.flatnonzero(~model.layout.can_be_set)
         self._twin.edit(arrays(parameters))
         inside = {key: parameters[key] for key in heavy(model)}
-        if self._inside != inside or not self._told:
-            self._told, mj = {}, self._twin.model
-            self.engine.resetSimulation(physicsClientId=self.handle)
-            self.engine.setPhysicsEngineParameter(
-                numSolverIterations=SOLVER_ITERATIONS,
-                # An early end, decided for all bodies together, would let bodies act on each
-                # other without touching.
-                solverResidualThreshold=0.0,
-                deterministicOverlappingPairs=1,
-                physicsClientId=self.handle,
-            )
-            self._built = build(self.engine, self.handle, mj)
-            self._parts = list(parts(self.engine, self.handle, mj, self._built))
+        if self._inside != inside:
+            gone = self._built.make(self._twin.model, self._shapes)
+            self._told = {what: v for what, v in self._told.items() if what[1][0] not in gone}
+            self._connect()
+            self._parts = list(parts(self.engine, self.handle, self._twin.model, self._built))
             self._inside = inside
         self._tell_all()
+
+    def _connect(self) -> None:
+        """Say which shapes may touch."""
+        geoms = self._built.geoms
+        wanted = {(*geoms[first], *geoms[second]) for first, second in self._touching}
+        for pairs, enabled in ((self._connected - wanted, 0), (wanted, 1)):
+            for body, link, other, its in sorted(pairs):
+                self.engine.setCollisionFilterPair(
+                    body, other, link, its, enabled, physicsClientId=self.handle
+                )
+        self._connected = wanted
 
     def _check(self, state: list[float]) -> None:
         """Make sure that the engine took the state, up to rounding and the sign of a quaternion.
@@ -258,31 +303,37 @@ class Client:
         moved = self._moved()
         self._driven = [part for part in self._parts if part.tree in moved]
 
-    def _settings(self) -> Iterator[tuple[tuple[str, int], Any]]:
-        """List what live bodies have, by what it is and the number of the body, joint or shape."""
+    def _settings(self) -> Iterator[tuple[tuple[str, Handle], Any]]:
+        """List what live bodies have, by what it is and where."""
         mj, built = self._twin.model, self._built
         gravity = np.zeros(3) if disabled(mj, _OFF.mjDSBL_GRAVITY) else mj.opt.gravity
-        yield ("gravity", 0), gravity.tolist()
-        yield ("timestep", 0), mj.opt.timestep
-        for body in built.bodies:
-            yield ("solid", body), (float(mj.body_mass[body]), *solid(mj, body)[0].tolist())
+        yield ("gravity", WORLD), gravity.tolist()
+        yield ("timestep", WORLD), mj.opt.timestep
+        for body, place in built.bodies.items():
+            yield ("solid", place), (float(mj.body_mass[body]), *solid(mj, body)[0].tolist())
         rigid = not disabled(mj, _OFF.mjDSBL_CONSTRAINT)
         dry = rigid and not disabled(mj, _OFF.mjDSBL_FRICTIONLOSS)
         ends = rigid and not disabled(mj, _OFF.mjDSBL_LIMIT)
-        for joint in built.joints:
+        for joint, place in built.joints.items():
             if mj.jnt_type[joint] in (FREE, BALL):
                 continue
             if ends and mj.jnt_limited[joint]:
                 zero = mj.qpos0[mj.jnt_qposadr[joint]]
-                yield ("limits", joint), (mj.jnt_range[joint] - zero).tolist()
+                yield ("limits", place), (mj.jnt_range[joint] - zero).tolist()
             loss = float(mj.dof_frictionloss[mj.jnt_dofadr[joint]]) if dry else 0.0
-            yield ("dry", joint), (loss, loss and mj.opt.timestep)  # kept as an impulse of a step
-        for geom, share in shares(mj, built.geoms, self._usual).items():
-            yield ("friction", geom), share
+            yield ("dry", place), (loss, loss and mj.opt.timestep)  # kept as an impulse of a step
+        for geom, share in shares(mj, self._dynamic, self._usual).items():
+            yield ("lateralFriction", built.geoms[geom]), share
+        for geom, pair in self._paired.items():
+            slides, spins, _ = mj.geom_friction[geom].tolist()
+            bounce = math.sqrt(restitution(float(mj.pair_solref[pair, 1])))
+            yield ("lateralFriction", built.geoms[geom]), slides
+            yield ("spinningFriction", built.geoms[geom]), spins * self._spinning[geom]
+            yield ("restitution", built.geoms[geom]), bounce
 
-    def _tell(self, what: str, number: int, value: Any) -> None:
+    def _tell(self, what: str, place: Handle, value: Any) -> None:
         """Tell the engine one thing."""
-        engine, built, options = self.engine, self._built, {"physicsClientId": self.handle}
+        engine, options = self.engine, {"physicsClientId": self.handle}
         match what:
             case "gravity":
                 engine.setGravity(*value, **options)
@@ -290,24 +341,17 @@ class Client:
                 engine.setPhysicsEngineParameter(fixedTimeStep=value, **options)
             case "solid":
                 mass, *moments = value
-                engine.changeDynamics(
-                    *built.bodies[number], mass=mass, localInertiaDiagonal=moments, **options
-                )
+                engine.changeDynamics(*place, mass=mass, localInertiaDiagonal=moments, **options)
             case "limits":
                 low, high = value
-                engine.changeDynamics(
-                    *built.joints[number], jointLowerLimit=low, jointUpperLimit=high, **options
-                )
+                engine.changeDynamics(*place, jointLowerLimit=low, jointUpperLimit=high, **options)
             case "dry":
+                mode, force = engine.VELOCITY_CONTROL, value[0]
                 engine.setJointMotorControl2(
-                    *built.joints[number],
-                    engine.VELOCITY_CONTROL,
-                    targetVelocity=0.0,
-                    force=value[0],
-                    **options,
+                    *place, mode, targetVelocity=0.0, force=force, **options
                 )
-            case "friction":
-                engine.changeDynamics(*built.geoms[number], lateralFriction=value, **options)
+            case _:
+                engine.changeDynamics(*place, **{what: value}, **options)
 
     def _moved(self) -> set[int]:
         """List the trees on which smooth forces act, other than weight."""
@@ -339,13 +383,13 @@ class Client:
 
     def remarks(self, before: Parameters) -> tuple[str, ...]:
         """Say which frictions were changed without an effect; see ``shares``."""
-        twin, built, found = self._twin, self._built, []
-        now = shares(twin.model, built.geoms, self._usual)
+        twin, found = self._twin, list[str]()
+        now = shares(twin.model, self._dynamic, self._usual)
         for key, old in before.items():
             if key[1] == "friction":
                 present = twin.kept[key]
                 twin.edit({key: old})
-                if shares(twin.model, built.geoms, self._usual) == now:
+                if shares(twin.model, self._dynamic, self._usual) == now:
                     found.append(
                         f"{'.'.join(key)} has no effect: the larger coefficient of two shapes "
                         "counts, and those of the others are larger"

@@ -22,6 +22,7 @@ from scm_world.backends.bullet.build import (
     takes_armature,
 )
 from scm_world.backends.mujoco import fields, reading
+from scm_world.backends.mujoco.realization import slots_of
 from scm_world.backends.mujoco.trees import Couplings, works
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable
 from scm_world.models.model import Model, Parameter
@@ -55,7 +56,7 @@ def _of_joints(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iter
             yield f"limits of the ball joint {name!r}"
         if kind in (FREE, BALL) and mj.dof_frictionloss[dof]:
             yield f"frictionloss of the {('free', 'ball')[kind]} joint {name!r}"
-    for equality in couplings(mj):
+    for equality in couplings(mj, range(mj.njnt)):
         kind = int(mj.eq_type[equality])
         ends = int(mj.eq_obj1id[equality]), int(mj.eq_obj2id[equality])
         what = f"the equality constraint {names['equality'][equality]!r}"
@@ -90,12 +91,20 @@ def _of_contacts(
             yield f"the {mujoco.mjtGeom(kind).name.removeprefix('mjGEOM_').lower()} {name!r}"
         if mj.geom_adhesion[geom] or np.any(mj.geom_surfacevel[geom]):
             yield f"adhesion or moving surface of the geom {name!r}"
-    factors, dynamic = mj.geom_friction[:, 0], trees.dynamic.any(axis=1)
-    for pair, name in enumerate(names["pair"]):
-        one, other = int(mj.pair_geom1[pair]), int(mj.pair_geom2[pair])
-        alike = np.allclose(mj.pair_friction[pair, :2], factors[one] * factors[other])
+    dynamic = trees.dynamic.any(axis=1)
+    for name, one, other, alike in zip(
+        names["pair"], mj.pair_geom1, mj.pair_geom2, _multiplied(mj), strict=True
+    ):
         if dynamic[one] or dynamic[other] or not alike:
             yield f"the pair {name!r}, whose friction is not the product of those of its shapes"
+
+
+def _multiplied(mj: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Tell which pairs have the product of the frictions of their shapes, shape (npair,)."""
+    factors = mj.geom_friction[:, 0]
+    products = factors[mj.pair_geom1] * factors[mj.pair_geom2]
+    found: NDArray[np.bool_] = (mj.pair_friction[:, :2] == products[:, None]).all(axis=1)
+    return found
 
 
 def _of_bodies(
@@ -190,20 +199,17 @@ FORCES = (
 
 def _honoured(mj: mujoco.MjModel) -> Iterator[tuple[str, Kind, Any]]:
     """List arrays, what a change of them takes, and which of their rows or numbers count."""
-    moves = np.asarray(mj.body_treeid) >= 0
     hinged = np.array([takes_armature(mj, body) for body in range(mj.nbody)])
     scalar = ~np.isin(mj.jnt_type, (FREE, BALL))
-    touches = Couplings(mj).touches.any(axis=1)
-    paired = np.zeros(mj.ngeom, dtype=np.bool_)
-    paired[[*mj.pair_geom1, *mj.pair_geom2]] = True
-    slides = np.stack([touches, paired, touches & False], axis=1)
+    dynamic = Couplings(mj).dynamic.any(axis=1)
+    frictions = np.stack([dynamic | True, ~dynamic, ~dynamic], axis=1)
     dofs = scalar[mj.dof_jntid]
     yield from ((name, "live", True) for name in FORCES)
     yield from ((name, "live", True) for name in ("opt.gravity", "opt.timestep"))
-    yield from ((name, "live", True) for name in ("pair_friction", "pair_solref"))
-    yield from (("body_mass", "live", moves), ("body_inertia", "live", (moves & ~hinged)[:, None]))
+    yield from (("body_mass", "live", True), ("body_inertia", "live", ~hinged[:, None]))
     yield from (("jnt_range", "live", scalar[:, None]), ("dof_frictionloss", "live", dofs))
-    yield "geom_friction", "live", slides
+    yield from (("geom_friction", "live", frictions), ("pair_solref", "live", True))
+    yield "pair_friction", "live", np.arange(5) < 3
     yield from (("body_inertia", "rebuilt", hinged[:, None]), ("body_pos", "rebuilt", True))
     yield from (("body_quat", "rebuilt", True), ("body_ipos", "rebuilt", True))
     yield from ((name, "rebuilt", True) for name in ("jnt_pos", "jnt_axis", "qpos0"))
@@ -251,21 +257,23 @@ def changes(model: Model) -> Mapping[ParameterKey, Kind]:
     """
     compiled = reading.compiled(model)
     mj = copy.copy(compiled)
-    slots = fields.slots(compiled, keys(model), mj, mujoco.MjData(mj))
+    slots = slots_of(model, mj, mujoco.MjData(mj))
     untouched, found = _saved(mj), dict[ParameterKey, Kind]()
     rows = [(name, kind, which, _read(mj, name)) for name, kind, which in _honoured(mj)]
     for row in model.parameters:
         slot = slots[row.key]
         before = slot.read()
         slot.write(_other(row))
-        takes: set[Kind] = set()
+        if slot.follow_up:
+            slot.follow_up(mj)
+        takes, multiplied = set[Kind](), _multiplied(mj).all()
         for name, kind, which, was in rows:
             now = _read(mj, name)
             changed = (now != was) & which
             if changed.any():
                 takes.add(kind)
                 _write(mj, name, np.where(changed, was, now))
-        if takes and np.array_equal(_saved(mj), untouched):
+        if takes and multiplied and np.array_equal(_saved(mj), untouched):
             found[row.key] = "rebuilt" if "rebuilt" in takes else "live"
         for name, _, _, was in rows:
             _write(mj, name, was)

@@ -139,7 +139,6 @@ class TriFinger(Model):
 
 
 _REALIZATIONS = {
-    "bullet": ("bullet.client", "TriFingerClient"),
     "published": ("bullet.published", "PublishedClient"),
     "fake": ("fake", None),
     "renderer": ("drawing", "DRAWING"),
