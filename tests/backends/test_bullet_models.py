@@ -686,7 +686,7 @@ def test_parameters_that_bullet_lacks(backend: BulletBackend) -> None:
     assert backend.supports(trifinger(), ("robot", "height"))
 
 
-def test_names_and_modes_that_do_not_exist(backend: BulletBackend) -> None:
+def test_names_that_do_not_exist(backend: BulletBackend) -> None:
     """Errors list what there is."""
     model = described("pile")
     backend.build(model.default_scene())
@@ -700,14 +700,6 @@ def test_names_and_modes_that_do_not_exist(backend: BulletBackend) -> None:
     wrong = described("cartpole").empty_state()
     with pytest.raises(ValueError, match=f"expected a state of {model.layout.size} numbers"):
         backend.apply(Difference(state=wrong))
-    robot = Scene(
-        trifinger(),
-        trifinger().default_scene().parameters,
-        trifinger().empty_state(),
-    )
-    backend.build(robot)
-    with pytest.raises(UnknownOption, match="joint_positions, joint_torques"):
-        backend.step(np.zeros(9), 1)
 
 
 def test_a_world_leaves_out_what_bullet_lacks() -> None:

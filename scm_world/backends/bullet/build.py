@@ -1,6 +1,6 @@
 """The bodies of a compiled model in a physics client.
 
-What can move is one multibody for each kinematic tree. A body is one link for each of its joints,
+What can move is one multibody for each free body and what hangs on it, and one for all that hangs on the world. A body is one link for each of its joints,
 all but the last without mass, and each of its shapes is a further link without mass that is fixed
 to the last. So shapes of one body can differ in what they touch, have frames of their own, and no
 link has two of them. A shape that cannot move is a body by itself.
@@ -21,6 +21,7 @@ from scm_world._types import Floats
 Handle = tuple[int, int]
 """A multibody and a link of it; -1 is its base."""
 
+MOST_LINKS = 127  # the engine has room for no more of them in a multibody
 FASTEST = 1e4  # [rad/s] or [m/s]; the engine would cut at 100
 HULL_MARGIN = 1e-5  # [m] a mesh is inflated by so much
 GEAR_ERP = 0.2  # share of the error of a coupling that a step takes away
@@ -130,18 +131,49 @@ class Built:
 
 
 def _plans(mj: mujoco.MjModel, touching: list[int]) -> Iterator[Plan]:
-    """List what becomes a unit: shapes that cannot move, and kinematic trees."""
-    tree_of = mj.body_treeid[mj.geom_bodyid].tolist()
-    yield from (Plan([], [], [geom]) for geom in touching if tree_of[geom] < 0)
+    """List what becomes a unit: shapes that cannot move; what hangs on the world; free bodies.
+
+    Kinematic trees that hang on the world share a multibody, as far as there is room: the engine
+    is asked and told of all of them at once, and solves each by itself.
+    """
+    still = mj.body_treeid[mj.geom_bodyid] < 0
+    yield from (Plan([], [], [geom]) for geom in touching if still[geom])
+    free, hanging, room = list[Plan](), Plan([], [], []), MOST_LINKS
     for tree in range(mj.ntree):
-        bodies = np.flatnonzero(mj.body_treeid == tree).tolist()
-        joints = [joint for body in bodies for joint in joints_of(mj, body)]
-        yield Plan(bodies, joints, [geom for geom in touching if tree_of[geom] == tree])
+        plan = plan_of(mj, tree, touching)
+        if mj.jnt_type[plan.joints[0]] == FREE:
+            free.append(plan)
+            continue
+        if links(mj, plan) > room:
+            yield hanging
+            hanging, room = Plan([], [], []), MOST_LINKS
+        room -= links(mj, plan)
+        hanging.bodies.extend(plan.bodies)
+        hanging.joints.extend(plan.joints)
+        hanging.geoms.extend(plan.geoms)
+    yield from ([hanging] if hanging.bodies else [])
+    yield from free
+
+
+def plan_of(mj: mujoco.MjModel, tree: int, touching: list[int]) -> Plan:
+    """List what a kinematic tree consists of."""
+    bodies = np.flatnonzero(mj.body_treeid == tree).tolist()
+    joints = [joint for body in bodies for joint in joints_of(mj, body)]
+    own = mj.body_treeid[mj.geom_bodyid] == tree
+    return Plan(bodies, joints, [geom for geom in touching if own[geom]])
+
+
+def links(mj: mujoco.MjModel, plan: Plan) -> int:
+    """Count the links that a tree needs."""
+    free = mj.jnt_type[plan.joints[0]] == FREE
+    jointless = sum(not joints_of(mj, body) for body in plan.bodies)
+    return len(plan.geoms) + len(plan.joints) + jointless - int(free)
 
 
 def _made_of(mj: mujoco.MjModel, data: mujoco.MjData, plan: Plan) -> tuple[Any, ...]:
     """List everything in a unit that cannot be changed while it is there."""
     bodies, joints, geoms = plan.bodies, plan.joints, plan.geoms
+    place = {body: index for index, body in enumerate(bodies)}
     found: list[Any] = [
         *(len(bodies), len(joints), mj.opt.disableflags, mj.jnt_limited[joints]),
         np.isin(geoms, [mj.pair_geom1, mj.pair_geom2]),
@@ -151,15 +183,18 @@ def _made_of(mj: mujoco.MjModel, data: mujoco.MjData, plan: Plan) -> tuple[Any, 
     if not bodies:
         found += [data.geom_xpos[geoms], data.geom_xmat[geoms]]
     else:
-        root, free = bodies[0], int(bool(joints) and mj.jnt_type[joints[0]] == FREE)
-        parent = mj.body_parentid[root]
+        free = int(mj.jnt_type[joints[0]] == FREE)
+        parents = mj.body_parentid[bodies].tolist()
+        fixed = [parent for parent in parents if parent not in place]
         found += [
-            *(mj.body_parentid[bodies] - root, mj.body_ipos[bodies], mj.body_jntnum[bodies]),
+            tuple(place.get(parent, -1) for parent in parents),
+            tuple(place[body] for body in mj.geom_bodyid[geoms].tolist()),
+            *(mj.body_ipos[bodies], mj.body_jntnum[bodies]),
             *(solid(mj, body)[1] for body in bodies),
             *(mj.body_pos[bodies[free:]], mj.body_quat[bodies[free:]]),
-            *(data.xpos[parent], data.xquat[parent]),
+            *(data.xpos[fixed], data.xquat[fixed]),
             *(mj.jnt_type[joints], mj.jnt_pos[joints], mj.jnt_axis[joints]),
-            *(mj.geom_bodyid[geoms] - root, mj.geom_pos[geoms], mj.geom_quat[geoms]),
+            *(mj.geom_pos[geoms], mj.geom_quat[geoms]),
             *(mj.eq_data[equality, :2] for equality in couplings(mj, joints)),
         ]
     return tuple(part.tobytes() if isinstance(part, np.ndarray) else part for part in found)
@@ -217,8 +252,10 @@ def couplings(mj: mujoco.MjModel, joints: Sequence[int]) -> Iterator[int]:
             yield equality
 
 
-def _shape(engine: Any, client: int, mj: mujoco.MjModel, geom: int) -> int:
-    """Make a collision shape."""
+def _shape(
+    engine: Any, client: int, mj: mujoco.MjModel, geom: int, *, placed: bool = False
+) -> int:
+    """Make a collision shape; see ``_corners``."""
     radius, half, _ = size = mj.geom_size[geom].tolist()
     kind, options = {
         PLANE: (engine.GEOM_PLANE, {"planeNormal": [0.0, 0.0, 1.0]}),
@@ -229,13 +266,32 @@ def _shape(engine: Any, client: int, mj: mujoco.MjModel, geom: int) -> int:
         MESH: (engine.GEOM_MESH, {}),
     }[int(mj.geom_type[geom])]
     if kind == engine.GEOM_MESH:
-        options["vertices"] = _kept(_corners(mj, geom))
+        options["vertices"] = _kept(_corners(mj, geom, placed=placed))
     shape: int = engine.createCollisionShape(kind, physicsClientId=client, **options)
     return shape
 
 
-def _corners(mj: mujoco.MjModel, geom: int) -> bytes:
-    """Return the corners of the convex hull of a mesh [m]; nothing for another shape."""
+def _own_shape(mj: mujoco.MjModel, body: int, plan: Plan) -> int | None:
+    """Return what becomes the shape of a free body itself, if any can: that is faster.
+
+    It is one in the frame of the body. The corners of a mesh can be given in any frame; and the
+    engine takes a margin for the shape of a base alone.
+    """
+    for geom in plan.geoms:
+        unmoved = not mj.geom_pos[geom].any() and mj.geom_quat[geom, 0] == 1.0
+        if mj.geom_bodyid[geom] == body and (unmoved or mj.geom_type[geom] == MESH):
+            return geom
+    return None
+
+
+def _corners(mj: mujoco.MjModel, geom: int, *, placed: bool = False) -> bytes:
+    """Return the corners of the convex hull of a mesh [m]; nothing for another shape.
+
+    Args:
+        mj: The model.
+        geom: The shape.
+        placed: Whether they are given in the frame of the body, and not in that of the shape.
+    """
     if mj.geom_type[geom] != MESH:
         return b""
     mesh = int(mj.geom_dataid[geom])
@@ -245,14 +301,18 @@ def _corners(mj: mujoco.MjModel, geom: int) -> bytes:
     if graph >= 0:  # number of corners and faces, where their edges begin, which vertices
         n = int(mj.mesh_graph[graph])
         vertices = vertices[mj.mesh_graph[graph + 2 + n : graph + 2 + 2 * n]]
-    found: bytes = vertices.tobytes()
+    if placed:
+        turn = np.empty(9)
+        mujoco.mju_quat2Mat(turn, mj.geom_quat[geom])
+        vertices = vertices @ turn.reshape(3, 3).T + mj.geom_pos[geom]
+    found: bytes = vertices.astype(np.float64).tobytes()
     return found
 
 
 @lru_cache(maxsize=1024)
 def _kept(vertices: bytes) -> list[list[float]]:
     """Make a list, always the same one: the engine never lets go of what it is given."""
-    found: list[list[float]] = np.frombuffer(vertices, np.float32).reshape(-1, 3).tolist()
+    found: list[list[float]] = np.frombuffer(vertices).reshape(-1, 3).tolist()
     return found
 
 
@@ -353,6 +413,10 @@ def _tree(
                 "baseInertialFrameOrientation": plain(axes),
             }
             carrier[body], origin[body], joint_links[joints[0]] = -1, np.zeros(3), -1
+            own = _own_shape(mj, body, plan)
+            if own is not None:
+                base["baseCollisionShapeIndex"] = _shape(engine, client, mj, own, placed=True)
+                geom_links[own] = -1
         else:
             start, turn = mj.body_pos[body], mj.body_quat[body]
             if parent in carrier:
@@ -372,7 +436,7 @@ def _tree(
             links.load(link, mass, center - at, axes)
             carrier[body], origin[body] = link, at
         for geom in plan.geoms:
-            if mj.geom_bodyid[geom] == body:
+            if mj.geom_bodyid[geom] == body and geom not in geom_links:
                 position, shape = mj.geom_pos[geom] - origin[body], _shape(engine, client, mj, geom)
                 turn = mj.geom_quat[geom]
                 geom_links[geom] = links.add(carrier[body], position, turn, shape=shape)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import statistics
 import weakref
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 import mujoco
 import numpy as np
@@ -17,7 +17,7 @@ from scm_world._types import Floats, Integers
 from scm_world.backends.base import ContactPoint
 from scm_world.backends.bullet.build import BALL, FREE, Built, Handle, solid
 from scm_world.backends.bullet.honoured import check, heavy, keys, rotations, settle
-from scm_world.backends.bullet.joints import parts
+from scm_world.backends.bullet.joints import Part, parts
 from scm_world.backends.mujoco import reading
 from scm_world.backends.mujoco.backend import realize
 from scm_world.backends.mujoco.trees import Couplings, disabled
@@ -221,11 +221,13 @@ class Client:
         self._doomed.extend(self._saved)
         self._bury()
         self._construct(instant.structure, instant.parameters)
+        self._twin.reset()  # what the last step left there must not matter
         self._twin.place(np.array(instant.state))
         for part in self._parts:
             part.put(self._twin.data)
-        for place in self._built.geoms.values():
-            if place[1] >= 0:  # what moves
+        moves = self._twin.model.body_treeid[self._twin.model.geom_bodyid] >= 0
+        for geom, place in self._built.geoms.items():
+            if moves[geom]:
                 self.engine.setCollisionFilterGroupMask(*place, 0, 0, physicsClientId=self.handle)
         self._check(instant.state)
         self._untouched = instant.state
@@ -252,7 +254,8 @@ class Client:
             gone = self._built.make(self._twin.model, self._shapes)
             self._told = {what: v for what, v in self._told.items() if what[1][0] not in gone}
             self._connect()
-            self._parts = list(parts(self.engine, self.handle, self._twin.model, self._built))
+            self._parts = self._joints(range(self._twin.model.ntree))
+            self._trees, self._driven = set[int](), list[Part]()
             self._inside = inside
         self._tell_all()
 
@@ -301,7 +304,15 @@ class Client:
                 self._tell(*what, value)
                 self._told[what] = value
         moved = self._moved()
-        self._driven = [part for part in self._parts if part.tree in moved]
+        if self._trees != moved:
+            self._trees, self._driven = moved, self._joints(moved)
+
+    def _joints(self, trees: Collection[int]) -> list[Part]:
+        """Prepare asking and telling of what moves in some trees."""
+        mj, places = self._twin.model, self._built.joints
+        tree_of = mj.body_treeid[mj.jnt_bodyid].tolist()
+        own = {joint: place for joint, place in places.items() if tree_of[joint] in trees}
+        return list(parts(self.engine, self.handle, mj, own))
 
     def _settings(self) -> Iterator[tuple[tuple[str, Handle], Any]]:
         """List what live bodies have, by what it is and where."""
@@ -408,6 +419,7 @@ class Client:
         ``a = (M + h D)^-1 (f - b)``; the forces ``M a + b`` let the engine's explicit step have it.
         """
         self._untouched = None
+        self._twin.forget()
         mj, data, options = self._twin.model, self._twin.data, self._twin.model.opt
         asked = options.disableflags, options.integrator
         options.disableflags |= SMOOTH
@@ -418,11 +430,10 @@ class Client:
             if self._driven:
                 for part in self._driven:
                     part.take(data)
-                places, speeds = data.qpos.copy(), data.qvel.copy()
+                speeds = data.qvel.copy()
                 mujoco.mj_step(mj, data)
                 mujoco.mj_mulM(mj, data, forces, (data.qvel - speeds) / options.timestep)
                 forces += data.qfrc_bias
-                data.qpos[:], data.qvel[:] = places, speeds
                 for part in self._driven:
                     part.drive(data, forces)
             self.engine.stepSimulation(physicsClientId=self.handle)

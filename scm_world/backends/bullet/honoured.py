@@ -16,9 +16,11 @@ from scm_world._types import Floats
 from scm_world.backends.bullet.build import (
     BALL,
     FREE,
+    MOST_LINKS,
     SHAPES,
     couplings,
-    joints_of,
+    links,
+    plan_of,
     takes_armature,
 )
 from scm_world.backends.mujoco import fields, reading
@@ -29,9 +31,6 @@ from scm_world.models.model import Model, Parameter
 from scm_world.models.scene import ParameterKey, State
 
 UNIT = 1e-12  # a quaternion whose squared norm is this near to 1 is taken as it is
-
-MOST_LINKS = 127
-"""The engine has room for no more of them in a multibody."""
 
 
 @lru_cache(maxsize=64)
@@ -114,17 +113,14 @@ def _of_bodies(
     yield from (
         f"the mocap body {names['body'][body]!r}" for body in np.flatnonzero(mj.body_mocapid >= 0)
     )
-    shapes = np.bincount(mj.geom_bodyid, trees.touches.any(axis=1), mj.nbody)
+    touching = np.flatnonzero(trees.touches.any(axis=1)).tolist()
     for tree in range(mj.ntree):
-        members = np.flatnonzero(mj.body_treeid == tree).tolist()
-        links = int(shapes[members].sum())
-        for body in members:
-            kinds = [mj.jnt_type[joint] for joint in joints_of(mj, body)]
-            links += 0 if FREE in kinds else max(1, len(kinds))
-        if links > MOST_LINKS:
+        plan = plan_of(mj, tree, touching)
+        count = links(mj, plan)
+        if count > MOST_LINKS:
             yield (
-                f"the {links} links that {names['body'][members[0]]!r} and all that hangs on it "
-                f"need: there is room for {MOST_LINKS}"
+                f"the {count} links that {names['body'][plan.bodies[0]]!r} and all that hangs on "
+                f"it need: there is room for {MOST_LINKS}"
             )
 
 
@@ -134,6 +130,7 @@ def check(model: Model, parameters: Mapping[ParameterKey, Any]) -> None:
     Raises:
         ModelError: All of it that is in the model.
         NotIntervenable: A parameter that the engine lacks is not as in the model.
+        EngineFailure: A rotation has no direction.
     """
     problems = unsupported(model)
     if problems:
@@ -141,6 +138,9 @@ def check(model: Model, parameters: Mapping[ParameterKey, Any]) -> None:
         raise ModelError([f"Bullet cannot honour {what}; {advice}" for what in problems])
     known = changes(model)
     for row in model.parameters:
+        if row.kind == "rotation" and not any(parameters[row.key]):
+            found = parameters[row.key]
+            raise EngineFailure(f"{row.name} must be a quaternion, got {found}", "bullet")
         if row.visual or row.key in known:
             continue
         default, value = np.array(row.default), parameters[row.key]

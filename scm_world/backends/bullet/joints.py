@@ -3,95 +3,121 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, final
 
 import mujoco
 import numpy as np
 
-from scm_world._types import Floats
-from scm_world.backends.bullet.build import BALL, FREE, Built, composed, plain, rotated
+from scm_world._types import Floats, Integers
+from scm_world.backends.bullet.build import BALL, FREE, UNTURNED, Handle, composed, plain, rotated
 
 _SIGNS = np.array([1.0, -1.0, -1.0, -1.0])
 """What turns a quaternion (w, x, y, z) into its inverse."""
 
 
 class Part(ABC):
-    """Joints of one multibody that the engine is asked and told of together.
+    """Joints that the engine is asked and told of together."""
+
+    @abstractmethod
+    def put(self, data: mujoco.MjData) -> None:
+        """Give the engine the state that MuJoCo has."""
+
+    @abstractmethod
+    def take(self, data: mujoco.MjData) -> None:
+        """Give MuJoCo the state that the engine has."""
+
+    @abstractmethod
+    def drive(self, data: mujoco.MjData, forces: Floats) -> None:
+        """Apply generalized forces in the next step. MuJoCo has bodies where they are before it."""
+
+
+@final
+class Scalars(Part):
+    """Hinges and slides.
 
     Args:
         engine: The module ``pybullet``.
         handle: The number of the client.
         mj: The model.
-        multibody: The number of the multibody.
-        links: The link of each joint, by the number of the joint.
-
-    Attributes:
-        tree: Number of the kinematic tree.
+        places: The link of each joint, by the number of the joint.
     """
 
     def __init__(
-        self, engine: Any, handle: int, mj: mujoco.MjModel, multibody: int, links: dict[int, int]
+        self, engine: Any, handle: int, mj: mujoco.MjModel, places: Mapping[int, Handle]
     ) -> None:
-        self._engine, self._handle, self._multibody = engine, handle, multibody
-        joints = list(links)
-        self._links, self._link = list(links.values()), links[joints[0]]
-        self._q, self._v = int(mj.jnt_qposadr[joints[0]]), int(mj.jnt_dofadr[joints[0]])
-        body = int(mj.jnt_bodyid[joints[0]])
-        self.tree = int(mj.body_treeid[body])
-        last = mj.body_jntadr[body] + mj.body_jntnum[body] - 1 == joints[0]  # others have no mass
-        self._axes = mj.body_iquat[body].copy() if last else np.array([1.0, 0.0, 0.0, 0.0])
-        self._center = mj.body_ipos[body].copy()
-        self._positions, self._velocities = mj.jnt_qposadr[joints], mj.jnt_dofadr[joints]
+        self._engine, self._handle = engine, handle
+        links: dict[int, dict[int, int]] = {}
+        for joint, (multibody, link) in places.items():
+            links.setdefault(multibody, {})[joint] = link
+        joints = [joint for own in links.values() for joint in own]
+        self._links = [(multibody, list(own.values())) for multibody, own in links.items()]
+        self._positions = _run(mj.jnt_qposadr[joints])
+        self._velocities = _run(mj.jnt_dofadr[joints])
         self._references = mj.qpos0[self._positions]
-
-    @abstractmethod
-    def put(self, data: mujoco.MjData) -> None:
-        """Give the engine the state that MuJoCo has."""
-
-    @abstractmethod
-    def take(self, data: mujoco.MjData) -> None:
-        """Give MuJoCo the state that the engine has."""
-
-    @abstractmethod
-    def drive(self, data: mujoco.MjData, forces: Floats) -> None:
-        """Apply generalized forces, which are those at MuJoCo's state, in the next step."""
-
-
-@final
-class Scalars(Part):
-    """Hinges and slides."""
 
     def put(self, data: mujoco.MjData) -> None:
         """Give the engine the state that MuJoCo has."""
         values = (data.qpos[self._positions] - self._references).tolist()
         speeds = data.qvel[self._velocities].tolist()
-        for link, value, speed in zip(self._links, values, speeds, strict=True):
-            self._engine.resetJointState(
-                self._multibody, link, value, speed, physicsClientId=self._handle
-            )
+        places = [(multibody, link) for multibody, links in self._links for link in links]
+        for place, value, speed in zip(places, values, speeds, strict=True):
+            self._engine.resetJointState(*place, value, speed, physicsClientId=self._handle)
 
     def take(self, data: mujoco.MjData) -> None:
         """Give MuJoCo the state that the engine has."""
-        rows = self._engine.getJointStates(
-            self._multibody, self._links, physicsClientId=self._handle
-        )
-        data.qpos[self._positions] = self._references + [row[0] for row in rows]
+        ask, handle = self._engine.getJointStates, self._handle
+        rows = [
+            row for body, links in self._links for row in ask(body, links, physicsClientId=handle)
+        ]
+        data.qpos[self._positions] = [row[0] for row in rows]
+        data.qpos[self._positions] += self._references
         data.qvel[self._velocities] = [row[1] for row in rows]
 
     def drive(self, data: mujoco.MjData, forces: Floats) -> None:
         """Apply forces along the joints."""
-        self._engine.setJointMotorControlArray(
-            self._multibody,
-            self._links,
+        tell, torque, given = (
+            self._engine.setJointMotorControlArray,
             self._engine.TORQUE_CONTROL,
-            forces=forces[self._velocities].tolist(),
-            physicsClientId=self._handle,
+            forces[self._velocities].tolist(),
         )
+        for multibody, links in self._links:
+            own, given = given[: len(links)], given[len(links) :]
+            tell(multibody, links, torque, forces=own, physicsClientId=self._handle)
+
+
+def _run(numbers: Integers) -> Any:
+    """Give a slice for numbers that follow one another, which is faster; else the numbers."""
+    first, count = int(numbers[0]), len(numbers)
+    run = bool((numbers == np.arange(first, first + count)).all())
+    return slice(first, first + count) if run else numbers
+
+
+class _Rigid(Part):
+    """A joint that turns a body freely.
+
+    Args:
+        engine: The module ``pybullet``.
+        handle: The number of the client.
+        mj: The model.
+        joint: Its number.
+        place: Its link.
+    """
+
+    def __init__(
+        self, engine: Any, handle: int, mj: mujoco.MjModel, joint: int, place: Handle
+    ) -> None:
+        self._engine, self._handle = engine, handle
+        self._multibody, self._link = place
+        self._q, self._v = int(mj.jnt_qposadr[joint]), int(mj.jnt_dofadr[joint])
+        self._body = body = int(mj.jnt_bodyid[joint])
+        last = mj.body_jntadr[body] + mj.body_jntnum[body] - 1 == joint  # others have no mass
+        self._axes = mj.body_iquat[body].copy() if last else UNTURNED
+        self._center = mj.body_ipos[body].copy()
 
 
 @final
-class Ball(Part):
+class Ball(_Rigid):
     """A ball joint. The engine has it about the principal axes of the body."""
 
     def put(self, data: mujoco.MjData) -> None:
@@ -125,7 +151,7 @@ class Ball(Part):
 
 
 @final
-class Free(Part):
+class Free(_Rigid):
     """A free body. The engine has the motion of its center, and turns of its principal axes."""
 
     def put(self, data: mujoco.MjData) -> None:
@@ -163,9 +189,8 @@ class Free(Part):
 
     def drive(self, data: mujoco.MjData, forces: Floats) -> None:
         """Apply a force at the origin of the body, and a torque that is given in its frame."""
-        q, v = self._q, self._v
-        engine, world = self._engine, self._engine.WORLD_FRAME
-        place, turn = data.qpos[q : q + 3].tolist(), data.qpos[q + 3 : q + 7]
+        v, engine, world = self._v, self._engine, self._engine.WORLD_FRAME
+        place, turn = data.xpos[self._body].tolist(), data.xquat[self._body]
         push, torque = forces[v : v + 3].tolist(), rotated(turn, forces[v + 3 : v + 6]).tolist()
         engine.applyExternalForce(
             self._multibody, -1, push, place, world, physicsClientId=self._handle
@@ -180,15 +205,23 @@ def _cross(first: Floats, second: Floats) -> Floats:
     return found
 
 
-def parts(engine: Any, handle: int, mj: mujoco.MjModel, built: Built) -> Iterator[Part]:
-    """List everything that can move, as few parts as there can be."""
-    scalars: dict[int, dict[int, int]] = {}
-    for joint, (multibody, link) in sorted(built.joints.items()):
+def parts(
+    engine: Any, handle: int, mj: mujoco.MjModel, places: Mapping[int, Handle]
+) -> Iterator[Part]:
+    """List what can move, as few parts as there can be.
+
+    Args:
+        engine: The module ``pybullet``.
+        handle: The number of the client.
+        mj: The model.
+        places: The link of each joint, by the number of the joint.
+    """
+    scalars: dict[int, Handle] = {}
+    for joint, place in sorted(places.items()):
         kind = mj.jnt_type[joint]
         if kind in (FREE, BALL):
-            one = Free if kind == FREE else Ball
-            yield one(engine, handle, mj, multibody, {joint: link})
+            yield (Free if kind == FREE else Ball)(engine, handle, mj, joint, place)
         else:
-            scalars.setdefault(multibody, {})[joint] = link
-    for multibody, links in scalars.items():
-        yield Scalars(engine, handle, mj, multibody, links)
+            scalars[joint] = place
+    if scalars:
+        yield Scalars(engine, handle, mj, scalars)
