@@ -253,9 +253,18 @@ def couplings(mj: mujoco.MjModel, joints: Sequence[int]) -> Iterator[int]:
 
 
 def _shape(
-    engine: Any, client: int, mj: mujoco.MjModel, geom: int, *, placed: bool = False
+    engine: Any, client: int, mj: mujoco.MjModel, geom: int, origin: Floats | None = None
 ) -> int:
-    """Make a collision shape; see ``_corners``."""
+    """Make a collision shape.
+
+    Args:
+        engine: The module ``pybullet``.
+        client: Its client.
+        mj: The model.
+        geom: The shape.
+        origin: Of the frame that it is made in, which is turned like the body, in the frame of the
+            body [m]; in its own frame if None.
+    """
     radius, half, _ = size = mj.geom_size[geom].tolist()
     kind, options = {
         PLANE: (engine.GEOM_PLANE, {"planeNormal": [0.0, 0.0, 1.0]}),
@@ -266,32 +275,18 @@ def _shape(
         MESH: (engine.GEOM_MESH, {}),
     }[int(mj.geom_type[geom])]
     if kind == engine.GEOM_MESH:
-        options["vertices"] = _kept(_corners(mj, geom, placed=placed))
+        options["vertices"] = _kept(_corners(mj, geom, origin))
+    elif origin is not None:
+        place, turn = mj.geom_pos[geom] - origin, mj.geom_quat[geom]
+        if place.any() or turn[0] != 1.0:  # a frame of its own, which has a price
+            options |= {"collisionFramePosition": place.tolist()}
+            options |= {"collisionFrameOrientation": plain(turn)}
     shape: int = engine.createCollisionShape(kind, physicsClientId=client, **options)
     return shape
 
 
-def _own_shape(mj: mujoco.MjModel, body: int, plan: Plan) -> int | None:
-    """Return what becomes the shape of a free body itself, if any can: that is faster.
-
-    It is one in the frame of the body. The corners of a mesh can be given in any frame; and the
-    engine takes a margin for the shape of a base alone.
-    """
-    for geom in plan.geoms:
-        unmoved = not mj.geom_pos[geom].any() and mj.geom_quat[geom, 0] == 1.0
-        if mj.geom_bodyid[geom] == body and (unmoved or mj.geom_type[geom] == MESH):
-            return geom
-    return None
-
-
-def _corners(mj: mujoco.MjModel, geom: int, *, placed: bool = False) -> bytes:
-    """Return the corners of the convex hull of a mesh [m]; nothing for another shape.
-
-    Args:
-        mj: The model.
-        geom: The shape.
-        placed: Whether they are given in the frame of the body, and not in that of the shape.
-    """
+def _corners(mj: mujoco.MjModel, geom: int, origin: Floats | None = None) -> bytes:
+    """Return the corners of the convex hull of a mesh [m], see ``_shape``; else nothing."""
     if mj.geom_type[geom] != MESH:
         return b""
     mesh = int(mj.geom_dataid[geom])
@@ -301,10 +296,10 @@ def _corners(mj: mujoco.MjModel, geom: int, *, placed: bool = False) -> bytes:
     if graph >= 0:  # number of corners and faces, where their edges begin, which vertices
         n = int(mj.mesh_graph[graph])
         vertices = vertices[mj.mesh_graph[graph + 2 + n : graph + 2 + 2 * n]]
-    if placed:
+    if origin is not None:
         turn = np.empty(9)
         mujoco.mju_quat2Mat(turn, mj.geom_quat[geom])
-        vertices = vertices @ turn.reshape(3, 3).T + mj.geom_pos[geom]
+        vertices = vertices @ turn.reshape(3, 3).T + mj.geom_pos[geom] - origin
     found: bytes = vertices.astype(np.float64).tobytes()
     return found
 
@@ -413,10 +408,6 @@ def _tree(
                 "baseInertialFrameOrientation": plain(axes),
             }
             carrier[body], origin[body], joint_links[joints[0]] = -1, np.zeros(3), -1
-            own = _own_shape(mj, body, plan)
-            if own is not None:
-                base["baseCollisionShapeIndex"] = _shape(engine, client, mj, own, placed=True)
-                geom_links[own] = -1
         else:
             start, turn = mj.body_pos[body], mj.body_quat[body]
             if parent in carrier:
@@ -435,11 +426,17 @@ def _tree(
                 link = links.add(link, start, turn)
             links.load(link, mass, center - at, axes)
             carrier[body], origin[body] = link, at
-        for geom in plan.geoms:
-            if mj.geom_bodyid[geom] == body and geom not in geom_links:
-                position, shape = mj.geom_pos[geom] - origin[body], _shape(engine, client, mj, geom)
-                turn = mj.geom_quat[geom]
-                geom_links[geom] = links.add(carrier[body], position, turn, shape=shape)
+        own = [geom for geom in plan.geoms if mj.geom_bodyid[geom] == body]
+        for geom in own[:1]:
+            shape, link = _shape(engine, client, mj, geom, origin[body]), carrier[body]
+            geom_links[geom] = link
+            if link < 0:
+                base["baseCollisionShapeIndex"] = shape
+            else:
+                links.rows[link][1] = shape
+        for geom in own[1:]:
+            shape = _shape(engine, client, mj, geom, origin[body])
+            geom_links[geom] = links.add(carrier[body], np.zeros(3), UNTURNED, shape=shape)
     # What touches what is said by pairs alone, also within the multibody.
     flags = engine.URDF_USE_SELF_COLLISION | engine.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
     made = engine.createMultiBody(
