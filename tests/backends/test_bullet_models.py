@@ -25,7 +25,7 @@ from scm_world.backends.mujoco.fields import element_names
 from scm_world.backends.mujoco.reading import compiled, permutation
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
-from scm_world.models import Difference, Model, Parameter, Scene
+from scm_world.models import Difference, Model, Parameter
 from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.backend import busy_scene
 from scm_world.testing.backend import play as play_robot

@@ -225,8 +225,6 @@ def _made(
         unit = Unit(made_of, multibody, [], [], [-1])
     for geom, link in zip(plan.geoms, unit.geoms, strict=True):
         place = unit.multibody, link
-        # By itself, a shape touches nothing: pairs say what it does.
-        engine.setCollisionFilterGroupMask(*place, 0, 0, physicsClientId=client)
         if mj.geom_type[geom] == MESH:
             engine.changeDynamics(*place, collisionMargin=HULL_MARGIN, physicsClientId=client)
     return unit

@@ -12,6 +12,7 @@ from typing import Any, final
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import ContactPoint
@@ -126,6 +127,42 @@ def usual_friction(mj: mujoco.MjModel) -> float:
     return float(statistics.median_low(found.tolist() or [0.0]))
 
 
+MOST_GROUPS = 31
+"""As many bits the engine has."""
+
+
+def groups(touches: NDArray[np.bool_]) -> dict[int, tuple[int, int]]:
+    """Give each shape that touches something a group and a mask of those it touches.
+
+    Shapes that touch the same others, and each other or not, are one group.
+
+    Args:
+        touches: Which shapes may touch, shape (ngeom, ngeom).
+
+    Returns:
+        Nothing if there are more groups than the engine has.
+    """
+    members: list[list[int]] = []
+    for geom in np.flatnonzero(touches.any(axis=1)).tolist():
+        for group in members:
+            among = touches[np.ix_([*group, geom], [*group, geom])]
+            inside = among[~np.eye(len(among), dtype=np.bool_)]
+            apart = np.delete(touches[[group[0], geom]], [*group, geom], axis=1)
+            if (apart[0] == apart[1]).all() and (inside == inside[0]).all():
+                group.append(geom)
+                break
+        else:
+            members.append([geom])
+    if len(members) > MOST_GROUPS:
+        return {}
+    number = {geom: index for index, group in enumerate(members) for geom in group}
+    found = {}
+    for geom, index in number.items():
+        others = {number[other] for other in np.flatnonzero(touches[geom]).tolist()}
+        found[geom] = 1 << index, sum(1 << other for other in others)
+    return found
+
+
 def spinning_shares(mj: mujoco.MjModel) -> dict[int, float]:
     """Give each shape in a pair what it gets of the spinning friction of its pairs.
 
@@ -188,7 +225,7 @@ class Client:
         self._model: Model | None = None
         self._told: dict[tuple[str, Handle], Any] = {}  # what the engine was told of live bodies
         self._inside: Values | None = None  # parameters that were built into the bodies
-        self._connected: set[tuple[int, int, int, int]] = set()  # pairs of shapes that may touch
+        self._ruled: set[tuple[int, int, int, int]] = set()  # pairs of links with a rule
         self._untouched: list[float] | None = None
         self._saved: dict[int, tuple[int, Floats]] = {}  # engine's number and activations
         self._tickets = 0
@@ -228,7 +265,8 @@ class Client:
         moves = self._twin.model.body_treeid[self._twin.model.geom_bodyid] >= 0
         for geom, place in self._built.geoms.items():
             if moves[geom]:
-                self.engine.setCollisionFilterGroupMask(*place, 0, 0, physicsClientId=self.handle)
+                both = self._filters[place]
+                self.engine.setCollisionFilterGroupMask(*place, *both, physicsClientId=self.handle)
         self._check(instant.state)
         self._untouched = instant.state
 
@@ -243,6 +281,7 @@ class Client:
             trees = Couplings(compiled)
             self._dynamic = np.flatnonzero(trees.dynamic.any(axis=1)).tolist()
             self._touching = np.argwhere(np.triu(trees.touches)).tolist()
+            self._groups = groups(trees.touches)
             self._shapes = np.flatnonzero(trees.touches.any(axis=1)).tolist()
             ends = zip(compiled.pair_geom1.tolist(), compiled.pair_geom2.tolist(), strict=True)
             self._paired = {geom: pair for pair, both in enumerate(ends) for geom in both}
@@ -260,15 +299,20 @@ class Client:
         self._tell_all()
 
     def _connect(self) -> None:
-        """Say which shapes may touch."""
+        """Say which shapes may touch: by groups, or pair by pair if these are too many."""
         geoms = self._built.geoms
+        self._filters = {geoms[geom]: both for geom, both in self._groups.items()}
         wanted = {(*geoms[first], *geoms[second]) for first, second in self._touching}
-        for pairs, enabled in ((self._connected - wanted, 0), (wanted, 1)):
-            for body, link, other, its in sorted(pairs):
-                self.engine.setCollisionFilterPair(
-                    body, other, link, its, enabled, physicsClientId=self.handle
-                )
-        self._connected = wanted
+        if not self._groups:
+            self._ruled |= wanted  # this holds as long as the client
+            self._filters = dict.fromkeys(geoms.values(), (0, 0))
+        for body, link, other, its in sorted(self._ruled):
+            enabled = int((body, link, other, its) in wanted)
+            self.engine.setCollisionFilterPair(
+                body, other, link, its, enabled, physicsClientId=self.handle
+            )
+        for place, both in self._filters.items():
+            self.engine.setCollisionFilterGroupMask(*place, *both, physicsClientId=self.handle)
 
     def _check(self, state: list[float]) -> None:
         """Make sure that the engine took the state, up to rounding and the sign of a quaternion.
@@ -425,14 +469,16 @@ class Client:
         options.disableflags |= SMOOTH
         options.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         self._twin.command[:] = command
-        forces = np.empty(mj.nv)
+        forces, rates, step = np.empty(mj.nv), np.empty(mj.nv), options.timestep
         for _ in range(substeps):
             if self._driven:
                 for part in self._driven:
                     part.take(data)
                 speeds = data.qvel.copy()
                 mujoco.mj_step(mj, data)
-                mujoco.mj_mulM(mj, data, forces, (data.qvel - speeds) / options.timestep)
+                np.subtract(data.qvel, speeds, out=rates)
+                rates /= step
+                mujoco.mj_mulM(mj, data, forces, rates)
                 forces += data.qfrc_bias
                 for part in self._driven:
                     part.drive(data, forces)

@@ -8,6 +8,7 @@ from typing import Any, final
 
 import mujoco
 import numpy as np
+from numba import njit
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.bullet.build import BALL, FREE, UNTURNED, Handle, composed, plain, rotated
@@ -55,6 +56,7 @@ class Scalars(Part):
         self._positions = _run(mj.jnt_qposadr[joints])
         self._velocities = _run(mj.jnt_dofadr[joints])
         self._references = mj.qpos0[self._positions]
+        self._shifted = bool(self._references.any())
 
     def put(self, data: mujoco.MjData) -> None:
         """Give the engine the state that MuJoCo has."""
@@ -71,7 +73,8 @@ class Scalars(Part):
             row for body, links in self._links for row in ask(body, links, physicsClientId=handle)
         ]
         data.qpos[self._positions] = [row[0] for row in rows]
-        data.qpos[self._positions] += self._references
+        if self._shifted:
+            data.qpos[self._positions] += self._references
         data.qvel[self._velocities] = [row[1] for row in rows]
 
     def drive(self, data: mujoco.MjData, forces: Floats) -> None:
@@ -93,8 +96,9 @@ def _run(numbers: Integers) -> Any:
     return slice(first, first + count) if run else numbers
 
 
-class _Rigid(Part):
-    """A joint that turns a body freely.
+@final
+class Ball(Part):
+    """A ball joint. The engine has it about the principal axes of the body.
 
     Args:
         engine: The module ``pybullet``.
@@ -110,15 +114,9 @@ class _Rigid(Part):
         self._engine, self._handle = engine, handle
         self._multibody, self._link = place
         self._q, self._v = int(mj.jnt_qposadr[joint]), int(mj.jnt_dofadr[joint])
-        self._body = body = int(mj.jnt_bodyid[joint])
+        body = int(mj.jnt_bodyid[joint])
         last = mj.body_jntadr[body] + mj.body_jntnum[body] - 1 == joint  # others have no mass
         self._axes = mj.body_iquat[body].copy() if last else UNTURNED
-        self._center = mj.body_ipos[body].copy()
-
-
-@final
-class Ball(_Rigid):
-    """A ball joint. The engine has it about the principal axes of the body."""
 
     def put(self, data: mujoco.MjData) -> None:
         """Give the engine the state that MuJoCo has."""
@@ -151,58 +149,137 @@ class Ball(_Rigid):
 
 
 @final
-class Free(_Rigid):
-    """A free body. The engine has the motion of its center, and turns of its principal axes."""
+class Free(Part):
+    """Free bodies. The engine has the motion of their centers, and turns of their principal axes.
+
+    Args:
+        engine: The module ``pybullet``.
+        handle: The number of the client.
+        mj: The model.
+        places: The base of each body, by the number of its joint.
+    """
+
+    def __init__(
+        self, engine: Any, handle: int, mj: mujoco.MjModel, places: Mapping[int, Handle]
+    ) -> None:
+        self._engine, self._handle = engine, handle
+        self._multibodies = [multibody for multibody, _ in places.values()]
+        joints = list(places)
+        self._bodies = mj.jnt_bodyid[joints].tolist()
+        self._starts = np.stack([mj.jnt_qposadr[joints], mj.jnt_dofadr[joints]], axis=1)
+        self._centers, self._axes = mj.body_ipos[self._bodies], mj.body_iquat[self._bodies]
 
     def put(self, data: mujoco.MjData) -> None:
         """Give the engine the state that MuJoCo has."""
-        q, v = self._q, self._v
-        turn = data.qpos[q + 3 : q + 7]
-        arm, spin = rotated(turn, self._center), rotated(turn, data.qvel[v + 3 : v + 6])
-        speed = data.qvel[v : v + 3] + _cross(spin, arm)
-        self._engine.resetBasePositionAndOrientation(
-            self._multibody,
-            (data.qpos[q : q + 3] + arm).tolist(),
-            plain(composed(turn, self._axes)),
-            physicsClientId=self._handle,
-        )
-        self._engine.resetBaseVelocity(
-            self._multibody, speed.tolist(), spin.tolist(), physicsClientId=self._handle
-        )
+        engine, handle = self._engine, self._handle
+        rows = np.empty((len(self._multibodies), 13))
+        _to_centers(data.qpos, data.qvel, self._starts, self._centers, self._axes, rows)
+        for body, row in zip(self._multibodies, rows.tolist(), strict=True):
+            engine.resetBasePositionAndOrientation(body, row[:3], row[3:7], physicsClientId=handle)
+            engine.resetBaseVelocity(body, row[7:10], row[10:], physicsClientId=handle)
 
     def take(self, data: mujoco.MjData) -> None:
-        """Give MuJoCo the state that the engine has, with a quaternion whose w >= 0.
+        """Give MuJoCo the state that the engine has, with quaternions whose w >= 0.
 
         The engine keeps a matrix: which of two quaternions it makes of it has no meaning.
         """
-        engine, handle, q, v = self._engine, self._handle, self._q, self._v
-        position, (x, y, z, w) = engine.getBasePositionAndOrientation(
-            self._multibody, physicsClientId=handle
-        )
-        speed, spin = map(np.array, engine.getBaseVelocity(self._multibody, physicsClientId=handle))
-        turn = composed(np.array([w, x, y, z]), _SIGNS * self._axes)
-        turn = -turn if turn[0] < 0.0 else turn
-        arm = rotated(turn, self._center)
-        data.qpos[q : q + 3], data.qpos[q + 3 : q + 7] = position - arm, turn
-        data.qvel[v : v + 3] = speed - _cross(spin, arm)
-        data.qvel[v + 3 : v + 6] = rotated(_SIGNS * turn, spin)
+        engine, handle, rows = self._engine, self._handle, list[tuple[float, ...]]()
+        for body in self._multibodies:
+            position, turn = engine.getBasePositionAndOrientation(body, physicsClientId=handle)
+            speed, spin = engine.getBaseVelocity(body, physicsClientId=handle)
+            rows.append(position + turn + speed + spin)
+        _from_centers(np.array(rows), self._starts, self._centers, self._axes, data.qpos, data.qvel)
 
     def drive(self, data: mujoco.MjData, forces: Floats) -> None:
-        """Apply a force at the origin of the body, and a torque that is given in its frame."""
-        v, engine, world = self._v, self._engine, self._engine.WORLD_FRAME
-        place, turn = data.xpos[self._body].tolist(), data.xquat[self._body]
-        push, torque = forces[v : v + 3].tolist(), rotated(turn, forces[v + 3 : v + 6]).tolist()
-        engine.applyExternalForce(
-            self._multibody, -1, push, place, world, physicsClientId=self._handle
-        )
-        engine.applyExternalTorque(self._multibody, -1, torque, world, physicsClientId=self._handle)
+        """Apply forces at the origins of the bodies, and torques that are given in their frames."""
+        engine, world, handle = self._engine, self._engine.WORLD_FRAME, self._handle
+        for multibody, body, (_, v) in zip(
+            self._multibodies, self._bodies, self._starts.tolist(), strict=True
+        ):
+            place, push = data.xpos[body].tolist(), forces[v : v + 3].tolist()
+            torque = rotated(data.xquat[body], forces[v + 3 : v + 6]).tolist()
+            engine.applyExternalForce(multibody, -1, push, place, world, physicsClientId=handle)
+            engine.applyExternalTorque(multibody, -1, torque, world, physicsClientId=handle)
 
 
-def _cross(first: Floats, second: Floats) -> Floats:
-    """Compute the outer product of two vectors."""
-    found = np.empty(3)
-    mujoco.mju_cross(found, first, second)
-    return found
+@njit(cache=True)
+def _turned(turn: Floats, vector: Floats, sign: float) -> Floats:
+    """Rotate a vector by a unit quaternion (x, y, z, w), or back with the sign -1."""
+    x, y, z, w = turn[0], turn[1], turn[2], sign * turn[3]
+    a, b, c = vector[0], vector[1], vector[2]
+    p, q, r = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return np.array(
+        [a + w * p + y * r - z * q, b + w * q + z * p - x * r, c + w * r + x * q - y * p]
+    )
+
+
+@njit(cache=True)
+def _product(p: Floats, q: Floats) -> Floats:
+    """Compose two quaternions (x, y, z, w): first q, then p."""
+    a, b, c, d = p[0], p[1], p[2], p[3]
+    x, y, z, w = q[0], q[1], q[2], q[3]
+    return np.array(
+        [
+            d * x + a * w + b * z - c * y,
+            d * y + b * w + c * x - a * z,
+            d * z + c * w + a * y - b * x,
+            d * w - a * x - b * y - c * z,
+        ]
+    )
+
+
+@njit(cache=True)
+def _to_centers(
+    positions: Floats,
+    velocities: Floats,
+    starts: Integers,
+    centers: Floats,
+    axes: Floats,
+    into: Floats,
+) -> None:
+    """Compute the motion of the centers of free bodies, and of their principal axes.
+
+    Args:
+        positions: ``qpos``.
+        velocities: ``qvel``.
+        starts: Where each body begins in the two, shape (n, 2).
+        centers: Centers of mass in the frames of the bodies, shape (n, 3) [m].
+        axes: From principal axes to those frames, as MuJoCo has quaternions, shape (n, 4).
+        into: Position, quaternion (x, y, z, w), velocity and angular velocity in the world,
+            written, shape (n, 13).
+    """
+    for i in range(len(into)):
+        q, v = starts[i, 0], starts[i, 1]
+        turn = np.roll(positions[q + 3 : q + 7], -1)
+        arm = _turned(turn, centers[i], 1.0)
+        spin = _turned(turn, velocities[v + 3 : v + 6], 1.0)
+        into[i, :3] = positions[q : q + 3] + arm
+        into[i, 3:7] = _product(turn, np.roll(axes[i], -1))
+        into[i, 7:10] = velocities[v : v + 3] + np.cross(spin, arm)
+        into[i, 10:] = spin
+
+
+@njit(cache=True)
+def _from_centers(
+    rows: Floats,
+    starts: Integers,
+    centers: Floats,
+    axes: Floats,
+    positions: Floats,
+    velocities: Floats,
+) -> None:
+    """Do the opposite of ``_to_centers``, with quaternions whose w is not negative."""
+    back = np.array([-1.0, -1.0, -1.0, 1.0])
+    for i in range(len(rows)):
+        q, v = starts[i, 0], starts[i, 1]
+        turn = _product(rows[i, 3:7], back * np.roll(axes[i], -1))
+        if turn[3] < 0.0:
+            turn = -turn
+        arm, spin = _turned(turn, centers[i], 1.0), rows[i, 10:]
+        positions[q : q + 3] = rows[i, :3] - arm
+        positions[q + 3 : q + 7] = np.roll(turn, 1)
+        velocities[v : v + 3] = rows[i, 7:10] - np.cross(spin, arm)
+        velocities[v + 3 : v + 6] = _turned(turn, spin, -1.0)
 
 
 def parts(
@@ -216,12 +293,11 @@ def parts(
         mj: The model.
         places: The link of each joint, by the number of the joint.
     """
-    scalars: dict[int, Handle] = {}
+    together: dict[type[Scalars | Free], dict[int, Handle]] = {}
     for joint, place in sorted(places.items()):
         kind = mj.jnt_type[joint]
-        if kind in (FREE, BALL):
-            yield (Free if kind == FREE else Ball)(engine, handle, mj, joint, place)
+        if kind == BALL:
+            yield Ball(engine, handle, mj, joint, place)
         else:
-            scalars[joint] = place
-    if scalars:
-        yield Scalars(engine, handle, mj, scalars)
+            together.setdefault(Free if kind == FREE else Scalars, {})[joint] = place
+    yield from (kind(engine, handle, mj, own) for kind, own in together.items())
