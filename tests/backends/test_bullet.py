@@ -131,9 +131,9 @@ def test_a_canonical_world_equals_a_new_one(
 def fingers_touch(backend: Backend, what: str) -> bool:
     """Tell whether a finger touches something of this name."""
     pairs = [contact.bodies for contact in backend.contacts()]
-    robot = [pair for pair in pairs if any("link" in name for name in pair)]
+    robot = [pair for pair in pairs if any("finger" in name for name in pair)]
     if what == "link":
-        return any("link" in first and "link" in second for first, second in robot)
+        return any("finger" in first and "finger" in second for first, second in robot)
     return any(what in name for pair in robot for name in pair)
 
 

@@ -12,15 +12,11 @@ import numpy as np
 import pytest
 
 from scm_world.backends.bullet import BulletBackend
+from scm_world.backends.mujoco.reading import body_names, compiled
 from scm_world.errors import EngineFailure, MissingEngine
-from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models import Difference
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.bullet import arena
-from scm_world.tasks.trifinger.bullet.arena import PARTS, link_index
-from scm_world.tasks.trifinger.bullet.client import compile_law
-from scm_world.tasks.trifinger.bullet.passive import MASSES, inverse_dynamics, mass_matrix
-from scm_world.tasks.trifinger.hardware import SPINNING_FRICTION, ControllerSpec
+from scm_world.tasks.trifinger.hardware import SPINNING_FRICTION
 from scm_world.tasks.trifinger.kinematics import link_frames
 from scm_world.tasks.trifinger.system import trifinger
 from scm_world.testing.backend import busy_scene
@@ -38,26 +34,13 @@ def backend() -> Iterator[BulletBackend]:
     backend.close()
 
 
-@pytest.mark.parametrize("torques", [False, True])
-def test_the_law_in_plain_floats_is_the_law(torques: bool) -> None:
-    """The torques equal those of ``ControllerSpec`` to the last bit."""
-    spec = ControllerSpec()
-    law, generator = compile_law(spec, commanded=torques), np.random.default_rng(0)
-    for _ in range(500):
-        command, positions, velocities = generator.normal(size=(3, 9), scale=0.1)
-        velocities *= 10
-        states = list(zip(positions.tolist(), velocities.tolist(), strict=True))
-        expected = spec.torques(command, positions, velocities, direct=torques)
-        assert law(states, command.tolist()) == expected.tolist()
-
-
 # --- the robot in the engine ----------------------------------------------------------------------
 
 
-def robot(backend: BulletBackend) -> tuple[Any, int, int]:
-    """Give the engine, the client and the body of the robot."""
+def robot(backend: BulletBackend) -> tuple[Any, Any, tuple[str, ...]]:
+    """Give the engine, the client that holds the last step, and the names of the bodies."""
     client = backend._last()
-    return backend._engine, client.handle, client.bodies.robot
+    return backend._engine, client, body_names(compiled(backend.structure))
 
 
 def test_links_are_where_kinematics_has_them(backend: BulletBackend) -> None:
@@ -65,50 +48,48 @@ def test_links_are_where_kinematics_has_them(backend: BulletBackend) -> None:
     scene = trifinger().default_scene()
     scene.state.joint_positions[:] = np.random.default_rng(0).uniform(-1, 1, 9)
     backend.build(scene)
-    engine, client, body = robot(backend)
+    engine, client, names = robot(backend)
     positions, _ = link_frames(scene.state.joint_positions, hardware.NOMINAL_HEIGHT)
-    per_finger = positions.reshape(3, -1, 3)
-    for finger in range(3):
-        for link in range(per_finger.shape[1]):
+    for finger, places in zip(hardware.FINGERS, positions.reshape(3, -1, 3), strict=True):
+        for link in (1, 2, 3):
+            place = client._built.bodies[names.index(hardware.link_name(finger, link))]
             state = engine.getLinkState(
-                body, link_index(finger, link), computeForwardKinematics=1, physicsClientId=client
+                *place, computeForwardKinematics=1, physicsClientId=client.handle
             )
             # The engine keeps the frames of links in single precision.
-            np.testing.assert_allclose(state[4], per_finger[finger, link], atol=1e-6)
+            np.testing.assert_allclose(state[4], places[link], atol=1e-6)
 
 
-def test_every_link_has_one_shape_and_its_inertia(backend: BulletBackend) -> None:
-    """Compound shapes would make saved states inexact, so the tip is a link of its own."""
+def test_every_link_has_its_inertia(backend: BulletBackend) -> None:
+    """Moments, center and principal axes are those of the model."""
     backend.build(trifinger().default_scene())
-    engine, client, body = robot(backend)
-    for finger in range(3):
-        for link in range(5):
-            index = link_index(finger, link)
-            shapes = engine.getCollisionShapeData(body, index, physicsClientId=client)
-            assert len(shapes) == (1 if link else 0)
-            info = engine.getDynamicsInfo(body, index, physicsClientId=client)
-            if link == 4:
-                np.testing.assert_allclose(info[2], hardware.TIP_INERTIA, rtol=1e-12)
-                continue
-            inertial = hardware.INERTIAL[link]
+    engine, client, names = robot(backend)
+    for finger in hardware.FINGERS:
+        for link in (1, 2, 3):
+            place = client._built.bodies[names.index(hardware.link_name(finger, link))]
+            info = engine.getDynamicsInfo(*place, physicsClientId=client.handle)
+            inertial, mass = hardware.INERTIAL[link], hardware.LINK_MASS[link]
             np.testing.assert_allclose(info[3], inertial.center, atol=1e-12)
             np.testing.assert_allclose(info[4], inertial.orientation, atol=1e-12)
-            expected = hardware.LINK_MASS[link] * np.array(inertial.per_mass)
-            np.testing.assert_allclose(info[2], expected, rtol=1e-12)
+            np.testing.assert_allclose(info[2], mass * np.array(inertial.per_mass), rtol=1e-12)
 
 
-def test_frictions_reach_the_links(backend: BulletBackend) -> None:
-    """Friction lands on the colliding links, not on the base; nothing damps or bounces."""
-    backend.build(trifinger().default_scene())
+def test_frictions_reach_the_shapes(backend: BulletBackend) -> None:
+    """Friction lands on the shapes of the robot, each of which is a link of its own."""
+    backend.build(trifinger(("block",)).default_scene())
     backend.apply(Difference(parameters={("robot", "friction"): np.array(0.37)}))
-    engine, client, body = robot(backend)
-    for link in arena.COLLIDING_LINKS:
-        info = engine.getDynamicsInfo(body, link, physicsClientId=client)
+    engine, client, _ = robot(backend)
+    mj = compiled(backend.structure)
+    owners = {geom: mj.geom(geom).name for geom in client._built.geoms}
+    places = [client._built.geoms[g] for g, name in owners.items() if name[:2].isdigit()]
+    assert len(places) == 12
+    for place in places:  # compound shapes would make saved states inexact
+        shapes = engine.getCollisionShapeData(*place, physicsClientId=client.handle)
+        info = engine.getDynamicsInfo(*place, physicsClientId=client.handle)
+        assert len(shapes) == 1
         assert info[1] == pytest.approx(0.37)
         assert info[5] == 0.0
         assert info[7] == 0.75 * SPINNING_FRICTION
-    for joint in range(engine.getNumJoints(body, physicsClientId=client)):
-        assert engine.getJointInfo(body, joint, physicsClientId=client)[6] == 0.0
 
 
 def test_nothing_slows_a_flying_block(backend: BulletBackend) -> None:
@@ -125,80 +106,7 @@ def test_nothing_slows_a_flying_block(backend: BulletBackend) -> None:
     np.testing.assert_allclose(after.angular_velocities, scene.state.angular_velocities, atol=1e-14)
 
 
-def test_who_may_touch_whom() -> None:
-    """Links meet blocks, the other fingers and what stands around them, as specified."""
-    bodies = {"block": (arena.BLOCK, -1), "floor": (arena.FLOOR, arena.FLOOR_MASK)}
-    bodies["wall"] = (arena.WALL, arena.WALL_MASK)
-    bodies["obstacle"] = (arena.OBSTACLE, arena.OBSTACLE_MASK)
-    bodies |= {f"{part}{f}": arena.groups(f, part) for f in range(3) for part in PARTS}
-
-    def meets(first: str, second: str) -> bool:
-        (group, mask), (other_group, other_mask) = bodies[first], bodies[second]
-        return bool(group & other_mask) and bool(other_group & mask)
-
-    assert all(meets("block", other) for other in bodies)
-    assert [part for part in PARTS if meets(f"{part}0", "floor")] == ["middle", "lower", "tip"]
-    assert [part for part in PARTS if meets(f"{part}0", "obstacle")] == ["middle", "lower", "tip"]
-    assert [part for part in PARTS if meets(f"{part}0", "wall")] == ["tip"]
-    assert not any(meets("obstacle", other) for other in ("floor", "wall", "obstacle"))
-    assert not any(meets(f"{a}0", f"{b}0") for a in PARTS for b in PARTS)
-    for a in PARTS:
-        for b in PARTS:
-            assert meets(f"{a}0", f"{b}2") == ("upper" not in (a, b))
-
-
 # --- viscous joints ------------------------------------------------------------------------------
-
-
-def test_the_dynamics_of_a_finger_are_the_engines(backend: BulletBackend) -> None:
-    """Mass matrix and bias in closed form equal those that the engine computes."""
-    backend.build(trifinger().default_scene())
-    engine, client, body = robot(backend)
-    generator, weights = np.random.default_rng(0), np.array(hardware.LINK_MASS[1:])
-    for _ in range(10):
-        angles, speeds = generator.uniform(-1, 1, 9), generator.normal(size=9, scale=5.0)
-        matrix = engine.calculateMassMatrix(body, angles.tolist(), physicsClientId=client)
-        bias = engine.calculateInverseDynamics(
-            body, angles.tolist(), speeds.tolist(), [0.0] * 9, physicsClientId=client
-        )
-        for finger in range(3):
-            own = slice(3 * finger, 3 * finger + 3)
-            mine = mass_matrix(angles[own], weights)
-            np.testing.assert_allclose(mine, np.array(matrix)[own, own], rtol=1e-12, atol=1e-16)
-            gravity = (0.0, 0.0, -9.81)
-            torques = inverse_dynamics(angles[own], speeds[own], np.zeros(3), gravity, weights)
-            np.testing.assert_allclose(torques, bias[own], rtol=1e-9, atol=1e-12)
-
-
-def test_a_damped_step_is_implicit(backend: BulletBackend) -> None:
-    """The engine moves as the equations of an implicit step say, tilted and with other masses."""
-    damping, gravity = 0.3, np.array([1.0, -2.0, -9.0])
-    masses = np.linspace(0.02, 0.2, 9)
-    scene = trifinger().default_scene()
-    values = {
-        ("robot", "joint_damping"): np.array(damping),
-        ("world", "gravity"): gravity,
-        ("controller", "safety_damping"): np.zeros(3),
-        **dict(zip(MASSES, masses, strict=True)),
-    }
-    scene.state.joint_velocities[:] = np.linspace(-3.0, 3.0, 9)
-    backend.build(scene.with_(parameters={**scene.parameters, **values}))
-    command = np.linspace(-0.3, 0.3, 9)
-    backend.step(command, 1)
-    after, before = backend.state(), scene.state
-    np.testing.assert_array_equal(after.joint_torques, command)
-
-    h = scene.structure.preset.timestep
-    for finger in range(3):
-        own = slice(3 * finger, 3 * finger + 3)
-        angles, speeds = before.joint_positions[own], before.joint_velocities[own]
-        yaw = hardware.WORLD_YAW + hardware.FINGER_YAW[finger]
-        pull = rotation_matrix([0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]).T @ gravity
-        bias = inverse_dynamics(angles, speeds, np.zeros(3), tuple(pull), masses[own])
-        inertia = mass_matrix(angles, masses[own]) + h * damping * np.eye(3)
-        rates = np.linalg.solve(inertia, command[own] - bias - damping * speeds)
-        # The engine integrates the bias with terms of higher order in the step.
-        np.testing.assert_allclose(after.joint_velocities[own], speeds + h * rates, atol=1e-6)
 
 
 def test_a_driven_joint_reaches_its_final_speed(backend: BulletBackend) -> None:

@@ -20,13 +20,11 @@ from scm_world.backends.bullet.client import (
     Values,
     arrays,
     known,
-    load,
     plain,
-    version,
 )
-from scm_world.backends.bullet.model.client import ModelClient
-from scm_world.backends.bullet.model.support import supports
-from scm_world.errors import EngineFailure, ModelError
+from scm_world.backends.bullet.engine import load, version
+from scm_world.backends.bullet.honoured import supports
+from scm_world.errors import EngineFailure, Infeasible, ModelError
 from scm_world.models.model import Model
 from scm_world.models.scene import (
     Difference,
@@ -82,7 +80,7 @@ class History:
             while edits and edits[-1][0] == start:
                 client.edit(edits.pop()[1])
             substeps, *command = self.rows[start : start + row]
-            client.stepped(command, int(substeps))
+            client.step(command, int(substeps))
         for _, values_ in reversed(edits):
             client.edit(values_)
 
@@ -164,10 +162,10 @@ class BulletBackend(Backend):
     # --- clients -------------------------------------------------------------------------------
 
     @staticmethod
-    def _kind(structure: Structure) -> type[Client]:
+    def _kind(structure: Structure) -> Any:
         """Give the class of the clients that realise a structure."""
-        kind: type[Client] = structure.realization("bullet") or ModelClient
-        if kind is ModelClient and not isinstance(structure, Model):
+        kind = structure.realization("bullet") or Client
+        if kind is Client and not isinstance(structure, Model):
             name = type(structure).__name__
             raise ModelError([f"Bullet cannot realise a {name}; it takes models"])
         return kind
@@ -200,9 +198,7 @@ class BulletBackend(Backend):
             return client
         if client is not None:
             client.close()
-        client = kind(self._engine)
-        client.furnish()
-        return client
+        return kind(self._engine)
 
     def _now(self) -> Client:
         """Give the client that holds the present."""
@@ -298,6 +294,10 @@ class BulletBackend(Backend):
         """Bring the present back, should the engine fail half way."""
         try:
             yield
+        except Infeasible:  # nothing was told to the engine
+            if self._history is not None:
+                self._return()
+            raise
         except Exception as error:
             if self._spare is not None:
                 self._spare.close()
@@ -320,8 +320,7 @@ class BulletBackend(Backend):
         Raises:
             UnknownOption: The scene has no such parameter.
         """
-        client = self._now()
-        return {key: client.parameter(key) for key in known(self._described().parameters, keys)}
+        return self._now().parameters(known(self._described().parameters, keys))
 
     def inertia(self, body: str) -> Floats:
         """Read the principal moments of inertia of a body, shape (3,) [kg m²].
@@ -333,7 +332,7 @@ class BulletBackend(Backend):
 
     def remarks(self, before: Parameters) -> tuple[str, ...]:
         """Say which frictions were changed without an effect."""
-        return self._now().remarks(dict(before))
+        return self._now().remarks(before)
 
     def read(self, into: State) -> None:
         """Write the present state into an existing vector."""
@@ -356,7 +355,7 @@ class BulletBackend(Backend):
         self._commit()
         client, history = self._last(), self._lived()
         try:
-            reported = client.stepped(numbers, substeps)
+            reported = client.step(numbers, substeps)
         except Exception as error:
             client.close()  # torques that were not stepped would count twice
             self._base = None

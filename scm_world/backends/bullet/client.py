@@ -1,34 +1,44 @@
-"""One physics client of the engine, and what is particular to the structure in it."""
+"""One physics client of the engine, with a model in it."""
 
 from __future__ import annotations
 
-import ctypes
 import math
-import operator
-import os
-import sys
+import statistics
 import weakref
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from importlib import metadata
-from typing import Any, ClassVar, final
+from typing import Any, final
 
+import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Integers
 from scm_world.backends.base import ContactPoint
-from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
-from scm_world.models.scene import ParameterKey, Parameters, State, Structure
+from scm_world.backends.bullet.build import BALL, FREE, Built, Handle, solid
+from scm_world.backends.bullet.honoured import check, heavy, keys, rotations, settle
+from scm_world.backends.bullet.joints import Part, parts
+from scm_world.backends.mujoco import reading
+from scm_world.backends.mujoco.backend import realize
+from scm_world.backends.mujoco.trees import Couplings, disabled
+from scm_world.errors import EngineFailure, UnknownOption
+from scm_world.models.model import Model
+from scm_world.models.scene import ParameterKey, Parameters
 
 Values = dict[ParameterKey, Any]
-"""All parameters, or some: plain numbers, or lists of them, which is what the engine speaks.
+"""All parameters, or some: plain numbers, or lists of them.
 Neither they nor their values are ever changed in place."""
+
+WORLD: Handle = (-1, -1)
+"""Where what holds for all bodies is."""
+
+_OFF = mujoco.mjtDisableBit
+SMOOTH = int(_OFF.mjDSBL_CONSTRAINT) | int(_OFF.mjDSBL_AUTORESET)
+"""What is switched off while MuJoCo computes smooth forces."""
 
 SOLVER_ITERATIONS = 50  # with 20, towers spike at 40 mm/s
 TOLERANCE = 1e-6  # how far a state that was set may read back from what was asked
-UNIT = 1e-12  # a quaternion whose squared norm is this near to 1 is taken as it is
 
 
 @final
@@ -42,7 +52,7 @@ class Instant:
         state: The numbers of a ``State``, with unit quaternions.
     """
 
-    structure: Structure
+    structure: Any
     parameters: Values
     state: list[float]
 
@@ -80,183 +90,163 @@ def arrays(parameters: Values) -> Parameters:
     return {key: np.array(value) for key, value in parameters.items()}
 
 
-class Client(ABC):
-    """A physics client, and what is known about it without asking.
+def shares(mj: mujoco.MjModel, geoms: Iterable[int], usual: float) -> dict[int, float]:
+    """Give each shape a number, so that a contact has the product of two as its friction.
 
-    There is one subclass for each kind of structure. It says which parameters there are, makes
-    the bodies, sets and reads them, and steps. Everything else is here.
+    A model says the larger of two coefficients. The product is that wherever a moving shape
+    touches fixed ones that are all alike, and wherever one of two moving shapes has the usual
+    coefficient and the other at least that, if the floor has no more than it. The number of a
+    moving shape depends on its own coefficient and on that of the first fixed shape alone, so
+    that shapes which never touch leave one another alone to the last bit.
+
+    Args:
+        mj: With the coefficients in force.
+        geoms: The shapes.
+        usual: See ``usual_friction``.
+
+    Returns:
+        The number of each shape.
+    """
+    shapes = list(geoms)
+    still = mj.body_treeid[mj.geom_bodyid[shapes]] < 0
+    found = np.where(mj.geom_condim[shapes] == 1, 0.0, mj.geom_friction[shapes, 0])
+    measure = found[still][0] if still.any() else None
+    if not measure:  # nothing is fixed, or it is smooth: the other shape decides
+        scale = math.sqrt(usual) if measure is None and usual else 1.0
+        found = np.where(still, np.where(found == 0.0, 1.0, found), found / scale)
+    else:
+        scale = math.sqrt(max(measure, usual))
+        found = np.where(still, found / measure * scale, np.maximum(found, measure) / scale)
+    return dict(zip(shapes, found.tolist(), strict=True))
+
+
+def usual_friction(mj: mujoco.MjModel) -> float:
+    """Give the coefficient in the middle of those of the moving shapes that touch something."""
+    shapes = Couplings(mj).touches.any(axis=1) & (mj.body_treeid[mj.geom_bodyid] >= 0)
+    found = np.where(mj.geom_condim == 1, 0.0, mj.geom_friction[:, 0])[shapes]
+    return float(statistics.median_low(found.tolist() or [0.0]))
+
+
+MOST_GROUPS = 31
+"""As many bits the engine has."""
+
+
+def groups(touches: NDArray[np.bool_]) -> dict[int, tuple[int, int]]:
+    """Give each shape that touches something a group and a mask of those it touches.
+
+    Shapes that touch the same others, and each other or not, are one group.
+
+    Args:
+        touches: Which shapes may touch, shape (ngeom, ngeom).
+
+    Returns:
+        Nothing if there are more groups than the engine has.
+    """
+    members: list[list[int]] = []
+    for geom in np.flatnonzero(touches.any(axis=1)).tolist():
+        for group in members:
+            among = touches[np.ix_([*group, geom], [*group, geom])]
+            inside = among[~np.eye(len(among), dtype=np.bool_)]
+            apart = np.delete(touches[[group[0], geom]], [*group, geom], axis=1)
+            if (apart[0] == apart[1]).all() and (inside == inside[0]).all():
+                group.append(geom)
+                break
+        else:
+            members.append([geom])
+    if len(members) > MOST_GROUPS:
+        return {}
+    number = {geom: index for index, group in enumerate(members) for geom in group}
+    found = {}
+    for geom, index in number.items():
+        others = {number[other] for other in np.flatnonzero(touches[geom]).tolist()}
+        found[geom] = 1 << index, sum(1 << other for other in others)
+    return found
+
+
+def spinning_shares(mj: mujoco.MjModel) -> dict[int, float]:
+    """Give each shape in a pair what it gets of the spinning friction of its pairs.
+
+    The engine combines two shapes to ``s1 f2 + s2 f1`` with the factors f of sliding friction. With
+    these shares that is the spinning friction of the pair where one of the two has the largest
+    factor, at the factors of the compiled model.
+    """
+    shapes = {*mj.pair_geom1.tolist(), *mj.pair_geom2.tolist()}
+    largest = max((float(mj.geom_friction[geom, 0]) for geom in shapes), default=0.0)
+    if largest == 0.0:
+        return dict.fromkeys(shapes, 0.0)
+    return {
+        geom: (1.0 - float(mj.geom_friction[geom, 0]) / (2.0 * largest)) / largest
+        for geom in sorted(shapes)
+    }
+
+
+def restitution(damping: float) -> float:
+    """Give what is left of the speed after half a period of a spring with a damping ratio."""
+    if not 0.0 <= damping < 1.0:
+        return 0.0
+    return math.exp(-math.pi * damping / math.sqrt(1.0 - damping * damping))
+
+
+def _pulled(mj: mujoco.MjModel) -> Integers:
+    """List the bodies of trees that actuators or tendons reach."""
+    trees = Couplings(mj)
+    effects = [trees.actuator(i) for i in range(mj.nactuator)]
+    effects += [trees.tendon(i) for i in range(mj.ntendon)]
+    reached = frozenset[int]().union(*(always for always, _ in effects))
+    bodies = [body for body in range(mj.nbody) if trees.tree(body) in reached]
+    return np.array(bodies, dtype=np.int64)
+
+
+@final
+class Client:
+    """A physics client with a model in it, and MuJoCo's own model beside it.
+
+    MuJoCo takes the parameters, has what follows from them, gives the forces of actuators,
+    springs, dampers and media, and converts states. Nothing moves there: each of its numbers that
+    concerns the engine is told to the engine when it differs from what that was told before.
+
+    Args:
+        engine: The module ``pybullet``.
 
     Attributes:
-        modes: What a command can mean.
-        signed: Whether the quaternions of a state that is set have a w that is not negative.
-        engine: The module ``pybullet``.
         handle: The number of the client; None once it is closed.
-        applied: The value of each parameter that is in force.
         generation: Counts the canonical states; a saved state is exact within one of them.
     """
 
-    signed: ClassVar[bool] = False
+    keys = staticmethod(keys)
+    check, settle, heavy = staticmethod(check), staticmethod(settle), staticmethod(heavy)
 
     def __init__(self, engine: Any) -> None:
         self.engine = engine
         self.handle = engine.connect(engine.DIRECT)
         if self.handle < 0:
             raise EngineFailure("Bullet has no physics client left; close some backends", "bullet")
-        self.applied: Values = {}
         self.generation = 0
+        self._model: Model | None = None
+        self._told: dict[tuple[str, Handle], Any] = {}  # what the engine was told of live bodies
+        self._inside: Values | None = None  # parameters that were built into the bodies
+        self._ruled: set[tuple[int, int, int, int]] = set()  # pairs of links with a rule
         self._untouched: list[float] | None = None
-        self._rotations: Sequence[int] = ()  # where quaternions begin in the state
-        self._reported: Sequence[int] = ()  # places of the numbers that cannot be set
-        self._saved: dict[int, int] = {}  # ticket to the engine's number, which it uses again
+        self._saved: dict[int, tuple[int, Floats]] = {}  # engine's number and activations
         self._tickets = 0
         self._doomed: list[int] = []
         self._close = weakref.finalize(self, _disconnect, engine, self.handle)
-
-    # --- what a structure of this kind is -------------------------------------------------------
-
-    @staticmethod
-    @abstractmethod
-    def keys(structure: Any) -> Iterable[ParameterKey]:
-        """List every parameter of a structure, in the order in which they are set."""
-
-    @staticmethod  # noqa: B027 # most can honour all
-    def check(structure: Any, parameters: Values) -> None:
-        """Say what the engine cannot honour, before anything is made.
-
-        Raises:
-            ModelError: Something in the structure.
-            NotIntervenable: A parameter that is not as in the structure.
-        """
-
-    @staticmethod
-    @abstractmethod
-    def heavy(structure: Any) -> Iterable[ParameterKey]:
-        """List the parameters that need new bodies, or new contacts."""
-
-    @staticmethod
-    @abstractmethod
-    def rotations(structure: Any) -> Sequence[int]:
-        """List where in the state the quaternions (x, y, z, w) begin."""
-
-    @classmethod
-    def settle(cls, structure: Any, given: State) -> list[float]:
-        """Turn a state into plain numbers: unit quaternions, and 0 for what cannot be set.
-
-        Raises:
-            ValueError: It is a state of another structure.
-            EngineFailure: A number is not finite.
-        """
-        numbers: list[float] = given.vector.tolist()
-        if len(numbers) != structure.layout.size:
-            raise ValueError(f"expected a state of {structure.layout.size} numbers, got {given!r}")
-        if not math.isfinite(sum(numbers)):
-            raise EngineFailure(f"a state must be finite, got {given!r}", "bullet")
-        for name in structure.layout.reported:
-            where = structure.layout.slices[name]
-            numbers[where] = [0.0] * (where.stop - where.start)
-        for start in cls.rotations(structure):
-            turn = numbers[start : start + 4]
-            square = sum(part * part for part in turn)
-            if abs(square - 1.0) >= UNIT and square != 0.0:
-                scale = math.sqrt(square)
-                turn = numbers[start : start + 4] = [part / scale for part in turn]
-            if cls.signed and turn[3] < 0.0:
-                numbers[start : start + 4] = [-part for part in turn]
-        return numbers
-
-    # --- what is done in the engine -------------------------------------------------------------
-
-    def furnish(self) -> None:
-        """Add what stands in every scene, and set how the engine solves for contacts."""
-        self.engine.setPhysicsEngineParameter(
+        self._built = Built(engine, self.handle)
+        engine.setPhysicsEngineParameter(
             numSolverIterations=SOLVER_ITERATIONS,
-            # An early end, decided for all bodies together, would let bodies act on each other
-            # without touching.
+            # An early end, decided for all bodies together, would let bodies act on each
+            # other without touching.
             solverResidualThreshold=0.0,
             deterministicOverlappingPairs=1,
             physicsClientId=self.handle,
         )
 
-    @abstractmethod
-    def construct(self, structure: Any, parameters: Values) -> None:
-        """Make sure that the bodies are there, with their shapes.
-
-        What is made again has no parameters in ``applied``.
-        """
-
-    @abstractmethod
-    def pose(self, parameters: Values, state: list[float]) -> None:
-        """Put all that moves in its place, and make the engine forget what touched what."""
-
-    @abstractmethod
-    def write(self, key: ParameterKey, value: Any) -> None:
-        """Set one parameter of live bodies."""
-
-    @abstractmethod
-    def written(self, keys: Iterable[ParameterKey]) -> None:
-        """Do what follows from parameters that were set: ``applied`` has them."""
-
-    @abstractmethod
-    def parameter(self, key: ParameterKey) -> Floats:
-        """Ask the engine for a parameter, in the units of the scene."""
-
-    @abstractmethod
-    def carrier(self, body: str) -> tuple[int, int]:
-        """Give multibody and link that carry the mass of a body.
-
-        Raises:
-            UnknownOption: There is no such body.
-        """
-
-    @abstractmethod
-    def advance(self, command: Sequence[float], substeps: int) -> list[float]:
-        """Hold a command for some physics steps, and return the numbers that cannot be set."""
-
-    @abstractmethod
-    def ask(self) -> list[float]:
-        """Ask the engine for the state, with 0 for what cannot be set."""
-
-    @abstractmethod
-    def owner(self, multibody: int, link: int) -> str:
-        """Name the body that a shape of the engine belongs to."""
-
-    # --- the same for all -----------------------------------------------------------------------
-
-    def contacts(self) -> tuple[ContactPoint, ...]:
-        """List the points of the last physics step that touch or press.
-
-        The engine also keeps points of bodies that only came near; they are left out.
-        """
-        return tuple(
-            ContactPoint(
-                bodies=(self.owner(point[1], point[3]), self.owner(point[2], point[4])),
-                position=(np.array(point[5]) + np.array(point[6])) / 2,
-                normal=-np.array(point[7]),  # the engine's points to the first body
-                depth=-point[8],
-                force=point[9],
-            )
-            for point in self.engine.getContactPoints(physicsClientId=self.handle)
-            if point[8] <= 0.0 or point[9] > 0.0
-        )
-
-    def inertia(self, body: str) -> Floats:
-        """Ask the engine for principal moments of inertia, shape (3,) [kg m²]."""
-        info = self.engine.getDynamicsInfo(*self.carrier(body), physicsClientId=self.handle)
-        return np.array(info[2])
-
-    def remarks(self, before: Values) -> tuple[str, ...]:
-        """Say which parameters were changed without an effect; see ``Backend.remarks``."""
-        return ()
-
-    def gravity(self) -> Floats:
-        """Ask the engine for gravity, shape (3,) [m/s²]."""
-        physics = self.engine.getPhysicsEngineParameters(physicsClientId=self.handle)
-        return np.array([physics[f"gravityAcceleration{axis}"] for axis in "XYZ"])
-
     def close(self) -> None:
         """Disconnect. Closing twice is harmless."""
         self._close()
         self.handle = None
+
+    # --- bodies ----------------------------------------------------------------------------------
 
     def canonicalize(self, instant: Instant) -> None:
         """Build the one world with these parameters and this state, independently of the past.
@@ -267,43 +257,62 @@ class Client(ABC):
         self.generation += 1
         self._doomed.extend(self._saved)
         self._bury()
-        structure, parameters = instant.structure, instant.parameters
-        self._rotations = self.rotations(structure)
-        self._reported = np.flatnonzero(~structure.layout.can_be_set).tolist()
-        self.construct(structure, parameters)
-        self.pose(parameters, instant.state)
-        self.applied.update((key, parameters[key]) for key in self.heavy(structure))
-        self.edit(parameters)
+        self._construct(instant.structure, instant.parameters)
+        self._twin.reset()  # what the last step left there must not matter
+        self._twin.place(np.array(instant.state))
+        for part in self._parts:
+            part.put(self._twin.data)
+        moves = self._twin.model.body_treeid[self._twin.model.geom_bodyid] >= 0
+        for geom, place in self._built.geoms.items():
+            if moves[geom]:
+                both = self._filters[place]
+                self.engine.setCollisionFilterGroupMask(*place, *both, physicsClientId=self.handle)
         self._check(instant.state)
         self._untouched = instant.state
 
-    def edit(self, parameters: Values) -> None:
-        """Change parameters that need no new bodies. What is in force already is left alone."""
-        others = []
-        for key, value in parameters.items():
-            if self.applied.get(key) != value:
-                self.applied.pop(key, None)  # unknown, should the engine fail
-                self.write(key, value)
-                self.applied[key] = value
-                others.append(key)
-        if others:
-            self.written(others)
+    def _construct(self, model: Model, parameters: Values) -> None:
+        """Make everything again, unless live bodies can take on what differs from what is there."""
+        if self._model != model:
+            compiled = reading.compiled(model)
+            self._model, self._inside = model, None
+            self._twin = realize(model, arrays(parameters))
+            self._names, self._pulled = reading.body_names(compiled), _pulled(compiled)
+            self._usual, self._spinning = usual_friction(compiled), spinning_shares(compiled)
+            trees = Couplings(compiled)
+            self._dynamic = np.flatnonzero(trees.dynamic.any(axis=1)).tolist()
+            self._touching = np.argwhere(np.triu(trees.touches)).tolist()
+            self._groups = groups(trees.touches)
+            self._shapes = np.flatnonzero(trees.touches.any(axis=1)).tolist()
+            ends = zip(compiled.pair_geom1.tolist(), compiled.pair_geom2.tolist(), strict=True)
+            self._paired = {geom: pair for pair, both in enumerate(ends) for geom in both}
+            self._rotations = rotations(model)
+            self._reported = np.flatnonzero(~model.layout.can_be_set)
+        self._twin.edit(arrays(parameters))
+        inside = {key: parameters[key] for key in heavy(model)}
+        if self._inside != inside:
+            gone = self._built.make(self._twin.model, self._shapes)
+            self._told = {what: v for what, v in self._told.items() if what[1][0] not in gone}
+            self._connect()
+            self._parts = self._joints(range(self._twin.model.ntree))
+            self._trees, self._driven = set[int](), list[Part]()
+            self._inside = inside
+        self._tell_all()
 
-    def stepped(self, command: Sequence[float], substeps: int) -> list[float]:
-        """Hold a command for some physics steps; see ``advance``."""
-        self._untouched = None
-        return self.advance(command, substeps)
-
-    def read(self, reported: list[float]) -> list[float]:
-        """Read the present state; the numbers that cannot be set are given.
-
-        A state that was set and not stepped yet reads as it was set; ``canonicalize`` has made
-        sure that the engine agrees up to rounding.
-        """
-        state = self.ask() if self._untouched is None else list(self._untouched)
-        for place, value in zip(self._reported, reported, strict=True):
-            state[place] = value
-        return state
+    def _connect(self) -> None:
+        """Say which shapes may touch: by groups, or pair by pair if these are too many."""
+        geoms = self._built.geoms
+        self._filters = {geoms[geom]: both for geom, both in self._groups.items()}
+        wanted = {(*geoms[first], *geoms[second]) for first, second in self._touching}
+        if not self._groups:
+            self._ruled |= wanted  # this holds as long as the client
+            self._filters = dict.fromkeys(geoms.values(), (0, 0))
+        for body, link, other, its in sorted(self._ruled):
+            enabled = int((body, link, other, its) in wanted)
+            self.engine.setCollisionFilterPair(
+                body, other, link, its, enabled, physicsClientId=self.handle
+            )
+        for place, both in self._filters.items():
+            self.engine.setCollisionFilterGroupMask(*place, *both, physicsClientId=self.handle)
 
     def _check(self, state: list[float]) -> None:
         """Make sure that the engine took the state, up to rounding and the sign of a quaternion.
@@ -311,27 +320,230 @@ class Client(ABC):
         Raises:
             EngineFailure: It did not.
         """
-        actual = self.ask()
+        actual, wanted = np.array(self._ask()), np.array(state)
         for start in self._rotations:
-            turn, wanted = actual[start : start + 4], state[start : start + 4]
-            if sum(map(operator.mul, turn, wanted)) < 0.0:
-                actual[start : start + 4] = [-part for part in turn]
-        if any(
-            not abs(there - here) <= TOLERANCE * (1.0 + abs(here))
-            for here, there in zip(state, actual, strict=True)
-        ):
+            where = slice(start, start + 4)
+            if actual[where] @ wanted[where] < 0.0:
+                actual[where] *= -1.0
+        wanted[self._reported] = actual[self._reported]
+        if not (abs(actual - wanted) <= TOLERANCE * (1.0 + abs(wanted))).all():
             raise EngineFailure("Bullet did not take the state that was set", "bullet")
+
+    # --- parameters ------------------------------------------------------------------------------
+
+    def edit(self, parameters: Values) -> None:
+        """Change parameters that need no new bodies. What is in force already is left alone.
+
+        Raises:
+            Infeasible: Nothing can move with them. Nothing has changed.
+        """
+        self._twin.edit(arrays(parameters))
+        self._tell_all()
+
+    def _tell_all(self) -> None:
+        """Tell the engine what differs from what it was told before."""
+        for what, value in self._settings():
+            if self._told.get(what) != value:
+                self._told.pop(what, None)  # unknown, should the engine fail
+                self._tell(*what, value)
+                self._told[what] = value
+        moved = self._moved()
+        if self._trees != moved:
+            self._trees, self._driven = moved, self._joints(moved)
+
+    def _joints(self, trees: Collection[int]) -> list[Part]:
+        """Prepare asking and telling of what moves in some trees."""
+        mj, places = self._twin.model, self._built.joints
+        tree_of = mj.body_treeid[mj.jnt_bodyid].tolist()
+        own = {joint: place for joint, place in places.items() if tree_of[joint] in trees}
+        return list(parts(self.engine, self.handle, mj, own))
+
+    def _settings(self) -> Iterator[tuple[tuple[str, Handle], Any]]:
+        """List what live bodies have, by what it is and where."""
+        mj, built = self._twin.model, self._built
+        gravity = np.zeros(3) if disabled(mj, _OFF.mjDSBL_GRAVITY) else mj.opt.gravity
+        yield ("gravity", WORLD), gravity.tolist()
+        yield ("timestep", WORLD), mj.opt.timestep
+        for body, place in built.bodies.items():
+            yield ("solid", place), (float(mj.body_mass[body]), *solid(mj, body)[0].tolist())
+        rigid = not disabled(mj, _OFF.mjDSBL_CONSTRAINT)
+        dry = rigid and not disabled(mj, _OFF.mjDSBL_FRICTIONLOSS)
+        ends = rigid and not disabled(mj, _OFF.mjDSBL_LIMIT)
+        for joint, place in built.joints.items():
+            if mj.jnt_type[joint] in (FREE, BALL):
+                continue
+            if ends and mj.jnt_limited[joint]:
+                zero = mj.qpos0[mj.jnt_qposadr[joint]]
+                yield ("limits", place), (mj.jnt_range[joint] - zero).tolist()
+            loss = float(mj.dof_frictionloss[mj.jnt_dofadr[joint]]) if dry else 0.0
+            yield ("dry", place), (loss, loss and mj.opt.timestep)  # kept as an impulse of a step
+        for geom, share in shares(mj, self._dynamic, self._usual).items():
+            yield ("lateralFriction", built.geoms[geom]), share
+        for geom, pair in self._paired.items():
+            slides, spins, _ = mj.geom_friction[geom].tolist()
+            bounce = math.sqrt(restitution(float(mj.pair_solref[pair, 1])))
+            yield ("lateralFriction", built.geoms[geom]), slides
+            yield ("spinningFriction", built.geoms[geom]), spins * self._spinning[geom]
+            yield ("restitution", built.geoms[geom]), bounce
+
+    def _tell(self, what: str, place: Handle, value: Any) -> None:
+        """Tell the engine one thing."""
+        engine, options = self.engine, {"physicsClientId": self.handle}
+        match what:
+            case "gravity":
+                engine.setGravity(*value, **options)
+            case "timestep":
+                engine.setPhysicsEngineParameter(fixedTimeStep=value, **options)
+            case "solid":
+                mass, *moments = value
+                engine.changeDynamics(*place, mass=mass, localInertiaDiagonal=moments, **options)
+            case "limits":
+                low, high = value
+                engine.changeDynamics(*place, jointLowerLimit=low, jointUpperLimit=high, **options)
+            case "dry":
+                mode, force = engine.VELOCITY_CONTROL, value[0]
+                engine.setJointMotorControl2(
+                    *place, mode, targetVelocity=0.0, force=force, **options
+                )
+            case _:
+                engine.changeDynamics(*place, **{what: value}, **options)
+
+    def _moved(self) -> set[int]:
+        """List the trees on which smooth forces act, other than weight."""
+        mj = self._twin.model
+        if mj.opt.density > 0.0 or mj.opt.viscosity > 0.0:
+            return set(range(mj.ntree))
+        bodies = (
+            mj.dof_bodyid[mj.dof_damping != 0.0],
+            mj.jnt_bodyid[mj.jnt_stiffness != 0.0],
+            np.flatnonzero(mj.body_gravcomp),
+            self._pulled,
+        )
+        return set(mj.body_treeid[np.concatenate(bodies)].tolist())
+
+    def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
+        """Read parameters from the arrays that the engine's numbers are made of."""
+        return self._twin.parameters(keys)
+
+    def inertia(self, body: str) -> Floats:
+        """Ask the engine for principal moments of inertia, shape (3,) [kg m²].
+
+        Raises:
+            UnknownOption: There is no such body that can move.
+        """
+        handles = {self._names[number]: handle for number, handle in self._built.bodies.items()}
+        if body not in handles:
+            raise UnknownOption("body", body, handles)
+        return np.array(self.engine.getDynamicsInfo(*handles[body], physicsClientId=self.handle)[2])
+
+    def remarks(self, before: Parameters) -> tuple[str, ...]:
+        """Say which frictions were changed without an effect; see ``shares``."""
+        twin, found = self._twin, list[str]()
+        now = shares(twin.model, self._dynamic, self._usual)
+        for key, old in before.items():
+            if key[1] == "friction":
+                present = twin.kept[key]
+                twin.edit({key: old})
+                if shares(twin.model, self._dynamic, self._usual) == now:
+                    found.append(
+                        f"{'.'.join(key)} has no effect: the larger coefficient of two shapes "
+                        "counts, and those of the others are larger"
+                    )
+                twin.edit({key: present})
+        return tuple(found)
+
+    # --- steps -----------------------------------------------------------------------------------
+
+    def step(self, command: Sequence[float], substeps: int) -> list[float]:
+        """Hold a command for some physics steps, and return the numbers that cannot be set.
+
+        What brakes in proportion to speed acts with the speed at the end of the step: with that
+        before the step, light links would turn back faster than they came. With mass matrix M,
+        bias b, forces f and slopes D, MuJoCo's integrator ``implicitfast`` has the acceleration
+        ``a = (M + h D)^-1 (f - b)``; the forces ``M a + b`` let the engine's explicit step have it.
+        """
+        self._untouched = None
+        self._twin.forget()
+        mj, data, options = self._twin.model, self._twin.data, self._twin.model.opt
+        asked = options.disableflags, options.integrator
+        options.disableflags |= SMOOTH
+        options.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        self._twin.command[:] = command
+        forces, rates, step = np.empty(mj.nv), np.empty(mj.nv), options.timestep
+        for _ in range(substeps):
+            if self._driven:
+                for part in self._driven:
+                    part.take(data)
+                speeds = data.qvel.copy()
+                mujoco.mj_step(mj, data)
+                np.subtract(data.qvel, speeds, out=rates)
+                rates /= step
+                mujoco.mj_mulM(mj, data, forces, rates)
+                forces += data.qfrc_bias
+                for part in self._driven:
+                    part.drive(data, forces)
+            self.engine.stepSimulation(physicsClientId=self.handle)
+        options.disableflags, options.integrator = asked
+        reported: list[float] = self._vector()[self._reported].tolist()
+        return reported
+
+    def read(self, reported: list[float]) -> list[float]:
+        """Read the present state; the numbers that cannot be set are given.
+
+        A state that was set and not stepped yet reads as it was set; ``canonicalize`` has made
+        sure that the engine agrees up to rounding.
+        """
+        state = self._ask() if self._untouched is None else list(self._untouched)
+        for place, value in zip(self._reported, reported, strict=True):
+            state[place] = value
+        return state
+
+    def _ask(self) -> list[float]:
+        """Ask the engine for the state."""
+        for part in self._parts:
+            part.take(self._twin.data)
+        state: list[float] = self._vector().tolist()
+        return state
+
+    def _vector(self) -> Floats:
+        """Give the state as MuJoCo has it now."""
+        vector: Floats = self._twin.structure.empty_state().vector
+        self._twin.read(vector)
+        return vector
+
+    def contacts(self) -> tuple[ContactPoint, ...]:
+        """List the points of the last physics step that touch or press.
+
+        The engine also keeps points of bodies that only came near; they are left out.
+        """
+        owners = self._twin.model.geom_bodyid
+        names = {h: self._names[owners[geom]] for geom, h in self._built.geoms.items()}
+        return tuple(
+            ContactPoint(
+                bodies=(names[point[1], point[3]], names[point[2], point[4]]),
+                position=(np.array(point[5]) + np.array(point[6])) / 2,
+                normal=-np.array(point[7]),  # the engine's points to the first body
+                depth=-point[8],
+                force=point[9],
+            )
+            for point in self.engine.getContactPoints(physicsClientId=self.handle)
+            if point[8] <= 0.0 or point[9] > 0.0
+        )
+
+    # --- saved states ----------------------------------------------------------------------------
 
     def save(self) -> int:
         """Keep the engine's own state in this process and return a ticket for it."""
         self._bury()
         self._tickets += 1
-        self._saved[self._tickets] = self.engine.saveState(physicsClientId=self.handle)
+        number = self.engine.saveState(physicsClientId=self.handle)
+        self._saved[self._tickets] = number, self._twin.data.act.copy()
         return self._tickets
 
     def load(self, ticket: int) -> None:
         """Go back to a state saved in this generation. Parameters are not part of it."""
-        self.engine.restoreState(stateId=self._saved[ticket], physicsClientId=self.handle)
+        number, self._twin.data.act[:] = self._saved[ticket]
+        self.engine.restoreState(stateId=number, physicsClientId=self.handle)
         self._untouched = None
 
     def forget(self, ticket: int) -> None:
@@ -340,7 +552,7 @@ class Client(ABC):
 
     def _bury(self) -> None:
         while self._doomed:
-            number = self._saved.pop(self._doomed.pop(), None)
+            number, _ = self._saved.pop(self._doomed.pop(), (None, None))
             if number is not None:
                 self.engine.removeState(number, physicsClientId=self.handle)
 
@@ -348,66 +560,3 @@ class Client(ABC):
 def _disconnect(engine: Any, handle: int) -> None:
     with suppress(engine.error):
         engine.disconnect(physicsClientId=handle)
-
-
-INSTALL = 'pip install "pybullet==3.2.7"'
-REASON = "wheels exist for Linux and Python < 3.12 only"
-
-
-def load() -> Any:
-    """Import pybullet.
-
-    Its import writes to the C library's streams, past ``sys.stdout``; nothing of it gets through.
-
-    Raises:
-        MissingEngine: It is not installed.
-    """
-    if sys.modules.get("pybullet") is not None:
-        return sys.modules["pybullet"]
-    try:
-        with silence():
-            import pybullet
-    except ImportError as error:
-        raise MissingEngine("bullet", INSTALL, f"{error}; {REASON}") from error
-    return pybullet
-
-
-def version() -> str:
-    """Give the version of pybullet.
-
-    Raises:
-        MissingEngine: It is not installed.
-    """
-    try:
-        return metadata.version("pybullet")
-    except metadata.PackageNotFoundError as error:
-        raise MissingEngine("bullet", INSTALL, REASON) from error
-
-
-@contextmanager
-def silence() -> Iterator[None]:
-    """Send what is written to the file descriptors of stdout and stderr nowhere."""
-    _flush()
-    saved: dict[int, int] = {}
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
-        for stream in (1, 2):
-            with suppress(OSError):  # a daemon may have closed it
-                saved[stream] = os.dup(stream)
-                os.dup2(nowhere, stream)
-        yield
-    finally:
-        _flush()
-        for stream, copy in saved.items():
-            os.dup2(copy, stream)
-            os.close(copy)
-        os.close(nowhere)
-
-
-def _flush() -> None:
-    """Empty the buffers of Python and of C, so that nothing crosses the border late."""
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(AttributeError, OSError, ValueError):
-            stream.flush()
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).fflush(None)

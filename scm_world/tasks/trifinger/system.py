@@ -147,7 +147,6 @@ class TriFinger(Model):
 
 
 _REALIZATIONS = {
-    "bullet": ("bullet.client", "TriFingerClient"),
     "published": ("bullet.published", "PublishedClient"),
     "fake": ("fake", None),
     "renderer": ("cameras", "VIEWS"),

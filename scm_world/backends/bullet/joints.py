@@ -1,0 +1,303 @@
+"""Joints in the engine: their states from and to MuJoCo's coordinates, and forces on them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from typing import Any, final
+
+import mujoco
+import numpy as np
+from numba import njit
+
+from scm_world._types import Floats, Integers
+from scm_world.backends.bullet.build import BALL, FREE, UNTURNED, Handle, composed, plain, rotated
+
+_SIGNS = np.array([1.0, -1.0, -1.0, -1.0])
+"""What turns a quaternion (w, x, y, z) into its inverse."""
+
+
+class Part(ABC):
+    """Joints that the engine is asked and told of together."""
+
+    @abstractmethod
+    def put(self, data: mujoco.MjData) -> None:
+        """Give the engine the state that MuJoCo has."""
+
+    @abstractmethod
+    def take(self, data: mujoco.MjData) -> None:
+        """Give MuJoCo the state that the engine has."""
+
+    @abstractmethod
+    def drive(self, data: mujoco.MjData, forces: Floats) -> None:
+        """Apply generalized forces in the next step. MuJoCo has bodies where they are before it."""
+
+
+@final
+class Scalars(Part):
+    """Hinges and slides.
+
+    Args:
+        engine: The module ``pybullet``.
+        handle: The number of the client.
+        mj: The model.
+        places: The link of each joint, by the number of the joint.
+    """
+
+    def __init__(
+        self, engine: Any, handle: int, mj: mujoco.MjModel, places: Mapping[int, Handle]
+    ) -> None:
+        self._engine, self._handle = engine, handle
+        links: dict[int, dict[int, int]] = {}
+        for joint, (multibody, link) in places.items():
+            links.setdefault(multibody, {})[joint] = link
+        joints = [joint for own in links.values() for joint in own]
+        self._links = [(multibody, list(own.values())) for multibody, own in links.items()]
+        self._positions = _run(mj.jnt_qposadr[joints])
+        self._velocities = _run(mj.jnt_dofadr[joints])
+        self._references = mj.qpos0[self._positions]
+        self._shifted = bool(self._references.any())
+
+    def put(self, data: mujoco.MjData) -> None:
+        """Give the engine the state that MuJoCo has."""
+        values = (data.qpos[self._positions] - self._references).tolist()
+        speeds = data.qvel[self._velocities].tolist()
+        places = [(multibody, link) for multibody, links in self._links for link in links]
+        for place, value, speed in zip(places, values, speeds, strict=True):
+            self._engine.resetJointState(*place, value, speed, physicsClientId=self._handle)
+
+    def take(self, data: mujoco.MjData) -> None:
+        """Give MuJoCo the state that the engine has."""
+        ask, handle = self._engine.getJointStates, self._handle
+        rows = [
+            row for body, links in self._links for row in ask(body, links, physicsClientId=handle)
+        ]
+        data.qpos[self._positions] = [row[0] for row in rows]
+        if self._shifted:
+            data.qpos[self._positions] += self._references
+        data.qvel[self._velocities] = [row[1] for row in rows]
+
+    def drive(self, data: mujoco.MjData, forces: Floats) -> None:
+        """Apply forces along the joints."""
+        tell, torque, given = (
+            self._engine.setJointMotorControlArray,
+            self._engine.TORQUE_CONTROL,
+            forces[self._velocities].tolist(),
+        )
+        for multibody, links in self._links:
+            own, given = given[: len(links)], given[len(links) :]
+            tell(multibody, links, torque, forces=own, physicsClientId=self._handle)
+
+
+def _run(numbers: Integers) -> Any:
+    """Give a slice for numbers that follow one another, which is faster; else the numbers."""
+    first, count = int(numbers[0]), len(numbers)
+    run = bool((numbers == np.arange(first, first + count)).all())
+    return slice(first, first + count) if run else numbers
+
+
+@final
+class Ball(Part):
+    """A ball joint. The engine has it about the principal axes of the body.
+
+    Args:
+        engine: The module ``pybullet``.
+        handle: The number of the client.
+        mj: The model.
+        joint: Its number.
+        place: Its link.
+    """
+
+    def __init__(
+        self, engine: Any, handle: int, mj: mujoco.MjModel, joint: int, place: Handle
+    ) -> None:
+        self._engine, self._handle = engine, handle
+        self._multibody, self._link = place
+        self._q, self._v = int(mj.jnt_qposadr[joint]), int(mj.jnt_dofadr[joint])
+        body = int(mj.jnt_bodyid[joint])
+        last = mj.body_jntadr[body] + mj.body_jntnum[body] - 1 == joint  # others have no mass
+        self._axes = mj.body_iquat[body].copy() if last else UNTURNED
+
+    def put(self, data: mujoco.MjData) -> None:
+        """Give the engine the state that MuJoCo has."""
+        back = _SIGNS * self._axes
+        turn = composed(composed(back, data.qpos[self._q : self._q + 4]), self._axes)
+        spin = rotated(back, data.qvel[self._v : self._v + 3]).tolist()
+        self._engine.resetJointStateMultiDof(
+            self._multibody, self._link, plain(turn), spin, physicsClientId=self._handle
+        )
+
+    def take(self, data: mujoco.MjData) -> None:
+        """Give MuJoCo the state that the engine has."""
+        (x, y, z, w), spin, *_ = self._engine.getJointStateMultiDof(
+            self._multibody, self._link, physicsClientId=self._handle
+        )
+        turn = composed(composed(self._axes, np.array([w, x, y, z])), _SIGNS * self._axes)
+        data.qpos[self._q : self._q + 4] = turn
+        data.qvel[self._v : self._v + 3] = rotated(self._axes, np.array(spin))
+
+    def drive(self, data: mujoco.MjData, forces: Floats) -> None:
+        """Apply a torque, which is given in the frame of the body."""
+        torque = rotated(_SIGNS * self._axes, forces[self._v : self._v + 3])
+        self._engine.setJointMotorControlMultiDof(
+            self._multibody,
+            self._link,
+            self._engine.TORQUE_CONTROL,
+            force=torque.tolist(),
+            physicsClientId=self._handle,
+        )
+
+
+@final
+class Free(Part):
+    """Free bodies. The engine has the motion of their centers, and turns of their principal axes.
+
+    Args:
+        engine: The module ``pybullet``.
+        handle: The number of the client.
+        mj: The model.
+        places: The base of each body, by the number of its joint.
+    """
+
+    def __init__(
+        self, engine: Any, handle: int, mj: mujoco.MjModel, places: Mapping[int, Handle]
+    ) -> None:
+        self._engine, self._handle = engine, handle
+        self._multibodies = [multibody for multibody, _ in places.values()]
+        joints = list(places)
+        self._bodies = mj.jnt_bodyid[joints].tolist()
+        self._starts = np.stack([mj.jnt_qposadr[joints], mj.jnt_dofadr[joints]], axis=1)
+        self._centers, self._axes = mj.body_ipos[self._bodies], mj.body_iquat[self._bodies]
+
+    def put(self, data: mujoco.MjData) -> None:
+        """Give the engine the state that MuJoCo has."""
+        engine, handle = self._engine, self._handle
+        rows = np.empty((len(self._multibodies), 13))
+        _to_centers(data.qpos, data.qvel, self._starts, self._centers, self._axes, rows)
+        for body, row in zip(self._multibodies, rows.tolist(), strict=True):
+            engine.resetBasePositionAndOrientation(body, row[:3], row[3:7], physicsClientId=handle)
+            engine.resetBaseVelocity(body, row[7:10], row[10:], physicsClientId=handle)
+
+    def take(self, data: mujoco.MjData) -> None:
+        """Give MuJoCo the state that the engine has, with quaternions whose w >= 0.
+
+        The engine keeps a matrix: which of two quaternions it makes of it has no meaning.
+        """
+        engine, handle, rows = self._engine, self._handle, list[tuple[float, ...]]()
+        for body in self._multibodies:
+            position, turn = engine.getBasePositionAndOrientation(body, physicsClientId=handle)
+            speed, spin = engine.getBaseVelocity(body, physicsClientId=handle)
+            rows.append(position + turn + speed + spin)
+        _from_centers(np.array(rows), self._starts, self._centers, self._axes, data.qpos, data.qvel)
+
+    def drive(self, data: mujoco.MjData, forces: Floats) -> None:
+        """Apply forces at the origins of the bodies, and torques that are given in their frames."""
+        engine, world, handle = self._engine, self._engine.WORLD_FRAME, self._handle
+        for multibody, body, (_, v) in zip(
+            self._multibodies, self._bodies, self._starts.tolist(), strict=True
+        ):
+            place, push = data.xpos[body].tolist(), forces[v : v + 3].tolist()
+            torque = rotated(data.xquat[body], forces[v + 3 : v + 6]).tolist()
+            engine.applyExternalForce(multibody, -1, push, place, world, physicsClientId=handle)
+            engine.applyExternalTorque(multibody, -1, torque, world, physicsClientId=handle)
+
+
+@njit(cache=True)
+def _turned(turn: Floats, vector: Floats, sign: float) -> Floats:
+    """Rotate a vector by a unit quaternion (x, y, z, w), or back with the sign -1."""
+    x, y, z, w = turn[0], turn[1], turn[2], sign * turn[3]
+    a, b, c = vector[0], vector[1], vector[2]
+    p, q, r = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return np.array(
+        [a + w * p + y * r - z * q, b + w * q + z * p - x * r, c + w * r + x * q - y * p]
+    )
+
+
+@njit(cache=True)
+def _product(p: Floats, q: Floats) -> Floats:
+    """Compose two quaternions (x, y, z, w): first q, then p."""
+    a, b, c, d = p[0], p[1], p[2], p[3]
+    x, y, z, w = q[0], q[1], q[2], q[3]
+    return np.array(
+        [
+            d * x + a * w + b * z - c * y,
+            d * y + b * w + c * x - a * z,
+            d * z + c * w + a * y - b * x,
+            d * w - a * x - b * y - c * z,
+        ]
+    )
+
+
+@njit(cache=True)
+def _to_centers(
+    positions: Floats,
+    velocities: Floats,
+    starts: Integers,
+    centers: Floats,
+    axes: Floats,
+    into: Floats,
+) -> None:
+    """Compute the motion of the centers of free bodies, and of their principal axes.
+
+    Args:
+        positions: ``qpos``.
+        velocities: ``qvel``.
+        starts: Where each body begins in the two, shape (n, 2).
+        centers: Centers of mass in the frames of the bodies, shape (n, 3) [m].
+        axes: From principal axes to those frames, as MuJoCo has quaternions, shape (n, 4).
+        into: Position, quaternion (x, y, z, w), velocity and angular velocity in the world,
+            written, shape (n, 13).
+    """
+    for i in range(len(into)):
+        q, v = starts[i, 0], starts[i, 1]
+        turn = np.roll(positions[q + 3 : q + 7], -1)
+        arm = _turned(turn, centers[i], 1.0)
+        spin = _turned(turn, velocities[v + 3 : v + 6], 1.0)
+        into[i, :3] = positions[q : q + 3] + arm
+        into[i, 3:7] = _product(turn, np.roll(axes[i], -1))
+        into[i, 7:10] = velocities[v : v + 3] + np.cross(spin, arm)
+        into[i, 10:] = spin
+
+
+@njit(cache=True)
+def _from_centers(
+    rows: Floats,
+    starts: Integers,
+    centers: Floats,
+    axes: Floats,
+    positions: Floats,
+    velocities: Floats,
+) -> None:
+    """Do the opposite of ``_to_centers``, with quaternions whose w is not negative."""
+    back = np.array([-1.0, -1.0, -1.0, 1.0])
+    for i in range(len(rows)):
+        q, v = starts[i, 0], starts[i, 1]
+        turn = _product(rows[i, 3:7], back * np.roll(axes[i], -1))
+        if turn[3] < 0.0:
+            turn = -turn
+        arm, spin = _turned(turn, centers[i], 1.0), rows[i, 10:]
+        positions[q : q + 3] = rows[i, :3] - arm
+        positions[q + 3 : q + 7] = np.roll(turn, 1)
+        velocities[v : v + 3] = rows[i, 7:10] - np.cross(spin, arm)
+        velocities[v + 3 : v + 6] = _turned(turn, spin, -1.0)
+
+
+def parts(
+    engine: Any, handle: int, mj: mujoco.MjModel, places: Mapping[int, Handle]
+) -> Iterator[Part]:
+    """List what can move, as few parts as there can be.
+
+    Args:
+        engine: The module ``pybullet``.
+        handle: The number of the client.
+        mj: The model.
+        places: The link of each joint, by the number of the joint.
+    """
+    together: dict[type[Scalars | Free], dict[int, Handle]] = {}
+    for joint, place in sorted(places.items()):
+        kind = mj.jnt_type[joint]
+        if kind == BALL:
+            yield Ball(engine, handle, mj, joint, place)
+        else:
+            together.setdefault(Free if kind == FREE else Scalars, {})[joint] = place
+    yield from (kind(engine, handle, mj, own) for kind, own in together.items())
