@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, final
@@ -239,11 +240,21 @@ class Composition(ABC):
         return float(self.structure(values).timestep)
 
     def overlaps(
-        self, scene: Scene, tolerance: float | None = None, asked: Iterable[str] = ()
+        self,
+        scene: Scene,
+        tolerance: float | None = None,
+        asked: Iterable[str] = (),
+        enough: float = math.inf,
+        among: Set[str] | None = None,
     ) -> tuple[Overlap, ...]:
-        """List the bodies that lie deeper in one another than a tolerance [m].
+        """List the bodies that lie deeper in one another than a tolerance.
 
-        None stands for what the task allows after an intervention on the variables asked for.
+        Args:
+            scene: With complete parameters.
+            tolerance: How deep is too deep [m]; what the task allows if None.
+            asked: The variables that an intervention is on.
+            enough: Where some lie deeper than this in one another, those alone may be listed [m].
+            among: Names of the bodies to look at; all if None.
         """
         return ()
 

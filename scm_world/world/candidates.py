@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from dataclasses import replace
 from typing import Any, final
 
@@ -20,12 +20,16 @@ from scm_world.world.solver import Solver, same
 
 ROUNDING = 1e-6
 """How much deeper than before is no deeper [m]."""
-CHUNK = 64
+CHUNK = 16
 """How many draws are looked at together."""
 
 
 class Unknown(Exception):  # no error: such draws are planned one after another
     """The result of a draw is unknown before it is planned."""
+
+
+class _Slow(Exception):  # no error
+    """A value has to be computed for one draw after another."""
 
 
 @final
@@ -47,24 +51,51 @@ class Candidates:
         self._carried = {variable.name: variable for variable in self._task.carried}
         self._found: dict[str, Value] = {}
         self._varying: set[str] = set()
+        self._patient = True
 
-    def scenes(self) -> Iterator[Scene]:
-        """Yield the scene of each draw, as far as it says where surfaces are."""
-        task, solver = self._task, self._solver
-        scene = task.describe(solver.static, solver.state)
+    def keep(self, which: list[bool]) -> None:
+        """Leave out draws; ``which`` tells of each whether it stays."""
+        self.attempts = self.attempts[which]
+        for name in self._varying:
+            self._found[name] = self._found[name][which]
+
+    def scenes(self, *, slow: bool) -> tuple[Iterator[Scene], Set[str] | None]:
+        """Describe the scene of each draw, as far as it says where surfaces are.
+
+        Args:
+            slow: Whether values are also computed for one draw after another.
+
+        Returns:
+            The scenes, and the bodies that are where they are shown; None for all.
+        """
+        task, scene = self._task, self._task.describe(self._solver.static, self._solver.state)
         keys = {name: key for name, key in task.parameter_keys.items() if key[1] in SURFACES}
-        surfaces = {key: self._value(name) for name, key in keys.items()}
-        places = [
-            (where, self._value(name))
-            for name, where in task.places.items()
-            if name not in task.bundles
-        ]
-        for row in range(len(self.attempts)):
-            state = scene.state.copy()
-            for where, value in places:
-                state.vector[where] = value[min(row, len(value) - 1)].ravel()
-            found = {key: value[min(row, len(value) - 1)] for key, value in surfaces.items()}
-            yield Scene(scene.structure, {**scene.parameters, **found}, state)
+        values, late = dict[str, Value](), set[str]()
+        self._patient = slow
+        for name in (*keys, *(name for name in task.places if name not in task.bundles)):
+            try:
+                values[name] = self._value(name)
+            except _Slow:
+                late.add(name)
+
+        def scenes() -> Iterator[Scene]:
+            vector, parameters = scene.state.vector.copy(), {**scene.parameters}
+            varying = self._varying.intersection(values)
+            for row in range(len(self.attempts)):
+                for name in varying if row else values:
+                    value = values[name][row if name in varying else 0]
+                    if name in keys:
+                        parameters[keys[name]] = value
+                    else:
+                        vector[task.places[name]] = value.ravel()
+                yield Scene(scene.structure, parameters, scene.state.with_vector(vector))
+
+        if not late:
+            return scenes(), None
+        touched = task.composition.touched()
+        shown = {body for body, states in touched.items() if late.isdisjoint(states)}
+        own = {keys[name][0] for name in late if name in keys}
+        return scenes(), frozenset(shown - own if own.issubset(touched) else ())
 
     def _value(self, name: str) -> Value:
         if name not in self._found:
@@ -163,7 +194,13 @@ class Candidates:
         *,
         varies: bool,
     ) -> Value:
-        """Compute a function for each draw; functions of users need not take many together."""
+        """Compute a function for each draw; functions of users need not take many together.
+
+        Raises:
+            _Slow: That was not asked for.
+        """
+        if varies and not self._patient:
+            raise _Slow
         found = np.empty((len(self.attempts) if varies else 1, *shape))
         for i in range(len(found)):
             found[i] = function(*(value[i if len(value) > 1 else 0] for value in values))
@@ -240,11 +277,19 @@ def _thinned(
     """
     if plan.solver is None:
         return attempts
+    enough = max((overlap.depth for overlap in before), default=0.0) + ROUNDING
     composition = plan.compiled.composition
     candidates = Candidates(plan.solver, replace(key, attempt=1), np.array(attempts))
     try:
         with np.errstate(all="ignore"):
-            found = [composition.overlaps(s, asked=plan.asked) for s in candidates.scenes()]
+            for slow in (False, True):
+                scenes, among = candidates.scenes(slow=slow)
+                found = (composition.overlaps(s, None, plan.asked, enough, among) for s in scenes)
+                if among is None or among:
+                    candidates.keep([not deeper(overlaps, before) for overlaps in found])
+                if among is None or not len(candidates.attempts):
+                    break
     except Exception:  # planning says what is wrong
         return attempts
-    return [n for n, overlaps in zip(attempts, found, strict=True) if not deeper(overlaps, before)]
+    left: list[int] = candidates.attempts.tolist()
+    return left

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+import math
+from collections.abc import Container, Set
 
 import numpy as np
 
@@ -19,7 +20,9 @@ from scm_world.tasks.trifinger.structure import (
 )
 
 
-def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
+def overlaps(
+    scene: Scene, *, tolerance: float, enough: float = math.inf, among: Set[str] | None = None
+) -> tuple[Overlap, ...]:
     """List all pairs of bodies that lie deeper in one another than a tolerance.
 
     Compared are blocks with everything; the middle and lower links of different fingers with one
@@ -30,6 +33,8 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
     Args:
         scene: With complete parameters.
         tolerance: How deep is too deep [m].
+        enough: Where some lie deeper than this in one another, those alone may be listed [m].
+        among: Names of the bodies to look at; all if None.
 
     Returns:
         One entry for each pair of names, blocks first.
@@ -44,18 +49,19 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
     """
     from scm_world.backends.mujoco import overlaps as engine
 
-    state = scene.state
+    found, state = engine.overlaps(scene, tolerance, enough=enough, among=among), scene.state
+    if any(overlap.depth > enough for overlap in found):
+        return found
     tips = forward(state.joint_positions, float(scene.parameters["robot", "height"])).reshape(3, 3)
     centers = np.vstack([state.positions, tips])
     beyond = np.hypot(centers[:, 0], centers[:, 1]) - WALL_RADIUS
     beyond[len(state.positions) :][tips[:, 2] > WALL_HEIGHT] = 0.0
-    found = engine.overlaps(scene, tolerance)
     if beyond.max() <= tolerance:
         return found
     names = *scene.structure.blocks, *(hardware.link_name(f, 3) for f in hardware.FINGERS)
     deepest = {overlap.bodies: overlap.depth for overlap in found}
     for name, depth in zip(names, beyond.tolist(), strict=True):
-        if depth > tolerance:
+        if depth > tolerance and (among is None or name in among):
             deepest[name, "stage"] = max(depth, deepest.get((name, "stage"), 0.0))
     return tuple(Overlap(bodies, depth) for bodies, depth in deepest.items())
 
@@ -70,10 +76,8 @@ def buried_goals(scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
     found, obstacles = list[Overlap](), scene.structure.obstacles
     goals = [goal for goal in scene.goals if obstacles and goal.name in names]
     for goal in (goal for goal in goals if goal.shape == "sphere"):
-        depths = {name: _depth_in_box(goal, scene, name) for name in obstacles}
-        found += [
-            Overlap((goal.name, n), depth) for n, depth in depths.items() if depth > TOLERANCE
-        ]
+        inside = (Overlap((goal.name, o), _depth_in_box(goal, scene, o)) for o in obstacles)
+        found += [overlap for overlap in inside if overlap.depth > TOLERANCE]
     solid = [goal for goal in goals if goal.shape != "sphere"]
     if solid:  # blocks in the places of goals
         hulls = tuple((goal.name, goal.hull) for goal in solid if goal.hull is not None)

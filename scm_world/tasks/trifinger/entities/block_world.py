@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping
+import math
+from collections.abc import Container, Iterable, Mapping, Set
 from dataclasses import dataclass, field
 from typing import final
 
@@ -85,17 +86,27 @@ class BlockWorld(Composition):
         return self._structures[name]
 
     def overlaps(
-        self, scene: Scene, tolerance: float | None = None, asked: Iterable[str] = ()
+        self,
+        scene: Scene,
+        tolerance: float | None = None,
+        asked: Iterable[str] = (),
+        enough: float = math.inf,
+        among: Set[str] | None = None,
     ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance [m]."""
         if tolerance is not None:
             return overlaps(scene, tolerance=tolerance)
-        if any(name.partition(".")[0] in self.unchecked for name in asked):
+        if self.unchecked and any(name.partition(".")[0] in self.unchecked for name in asked):
             return ()
         robot, others = self.conventions.robot_tolerance, self.conventions.tolerance
         return tuple(
             overlap
-            for overlap in overlaps(scene, tolerance=min(robot, others))
+            for overlap in overlaps(
+                scene,
+                tolerance=min(robot, others),
+                enough=max(enough, robot, others),
+                among=among,
+            )
             if overlap.depth > (others if set(LINK_NAMES).isdisjoint(overlap.bodies) else robot)
         )
 
