@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Container, Iterable, Mapping, Set
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, final
@@ -245,7 +245,6 @@ class Composition(ABC):
         tolerance: float | None = None,
         asked: Iterable[str] = (),
         enough: float = math.inf,
-        among: Set[str] | None = None,
     ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance.
 
@@ -254,9 +253,16 @@ class Composition(ABC):
             tolerance: How deep is too deep [m]; what the task allows if None.
             asked: The variables that an intervention is on.
             enough: Where some lie deeper than this in one another, those alone may be listed [m].
-            among: Names of the bodies to look at; all if None.
         """
         return ()
+
+    def thin(self, candidates: Any, limit: float) -> None:  # noqa: B027 # may leave all
+        """Leave out candidates of which it is seen at once that they put bodies in one place.
+
+        Args:
+            candidates: Draws of an intervention, with ``parameter``, ``state`` and ``keep``.
+            limit: How deep bodies lie in one another already [m].
+        """
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         """List goals, of some, that lie in something that never moves: nothing can fill them."""

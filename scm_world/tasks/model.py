@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from typing import Any, Self, final
 
@@ -77,7 +77,6 @@ class ModelComposition(Composition):
         tolerance: float | None = None,
         asked: Iterable[str] = (),
         enough: float = math.inf,
-        among: Set[str] | None = None,
     ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance [m].
 
@@ -89,7 +88,7 @@ class ModelComposition(Composition):
         from scm_world.backends.mujoco.overlaps import overlaps
 
         tolerance = TOLERANCE if tolerance is None else tolerance
-        return overlaps(scene, tolerance, self._meant, max(enough, tolerance), among)
+        return overlaps(scene, tolerance, self._meant, max(enough, tolerance))
 
     def structure(self, values: Mapping[str, Any]) -> Model:
         """Give the model: it is compiled once."""

@@ -13,7 +13,6 @@ from typing import Any, final
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.mujoco.backend import realize
@@ -34,7 +33,6 @@ class _Scratch:
         }
         self._now = realize(structure, self._written)
         model, self.owners = self._now.model, self._now.owners
-        self._owned: dict[Set[str], NDArray[np.bool_]] = {}
         kinds = np.ones(model.ngeom + model.nflex, dtype=np.int64)
         roots = model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)]
         kinds[: model.ngeom][np.isin(model.body_rootid[model.geom_bodyid], roots)] = 0
@@ -42,12 +40,6 @@ class _Scratch:
         self.ranks: dict[str, tuple[int, int]] = {}
         for shape, (owner, kind) in enumerate(zip(self.owners, kinds.tolist(), strict=True)):
             self.ranks.setdefault(owner, (kind, shape))
-
-    def owned(self, names: Set[str]) -> NDArray[np.bool_]:
-        """Tell which shapes belong to some bodies."""
-        if names not in self._owned:
-            self._owned[names] = np.array([owner in names for owner in self.owners])
-        return self._owned[names]
 
     def contacts(self, scene: Scene) -> tuple[Integers, Floats]:
         """Find the shapes that touch, shape (n, 2), and their depths, shape (n,) [m]."""
@@ -86,7 +78,6 @@ def overlaps(
     tolerance: float,
     besides: Set[Shapes] = frozenset(),
     enough: float = np.inf,
-    among: Set[str] | None = None,
 ) -> tuple[Overlap, ...]:
     """List all pairs of bodies that lie deeper in one another than a tolerance.
 
@@ -95,7 +86,6 @@ def overlaps(
         tolerance: How deep is too deep [m].
         besides: Pairs of shapes that may lie in one another.
         enough: Where some lie deeper than this in one another, the deepest alone are listed [m].
-        among: Names of the bodies to look at; all if None.
 
     Returns:
         One entry for each pair of names, with its greatest depth. First come bodies that move
@@ -112,9 +102,6 @@ def overlaps(
     """
     scratch = _scratch(scene.structure, threading.get_ident())
     shapes, depths = scratch.contacts(scene)
-    if among is not None:
-        both = scratch.owned(among)[shapes].all(axis=1)
-        shapes, depths = shapes[both], depths[both]
     if not len(depths):
         return ()
     found: dict[tuple[str, ...], Overlap] = {}

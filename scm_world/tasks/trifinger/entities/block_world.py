@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterable, Mapping, Set
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import final
+from typing import Any, final
 
 from scm_world._types import Floats, Values
 from scm_world.geometry.hulls import Hull
@@ -13,7 +13,7 @@ from scm_world.models import ControlMode, GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.scene import Overlap
 from scm_world.tasks.composition import Commands, Composition, Entity
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
-from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps
+from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
 from scm_world.tasks.trifinger.hardware import (
     FINGERS,
     LINK_NAMES,
@@ -91,7 +91,6 @@ class BlockWorld(Composition):
         tolerance: float | None = None,
         asked: Iterable[str] = (),
         enough: float = math.inf,
-        among: Set[str] | None = None,
     ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance [m]."""
         if tolerance is not None:
@@ -105,10 +104,13 @@ class BlockWorld(Composition):
                 scene,
                 tolerance=min(robot, others),
                 enough=max(enough, robot, others),
-                among=among,
             )
             if overlap.depth > (others if set(LINK_NAMES).isdisjoint(overlap.bodies) else robot)
         )
+
+    def thin(self, candidates: Any, limit: float) -> None:
+        """Leave out candidates whose fingers cross one another."""
+        thin(candidates, max(limit, self.conventions.robot_tolerance))
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable, with the states coupled to all physical quantities."""
