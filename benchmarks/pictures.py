@@ -58,7 +58,7 @@ def parts(world: World) -> dict[str, float]:
             done = time.process_time()
             scene = world.scene()
             seen = time.process_time()
-            rgb = picture(scene, None, (64, 64), "software")
+            rgb = picture(scene, None, (64, 64))
             painted = time.process_time()
             png(rgb)
             times = (begun, done, seen, painted, time.process_time())

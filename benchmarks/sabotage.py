@@ -131,7 +131,7 @@ class Sabotaged(BackendWrapper):
             return found
         return {key: np.array(self.asked.get(key, value)) for key, value in found.items()}
 
-    def step(self, mode: Any, command: Any, substeps: int) -> None:
+    def step(self, command: Any, substeps: int) -> None:
         """Hold a command, and do something wrong before or after it."""
         if self.before is not None:
             command = self.before(self, np.array(command), self.memory)

@@ -75,7 +75,7 @@ def shown(world: World, values, i: int, pixels: int) -> bytes:
     joints[:3] = inverse(tips, height, joints).joint_positions[:3]
     lit = 0.06 + np.diag([0.06 + 0.88 * values[name][i] for name in PLACES])
     world.do({"joint_positions": joints, **{f"tool_{k}.color": lit[k] for k in range(3)}})
-    return png(picture(world.scene().with_(goals=()), CAMERA, (pixels, pixels), "software"))
+    return png(picture(world.scene().with_(goals=()), CAMERA, (pixels, pixels)))
 
 
 def pairs(world: World, first: int, n: int, pixels: int) -> dict[str, np.ndarray]:

@@ -21,7 +21,7 @@ SCORE, TRIALS = "fractional_success", 25
 def demonstrations(episodes: int, seed: int) -> Recording:
     """Record the scripted teacher, with noise in what it plays and none in what it says."""
     env = gymnasium.make("scm_world/Pushing-v0", **ENV)
-    shown = record("grasp", env, episodes, noise=0.04, labels="teacher", seed=seed)
+    shown = record("feedback", env, episodes, noise=0.02, labels="teacher", seed=seed)
     good = [episode for episode in shown if episode.infos[SCORE][-1] > 0.9]
     return Recording(shown.environment, tuple(good), shown.versions, shown.policy)
 
@@ -63,12 +63,12 @@ def main(episodes: str = "240", updates: str = "16000", seed: str = "0", dataset
     found = evaluate(policy, "P0", task="pushing", n=TRIALS, seeds=1_000, env=ENV)
     print(f"success in P0, where all episodes begin alike: {found.score('P0', 'success')}")
     env = gymnasium.make("scm_world/Pushing-v0", **ENV)
-    for name, one in (("clone", policy), ("teacher", "grasp")):
-        pushed = record(one, env, TRIALS, noise=0.04, seed=1_000)
+    for name, one in (("clone", policy), ("teacher", "feedback")):
+        pushed = record(one, env, TRIALS, noise=0.02, seed=1_000)
         solved = [episode.infos[SCORE][-1] > 0.9 for episode in pushed]
         print(f"with noise in the actions of the {name}: {sum(solved)} of {TRIALS}")
     if dataset:  # whose scores are 0 for a robot that keeps still, and 1 for the teacher
-        both = evaluate({"still": "still", "grasp": "grasp"}, "P0", n=TRIALS, seeds=1_000, env=ENV)
+        both = evaluate("still,feedback", "P0", task="pushing", n=TRIALS, seeds=1_000, env=ENV)
         low, high = (both.score("P0", "return", agent=name).value for name in both.agents)
         about = {"author": "scm_world", "author_email": "-", "code_permalink": "examples"}
         scores = {"ref_min_score": float(low), "ref_max_score": float(high)}

@@ -21,7 +21,7 @@ ENV = {"action_mode": "end_effector_positions"}
 def main(episodes: str = "3") -> None:
     """Evaluate it beside random actions, then record demonstrations for learners."""
     found = evaluate(
-        {"grasp": "grasp", "random": "random"},
+        {"feedback": "feedback", "random": "random"},
         "P0,P1,P5",
         task="picking",
         n=int(episodes),
@@ -32,15 +32,15 @@ def main(episodes: str = "3") -> None:
         for protocol in found.protocols:
             grasp, chance = (
                 found.score(protocol, "success", agent=agent, engine=engine)
-                for agent in ("grasp", "random")
+                for agent in ("feedback", "random")
             )
             print(f"{engine} {protocol}: success {grasp}, by chance {chance}")
-    print("MuJoCo minus Bullet in P5:", found.gap("mujoco", "bullet", "P5", agent="grasp"))
+    print("MuJoCo minus Bullet in P5:", found.gap("mujoco", "bullet", "P5", agent="feedback"))
 
     env = gymnasium.make("scm_world/Picking-v0", **ENV)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "demonstrations.parquet"
-        record("grasp", env, 2, do={"tool_block.mass": "A", "goal_block.height": "A"}, out=path)
+        record("feedback", env, 2, do={"tool_block.mass": "A", "goal_block.height": "A"}, out=path)
         seen, done = Recording.load(path).pairs()
     print(f"{len(seen)} pairs of what was seen, {seen.shape}, and what was done, {done.shape}")
     env.close()

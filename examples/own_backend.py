@@ -48,7 +48,7 @@ def main(episodes: str = "4", length: str = "250") -> None:
         suite.test_equal_scenes_continue_alike(busy_scene())
         print("equal scenes continue bit for bit alike")
     how = {"backend": both, "env": {"max_episode_length": int(length)}}
-    found = evaluate("grasp", "P0,P5", task="picking", n=int(episodes), **how)
+    found = evaluate("feedback", "P0,P5", task="picking", n=int(episodes), **how)
     for protocol in found.protocols:
         print(f"{protocol}: slow motors cost {found.gap(*both, protocol)} of fractional success")
 

@@ -52,7 +52,7 @@ def main(n: str = "5") -> None:
     """Give it an id, and see how far a scripted policy gets with heavy blocks."""
     gymnasium.register("Centering-v0", "scm_world.env:ScmWorldEnv", kwargs={"task": "centering"})
     print(f"observations {gymnasium.make('Centering-v0').observation_space.shape}")
-    found = evaluate("grasp", Protocol("heavy", f"{TOOL}.mass", "B"), task="centering", n=int(n))
+    found = evaluate("feedback", Protocol("heavy", f"{TOOL}.mass", "B"), task="centering", n=int(n))
     print(f"fractional success with heavy blocks: {found.score('heavy')}")
 
 

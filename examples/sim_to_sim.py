@@ -12,7 +12,7 @@ from scm_world.evaluation import evaluate
 from scm_world.policies.zoo import zoo
 
 ENGINES = ("mujoco", "bullet")
-LEARNED = "zoo:picking" if "picking" in zoo() else "grasp"
+LEARNED = "zoo:picking" if "picking" in zoo() else "feedback"
 
 
 def main(policy: str = LEARNED, task: str = "picking", episodes: str = "10") -> None:

@@ -13,7 +13,7 @@ from scm_world.evaluation.statistics import unpaired_interval
 from scm_world.policies.zoo import zoo
 
 PAIRS = (("P1", "P2"), ("P7", "P8"))  # mass; goal, start and mass: from A, and from B
-LEARNED = "zoo:picking" if "picking" in zoo() else "grasp"
+LEARNED = "zoo:picking" if "picking" in zoo() else "feedback"
 
 
 def main(policy: str = LEARNED, task: str = "picking", episodes: str = "30") -> None:

@@ -62,7 +62,7 @@ class StepModel:
     With ``"arrays"`` it is given four flat arrays of floats, in the order of declaration, and
     gives the new state as one: compiled functions take that. In both cases it must not change
     what it is given, must keep no memory from one call to the next, and must draw no random
-    numbers of its own.
+    numbers of its own: ``verify`` finds what it depends on in addition.
 
     A command is the action followed by the noise. Two models are equal if they have the same
     function and tables; it can be pickled if the function can.
@@ -265,7 +265,6 @@ class StepFunction(InMemory):
     name: ClassVar[str] = "step"
     capabilities: ClassVar[Capabilities] = Capabilities(batch=True)
     numbers: Floats
-    _asked: StepModel | None = None
 
     def build(self, scene: Scene) -> None:
         """Keep the scene.
@@ -294,18 +293,9 @@ class StepFunction(InMemory):
         """Hold a command, which is the action and the noise, for some steps.
 
         Raises:
-            EngineFailure: See ``StepModel.advance``; or the function gives two answers to one
-                question, which is tried in the first step. The state is as before.
+            EngineFailure: See ``StepModel.advance``. The state is as before.
         """
         parameters, states, commands = self.numbers[None], self._state.vector[None], command[None]
-        if self._asked is not self._structure:
-            asked = (self._structure.advance(parameters, states, commands) for _ in range(2))
-            if len({answer.tobytes() for answer in asked}) > 1:
-                raise self._structure._failure(
-                    "gave two answers to one question; let it keep no memory between calls, and "
-                    "declare what is random in noise="
-                )
-            self._asked = self._structure
         for _ in range(substeps):
             states = self._structure.advance(parameters, states, commands)
         self._state.vector[:] = states[0]

@@ -99,7 +99,7 @@ def discover(
         view: Rows of a task: outcome (one per episode) or step (control step).
         cause: What varies, such as '*.mass'; repeat it for more.
         outcome: Variable that is measured; repeat it for more.
-        policy: random, sweep, across, grasp or still; usual is sweep, of --view step random.
+        policy: random, sweep, across, feedback or still; usual is sweep, of --view step random.
         sensor_noise: Of sensors: deviation, in halves of a range.
         timeout: Limit of a run in seconds; 0 for none.
     """

@@ -48,7 +48,7 @@ def evaluate(
     Args:
         policy: A file (.safetensors, .onnx, .zip, .npz, .parquet; a .zip of Stable-Baselines3 with
             --trust stable_baselines3), the folder of a training run,
-            zoo:NAME, random, still, sweep, grasp, or module:function; several with commas;
+            zoo:NAME, random, still, sweep, feedback, or module:function; several with commas;
             NAME=POLICY names one, and A+B are its runs.
         task: A task (see 'scm-world list'), a model.xml or model.urdf, or module:function; by
             default what the policy was trained for, or pushing.

@@ -109,7 +109,7 @@ Steps = Annotated[int, typer.Option(min=1, help="Control steps of an episode.")]
 Policy = Annotated[
     str | None,
     typer.Option(
-        help="random, still or mpc; of the TriFinger also grasp, or sweep: the fingertips go to "
+        help="random, still or mpc; of the TriFinger also feedback, or sweep: the fingertips go to "
         "the middle.",
         show_default="random; still without a backend",
     ),

@@ -134,7 +134,7 @@ def clone(
     Example: scm-world clone picking --episodes 200 --out my-picker
 
     Args:
-        source: A policy that sees the whole world, such as grasp; a recording (.parquet), or a
+        source: A policy that sees the whole world, such as feedback; a recording (.parquet), or a
             folder of recordings.
         episodes: Demonstrations of the teacher.
         protocols: What varies in them: names with commas.

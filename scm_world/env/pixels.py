@@ -14,11 +14,11 @@ from scm_world._types import Values
 from scm_world.backends.renderer import (
     ORIGINAL,
     PLAIN,
-    drawing_of,
     following_camera,
     goal_pixels,
     now_pixels,
     scene_camera,
+    views_of,
 )
 from scm_world.env.observer import STACKS
 from scm_world.env.vector import Layouts
@@ -115,16 +115,18 @@ class Pixels:
         size: Size | None,
         stack: str = STACKS[0],
     ) -> None:
-        drawing, published = drawing_of(world.structure), world.conventions.published_observation
-        self._world, self._shows_goals = world, drawing.overview is not None
-        own = drawing.original_cameras if published else drawing.cameras
-        usual = [camera.name for camera in own] if self._shows_goals else [AUTOMATIC]
+        views, published = views_of(world.structure), world.conventions.published_observation
+        self._world, self._shows_goals = world, views is not None
+        own: tuple[Camera, ...] = ()
+        if views is not None:
+            own = views.original_cameras if published else views.cameras
+        usual = [AUTOMATIC] if views is None else [camera.name for camera in own]
         given = usual if cameras is None else cameras
         if isinstance(given, str) or not len(given):
             raise UnknownOption("list of cameras", cameras, ("one or more names or cameras",))
         self._given = tuple(given)
-        if drawing.overview is not None:
-            known = {camera.name: camera for camera in (*own, drawing.overview)}
+        if views is not None:
+            known = {camera.name: camera for camera in (*own, views.overview)}
             found = [read_camera(camera, known) for camera in given]
         else:
             plain = Camera("", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))

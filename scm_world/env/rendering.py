@@ -17,7 +17,7 @@ from scm_world.models.camera import Camera
 from scm_world.world import Simulation
 
 if TYPE_CHECKING:
-    from scm_world.backends.mujoco.opengl import Viewer
+    from scm_world.backends.mujoco.viewer import Viewer
 
 
 @final
@@ -47,7 +47,7 @@ class Window:
     def show(self, scene: Scene) -> None:
         """Show a scene; the first time, the window opens."""
         if self._viewer is None:
-            from scm_world.backends.mujoco.opengl import Viewer
+            from scm_world.backends.mujoco.viewer import Viewer
 
             self._viewer = Viewer()
         self._viewer.show(scene)
@@ -111,15 +111,15 @@ class Looks:
             whole_number("render_size", min(self._size), least=1)
 
     def _camera(self, camera: Camera | str | None) -> Camera:
-        from scm_world.backends.renderer import drawing_of, scene_camera
+        from scm_world.backends.renderer import scene_camera, views_of
 
         if isinstance(camera, Camera):
             return camera
-        overview = drawing_of(self.world.structure).overview
-        if overview is None:
+        views = views_of(self.world.structure)
+        if views is None:
             return scene_camera(self.world.scene(), camera)
-        camera = overview.name if camera is None else camera
-        known = {one.name: one for one in (*self.world.cameras(), overview)}
+        camera = views.overview.name if camera is None else camera
+        known = {one.name: one for one in (*self.world.cameras(), views.overview)}
         one_of("camera", camera, known)
         return known[camera]
 
@@ -139,14 +139,14 @@ class Looks:
 
     def _camera_of(self, scene: Scene) -> Camera:
         """Give the camera of pictures for people: of a model it follows what moves."""
-        from scm_world.backends.renderer import drawing_of, following_camera, scene_camera
+        from scm_world.backends.renderer import following_camera, scene_camera, views_of
         from scm_world.env.pixels import AUTOMATIC
 
-        overview = drawing_of(self.world.structure).overview
-        if self._view is not None and (overview is not None or self._view != AUTOMATIC):
+        views = views_of(self.world.structure)
+        if self._view is not None and (views is not None or self._view != AUTOMATIC):
             return self._camera(self._view)
-        if overview is not None:
-            return overview
+        if views is not None:
+            return views.overview
         if self._automatic is None:
             self._automatic = scene_camera(self.world.structure.default_scene())
         return following_camera(self._automatic, scene)

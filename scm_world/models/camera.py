@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -85,6 +86,25 @@ class Camera:
             column = self.width / 2.0 + focal * seen[..., 0] / depth
             row = self.height / 2.0 - focal * seen[..., 1] / depth
         return np.stack([column, row, depth], axis=-1)
+
+
+@final
+@dataclass(frozen=True)
+class Views:
+    """From where scenes of a structure are seen, if it says so.
+
+    Attributes:
+        overview: The camera of pictures for people.
+        cameras: Those of policies, by default.
+        original_cameras: The same as the published code realises them.
+        background: Takes a scene, and whether obstacles are wanted; returns the scene that
+            pictures of its goals show, and the names of the bodies that they leave out.
+    """
+
+    overview: Camera
+    cameras: tuple[Camera, ...]
+    original_cameras: tuple[Camera, ...]
+    background: Callable[[Any, bool], tuple[Any, frozenset[str]]]
 
 
 def camera_from(

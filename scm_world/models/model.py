@@ -152,6 +152,8 @@ class Model:
         trees: Names of the kinematic trees (bodies with one root), by number.
         refused: What cannot be set or exposed, by name, with the reason.
         notes: What acts without having a variable (plugins, flex), one sentence each.
+        staged: Whether its physics steps have stages (Runge-Kutta), in each of which bodies may
+            touch, while a backend lists the contacts of the last one alone.
         describe: Gives the ``ModelBodies`` of the model, for backends that do not read its file. It
             can be pickled.
     """
@@ -167,6 +169,7 @@ class Model:
     trees: tuple[str, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
+    staged: bool = False
     describe: Callable[[Model], ModelBodies] | None = field(default=None, repr=False)
 
     def __eq__(self, other: object) -> bool:

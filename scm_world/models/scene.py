@@ -152,7 +152,7 @@ class Structure(Protocol):
         Args:
             backend: ``"mujoco"``: a class derived from ``backends.mujoco.realization.Realization``;
                 ``"bullet"``: one derived from ``backends.bullet.client.Client``; ``"fake"``: see
-                ``backends.fake``; ``"renderer"``: a ``backends.renderer.drawing.Drawing``.
+                ``backends.fake``; ``"renderer"``: ``models.camera.Views``.
         """
 
 

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._types import ArrayLike, Floats, Integers
 
-Kind = Literal["box", "sphere", "capsule", "cylinder", "ellipsoid", "plane", "mesh"]
+Kind = Literal["box", "ellipsoid", "capsule", "cylinder", "plane", "mesh"]
 
+KINDS: tuple[Kind, ...] = ("box", "ellipsoid", "capsule", "cylinder", "plane", "mesh")
+BOX, ELLIPSOID, CAPSULE, CYLINDER, PLANE, MESH = range(len(KINDS))
+
+GOAL_OPACITY = 0.3  # Source: CausalWorld 1.2, silhouettes
 
 _UNIT_CUBE = np.array(list(product((0.0, 1.0), repeat=3)))
 
@@ -78,6 +84,100 @@ class Shape(NamedTuple):
     tiles: Tiles | None = None
 
 
+class Table(NamedTuple):
+    """The numbers of shapes, one row each; see ``Shape``.
+
+    Attributes:
+        kinds: Indices into ``KINDS``, shape (n,).
+        halves: Shape (n, 3) [m].
+        positions: Shape (n, 3) [m].
+        rotations: Shape (n, 3, 3).
+        colors: Shape (n, 4).
+        bodies: Shape (n,).
+    """
+
+    kinds: Integers
+    halves: Floats
+    positions: Floats
+    rotations: Floats
+    colors: Floats
+    bodies: Integers
+
+
+class Shapes(NamedTuple):
+    """Things to draw.
+
+    Attributes:
+        table: Their numbers.
+        moves: Whether the body of each can move, shape (n,).
+        meshes: Triangles, by row.
+        tiles: Checkerboards on planes, by row.
+    """
+
+    table: Table
+    moves: NDArray[np.bool_]
+    meshes: Mapping[int, Mesh]
+    tiles: Mapping[int, Tiles]
+
+    @classmethod
+    def of(cls, shapes: Sequence[Shape]) -> Shapes:
+        """Collect shapes."""
+        n = len(shapes)
+        table = Table(
+            np.array([KINDS.index(shape.kind) for shape in shapes], dtype=np.int64),
+            np.array([shape.halves for shape in shapes], dtype=np.float64).reshape(n, 3),
+            np.array([shape.position for shape in shapes], dtype=np.float64).reshape(n, 3),
+            np.array([shape.rotation for shape in shapes], dtype=np.float64).reshape(n, 3, 3),
+            np.array([shape.color for shape in shapes], dtype=np.float64).reshape(n, 4),
+            np.array([shape.body for shape in shapes], dtype=np.int64),
+        )
+        meshes = {i: shape.mesh for i, shape in enumerate(shapes) if shape.mesh is not None}
+        tiles = {i: shape.tiles for i, shape in enumerate(shapes) if shape.tiles is not None}
+        return cls(table, np.array([shape.moves for shape in shapes], dtype=bool), meshes, tiles)
+
+    def listed(self) -> list[Shape]:
+        """List the shapes."""
+        table = self.table
+        return [
+            Shape(
+                KINDS[table.kinds[i]],
+                table.halves[i],
+                table.positions[i],
+                table.rotations[i],
+                table.colors[i],
+                int(table.bodies[i]),
+                bool(self.moves[i]),
+                self.meshes.get(i),
+                self.tiles.get(i),
+            )
+            for i in range(len(self.moves))
+        ]
+
+    def joined(self, others: Shapes) -> Shapes:
+        """Put other shapes behind these."""
+        n = len(self.moves)
+        columns = zip(self.table, others.table, strict=True)
+        return Shapes(
+            Table(*(np.concatenate(pair) for pair in columns)),
+            np.concatenate([self.moves, others.moves]),
+            {**self.meshes, **{n + i: mesh for i, mesh in others.meshes.items()}},
+            {**self.tiles, **{n + i: tiles for i, tiles in others.tiles.items()}},
+        )
+
+    def corners(self, rows: Integers) -> Floats:
+        """Compute the corners in the world of the boxes around some shapes, (k, 8, 3) [m]."""
+        table = self.table
+        high = table.halves[rows]
+        low = -high
+        for k, row in enumerate(rows.tolist()):
+            if row in self.meshes:
+                low[k], high[k] = self.meshes[row].low, self.meshes[row].high
+        local = low[:, None] + _UNIT_CUBE * (high - low)[:, None]  # (k, 8, 3)
+        turned = local @ table.rotations[rows].transpose(0, 2, 1)
+        found: Floats = table.positions[rows][:, None] + turned
+        return found
+
+
 def mesh_of(vertices: ArrayLike, faces: ArrayLike, normals: ArrayLike | None = None) -> Mesh:
     """Make a mesh.
 
@@ -99,11 +199,3 @@ def mesh_of(vertices: ArrayLike, faces: ArrayLike, normals: ArrayLike | None = N
         normals = np.repeat(flat[:, None], 3, axis=1)
     normals = np.array(normals, dtype=np.float64)
     return Mesh(vertices, faces, normals, vertices.min(axis=0), vertices.max(axis=0))
-
-
-def corners(shape: Shape) -> Floats:
-    """Give the corners in the world of the box around a shape, shape (8, 3) [m]."""
-    mesh = shape.mesh
-    low, high = (-shape.halves, shape.halves) if mesh is None else (mesh.low, mesh.high)
-    points: Floats = shape.position + (low + _UNIT_CUBE * (high - low)) @ shape.rotation.T
-    return points

@@ -101,9 +101,8 @@ def as_policy(given: Any, world: Any = None) -> Policy:
     Args:
         given: A policy, actions, ``"random"``, ``"mpc"`` (plans), or None: the idle
             action of the first step. Of the block-building robot also
-            ``"sweep"`` (to the middle), ``"across"`` (one finger), ``"grasp"`` (blocks, to their
-            goals), ``"hold"`` (likewise, but the last block is not let go of), ``"feedback"``
-            (likewise, without a plan in time).
+            ``"sweep"`` (to the middle), ``"across"`` (one finger), ``"feedback"`` (grasps blocks
+            and brings them to their goals).
         world: In which it acts, if that is known already.
 
     Raises:

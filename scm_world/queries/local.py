@@ -16,7 +16,7 @@ import networkx as nx
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import ContactPoint
-from scm_world.errors import UnknownOption
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.world import Simulation
 
 __all__ = ["local_graph"]
@@ -41,6 +41,7 @@ def local_graph(world: Simulation, action: ArrayLike | None = None) -> nx.DiGrap
 
     Raises:
         ActionError: Wrong shape, or a number that is not finite.
+        ModelError: Its contacts are not all known.
         NotReset: There is no episode yet.
         UnknownOption: It is a world of something other than fingers and blocks.
 
@@ -213,7 +214,17 @@ class _Listener:
 
 
 def contacts_of(world: Simulation, action: ArrayLike) -> Touching:
-    """Take a control step, and return the contacts of each of its physics steps."""
+    """Take a control step, and return the contacts of each of its physics steps.
+
+    Raises:
+        ModelError: A backend does not list all contacts of a physics step of this model.
+    """
+    if getattr(world.structure, "staged", False):
+        problem = (
+            "the contacts in each stage of RK4 are not known, so that any edge by contact may act; "
+            "read the model with settings={'integrator': 'implicitfast'} to know them"
+        )
+        raise ModelError([problem])
     engine: Any = world.backend
     listener: Any = _Listener(engine)
     world.backend = listener

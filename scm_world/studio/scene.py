@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from scm_world._types import Floats
 from scm_world.backends.base import ContactPoint
-from scm_world.backends.renderer import body_names, drawing_of
+from scm_world.backends.renderer import body_names, shapes_of
 from scm_world.errors import ModelError
 from scm_world.models.scene import Scene
 from scm_world.models.shapes import Mesh, Shape
@@ -43,7 +43,7 @@ class Shapes:
         shapes: list[Shape] = []
         if scene is not None:  # equations have none
             with suppress(ModelError):  # a step function has no shapes
-                shapes = drawing_of(scene.structure).shapes(scene)
+                shapes = shapes_of(scene).listed()
         key = tuple(
             (s.kind, s.halves.tobytes(), s.color.tobytes(), id(s.mesh), s.body, s.tiles)
             for s in shapes

@@ -116,7 +116,7 @@ class Lesson(Frozen):
     """
 
     task: TaskName
-    teacher: str = "grasp"
+    teacher: str = "feedback"
     env: dict[str, Any] = Field(default_factory=dict)
     protocols: Annotated[tuple[str, ...], Field(min_length=1)] = ("P0", "P1", "P5")
     episodes: Count = 250

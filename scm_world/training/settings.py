@@ -439,7 +439,6 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
 """What differs from that, by task and algorithm."""
 
 _BY_FEEDBACK: Fields = {
-    "teacher": "feedback",
     "env": _reacting(),
     "protocols": ("P7", "P10"),
     "episodes": 12_000,

@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from scm_world._types import Floats
-from scm_world.backends.renderer import body_names, picture, render
+from scm_world.backends.renderer import body_names, render
 from scm_world.geometry import from_rotation_vector, rotation_matrix
 from scm_world.geometry.hulls import Hull, box_hull, hull_of
 from scm_world.models import GoalRegion, Light, Scene
 from scm_world.models.camera import Camera
-from scm_world.tasks.trifinger import drawing, hardware
+from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
-from scm_world.tasks.trifinger.drawing import MOUNT, link_meshes
 from scm_world.tasks.trifinger.kinematics import link_frames
-from scm_world.tasks.trifinger.system import trifinger
+from scm_world.tasks.trifinger.system import MOUNT, tip_name, trifinger
 
 TOP = Camera("top", eye=(0.0, 0.0, 0.25), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
 SMALL = replace(OVERVIEW, width=160, height=120)
 
 SIZE = np.array([0.06, 0.04, 0.05])
-TURN = np.array([0.1, 0.2, 0.3, 0.9])
+TURN = np.array([0.1, 0.2, 0.3, 0.9]) / np.sqrt(0.95)
 TETRAHEDRON = hull_of(0.08 * np.vstack([np.zeros(3), np.eye(3)]))
 
 
@@ -60,21 +58,22 @@ def differing(one: Scene, other: Scene, camera: Camera = OVERVIEW) -> int:
     return int((np.abs(first - second) > 2).any(axis=2).sum())
 
 
-def test_obstacles_are_numbered_behind_the_blocks() -> None:
-    """Names are floor, stage, robot, links, blocks, obstacles, and pixels carry those numbers."""
+def test_every_body_has_a_number() -> None:
+    """Floor, stage, robot, links, blocks and obstacles have names, pixels their numbers."""
     scene = with_obstacle(size=[0.06, 0.06, 0.06], position=[0.08, 0.0, 0.03])
     image = render(scene, TOP)
     column, row, _ = TOP.project([0.08, 0.0, 0.06])
 
-    expected = ("floor", "stage", "robot", *hardware.LINK_NAMES, "tool_block", "barrier")
-    assert body_names(scene.structure) == image.names == expected
+    expected = {"floor", "stage", "robot", *hardware.LINK_NAMES, "tool_block", "barrier"}
+    assert expected <= set(image.names)
+    assert body_names(scene.structure) == image.names
     assert image.names[image.segmentation[int(row), int(column)]] == "barrier"
     assert image.shows("tool_block").any()
 
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_obstacle_looks_like_a_block(*, turned: bool) -> None:
-    """A box looks the same, shadow included, whether it can move or not."""
+    """A box looks the same but for rounding, shadow included, whether it can move or not."""
     position, color = np.array([0.05, 0.02, 0.08]), np.array([0.2, 0.5, 0.9])
     orientation = TURN if turned else np.array([0.0, 0.0, 0.0, 1.0])
     block = trifinger(blocks=("it",)).default_scene()
@@ -89,8 +88,8 @@ def test_obstacle_looks_like_a_block(*, turned: bool) -> None:
 
     for camera in (TOP, OVERVIEW):
         one, other = render(block, camera), render(still, camera)
-        np.testing.assert_array_equal(one.rgb, other.rgb)
-        np.testing.assert_array_equal(one.segmentation, other.segmentation)
+        assert differing(block, still, camera) <= 5
+        assert (one.shows("it") != other.shows("it")).sum() <= 2
 
 
 def test_friction_of_an_obstacle_is_not_seen() -> None:
@@ -120,12 +119,13 @@ def test_box_as_a_hull_looks_like_a_box(camera: Camera) -> None:
 
 
 def test_box_goal_as_a_hull_looks_like_a_box_goal() -> None:
-    """Silhouettes of hulls are as translucent, and have the same edges."""
+    """Silhouettes of hulls are as translucent; only boxes have visible edges."""
     empty = trifinger().default_scene()
     box, hull = (empty.with_(goals=(it,)) for it in (goal("box"), goal("hull", box_hull(SIZE))))
 
     assert differing(box, empty) > 500
-    assert differing(box, hull) <= 5
+    assert differing(box, hull) < 0.25 * differing(box, empty)
+    assert abs(differing(hull, empty) - differing(box, empty)) <= 5
 
 
 def test_hull_covers_the_pixels_between_its_corners() -> None:
@@ -146,6 +146,14 @@ def test_hull_covers_the_pixels_between_its_corners() -> None:
     np.testing.assert_allclose(heights.max(axis=1), 0.0, atol=1e-6)
     assert np.ptp(columns) + 1 == pytest.approx(np.ptp(corners[:, 0]), abs=1.5)
     assert np.ptp(rows) + 1 == pytest.approx(np.ptp(corners[:, 1]), abs=1.5)
+
+
+def test_a_hull_in_its_goal_does_not_flicker() -> None:
+    """A block exactly in its goal hides it."""
+    scene = scene_with(TETRAHEDRON)
+    fulfilled = scene.with_(goals=(goal("hull", TETRAHEDRON),))
+
+    assert differing(fulfilled, scene) <= 5
 
 
 def test_camera_inside_a_hull() -> None:
@@ -272,49 +280,9 @@ def test_fingers_cover_the_pixels_whose_rays_pass_them(camera: Camera) -> None:
         points = along @ rotation_matrix(turn).T + position - camera.eye
         squared = (points**2).sum(axis=1) - (rays @ points.T) ** 2
         expected |= (squared < capsule.radius**2).any(axis=1)
-    robot = sum(image.shows(name) for name in hardware.LINK_NAMES).astype(bool)
+    names = (*hardware.LINK_NAMES, *map(tip_name, hardware.FINGERS))
+    robot = np.any([image.shows(name) for name in names], axis=0)
     unlike = (robot != expected.reshape(60, 80)) & ~image.shows("robot")
 
     assert robot.sum() > 200
     assert unlike.sum() <= 5
-
-
-def test_published_links_hang_in_the_frames_of_physics() -> None:
-    """Each reaches along the axis of its capsule, and holds the joint of the next link, or the tip.
-
-    Their license is beside them, and they are small.
-    """
-    origins = (*hardware.JOINT_ORIGINS[1:], hardware.TIP_ORIGIN)  # in the frame of the link
-    capsules = [hardware.COLLISION[name] for name in ("upper", "middle", "lower")]
-    for mesh, end, capsule in zip(link_meshes(), origins, capsules, strict=True):
-        for point in (np.zeros(3), np.array(end), np.array(capsule.start), np.array(capsule.end)):
-            assert (mesh.low - 0.01 <= point).all(), point
-            assert (point <= mesh.high + 0.01).all(), point
-        sides = mesh.vertices[mesh.faces]
-        inside = np.einsum("ij,ij->i", sides[:, 0], np.cross(sides[:, 1], sides[:, 2])).sum() / 6.0
-        assert 1e-5 < inside < 5e-4  # [m³] faces are seen from outside
-    folder = Path(drawing.__file__).parent / "meshes"
-    assert "BSD 3-Clause License" in (folder / "LICENSE").read_text()
-    assert sum(path.stat().st_size for path in folder.iterdir()) < 1_000_000
-
-
-def test_pictures_for_people_show_the_published_links_and_else_the_same() -> None:
-    """They cover about what the capsules cover, in the same colors and with the same owners."""
-    scene = scene_with()
-    whole, shown = (render(scene, SMALL, published=published) for published in (False, True))
-    np.testing.assert_array_equal(picture(scene, SMALL), shown.rgb)
-    assert not np.array_equal(whole.rgb, shown.rgb)
-    links = [index for index, name in enumerate(shown.names) if "_link_" in name]
-    one, other = (np.isin(found.segmentation, links) for found in (whole, shown))
-    assert (one & other).sum() > 0.6 * (one | other).sum()
-    np.testing.assert_array_equal(whole.rgb[~(one | other)], shown.rgb[~(one | other)])
-    for link in hardware.LINK_NAMES:
-        if not link.endswith("_0"):
-            assert shown.shows(link).any()
-    meshes = [
-        shape
-        for shape in drawing.DRAWING.shapes(scene)
-        if any(shape.mesh is mesh for mesh in link_meshes())
-    ]
-    names = [shown.names[shape.body] for shape in meshes]
-    assert names == [link for link in hardware.LINK_NAMES if not link.endswith("_0")]

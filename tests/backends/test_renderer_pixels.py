@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,10 +69,11 @@ def scene() -> Scene:
 
 def parked(scene: Scene, *, obstacles: bool = True) -> Scene:
     """Leave the goals and the obstacles, and a robot at the lower limits of its joints."""
-    state = trifinger().empty_state()
+    state: Any = trifinger().empty_state()
     state.joint_positions[:] = JOINT_LOW
-    kept = scene.structure.obstacles if obstacles else ()
-    return scene.with_(state=state, structure=trifinger(obstacles=kept))
+    structure = trifinger(obstacles=scene.structure.obstacles if obstacles else ())
+    kept = {key: scene.parameters[key] for key in structure.default_scene().parameters}
+    return scene.with_(state=state, structure=structure, parameters=kept)
 
 
 def now(scene: Scene) -> np.ndarray:

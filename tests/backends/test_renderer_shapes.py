@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,16 +11,12 @@ import pytest
 from scm_world._types import Floats
 from scm_world.backends.renderer.kernels import Canvas
 from scm_world.backends.renderer.picture import following, framing
-from scm_world.backends.renderer.shapes import (
-    SKY,
-    draw_shapes,
-    goal_shapes,
-)
+from scm_world.backends.renderer.shapes import SKY, draw_parts, goal_shapes, parted
 from scm_world.geometry import rotation_matrix
 from scm_world.geometry.hulls import box_hull
 from scm_world.models.camera import Camera
 from scm_world.models.scene import GoalRegion, Light
-from scm_world.models.shapes import Kind, Mesh, Shape, Tiles, corners, mesh_of
+from scm_world.models.shapes import Kind, Mesh, Shape, Shapes, Tiles, mesh_of
 
 LIGHT = Light()
 CAMERA = Camera("test", (0.7, -1.1, 0.9), (0.0, 0.0, 0.0), width=160, height=120)
@@ -41,6 +38,19 @@ def shape(
 ) -> Shape:
     """Make body 0."""
     return Shape(kind, np.array(halves), np.array(at), rotation, color, 0, moves, mesh, tiles)
+
+
+def draw_shapes(
+    shapes: Sequence[Shape], camera: Camera, light: Light, *, shadows: bool = True
+) -> Canvas:
+    """Draw a list of shapes."""
+    return draw_parts(parted(Shapes.of(shapes), shadows=shadows), camera, light)
+
+
+def corners(one: Shape) -> Floats:
+    """Compute the corners of the box around a shape."""
+    found: Floats = Shapes.of([one]).corners(np.array([0]))[0]
+    return found
 
 
 FLOOR = shape("plane", (0.0, 0.0, 0.0), rotation=np.eye(3), color=GREEN)
@@ -92,7 +102,7 @@ def test_a_solid_looks_like_its_triangles(kind: Kind) -> None:
     assert np.quantile(off, 0.97) <= 3
 
 
-@pytest.mark.parametrize("kind", ["box", "cylinder", "capsule", "sphere", "mesh"])
+@pytest.mark.parametrize("kind", ["box", "cylinder", "capsule", "ellipsoid", "mesh"])
 def test_the_inside_is_seen_from_within(kind: Kind) -> None:
     """A camera in a solid sees it everywhere, at the distance of its far side."""
     mesh = box_mesh((2.0, 2.0, 2.0)) if kind == "mesh" else None
@@ -162,7 +172,7 @@ def test_a_clear_shape_is_blended_once(kind: Kind) -> None:
 
 def test_a_clear_shape_does_not_hide_what_is_before_it() -> None:
     """A solid in front of a clear mesh keeps its color."""
-    front = shape("sphere", (0.1, 0.1, 0.1), (0.35, -0.55, 0.45))
+    front = shape("ellipsoid", (0.1, 0.1, 0.1), (0.35, -0.55, 0.45))
     mesh = box_mesh((0.3, 0.3, 0.3))
     glass = shape("mesh", (0.3, 0.3, 0.3), mesh=mesh, color=np.array([0.0, 0.0, 1.0, 0.5]))
     alone, both = (draw_shapes(shapes, CAMERA, LIGHT) for shapes in ([front], [glass, front]))
@@ -280,7 +290,7 @@ def test_framing_shows_all_that_moves_and_fills_the_picture() -> None:
     ]
     wall = shape("box", (20.0, 0.1, 20.0), (0.0, 30.0, 0.0))
     size = 90, 200
-    camera = framing([FLOOR, wall, *moving], size)
+    camera = framing(Shapes.of([FLOOR, wall, *moving]), size)
     points = camera.project(np.concatenate([corners(one) for one in moving]))
     share = points[:, :2] / (200, 90)
 
@@ -293,19 +303,20 @@ def test_framing_shows_all_that_moves_and_fills_the_picture() -> None:
 def test_framing_of_what_stands_still() -> None:
     """Where nothing moves, everything but planes is seen."""
     table = shape("box", (0.5, 0.5, 0.1), (1.0, 1.0, 0.5))
-    assert framing([FLOOR, table], (60, 80)).target == pytest.approx((1.0, 1.0, 0.5))
+    assert framing(Shapes.of([FLOOR, table]), (60, 80)).target == pytest.approx((1.0, 1.0, 0.5))
 
 
 def test_following_keeps_a_body_near_the_middle() -> None:
     """A camera stays while a body moves a little, and then goes along with it."""
-    body = shape("sphere", (0.1, 0.1, 0.1), moves=True)
-    camera = framing([FLOOR, body], (60, 80))
-    assert following(camera, [body._replace(position=np.array([0.02, 0.0, 0.0]))]) is camera
+    body = shape("ellipsoid", (0.1, 0.1, 0.1), moves=True)
+    camera = framing(Shapes.of([FLOOR, body]), (60, 80))
+    near = Shapes.of([body._replace(position=np.array([0.02, 0.0, 0.0]))])
+    assert following(camera, near) is camera
 
     offset = np.subtract(camera.eye, camera.target)
     for x in np.linspace(0.0, 10.0, 50):
         there = body._replace(position=np.array([x, 0.0, np.sin(x)]))
-        camera = following(camera, [FLOOR, there])
+        camera = following(camera, Shapes.of([FLOOR, there]))
         pixels = camera.project(corners(there))[:, :2]
         assert (pixels > 0.0).all()
         assert (pixels < (80.0, 60.0)).all()
@@ -318,7 +329,7 @@ def test_goals_are_silhouettes() -> None:
     for kind, hull in (("box", None), ("sphere", None), ("hull", box_hull([0.3, 0.3, 0.3]))):
         goal = GoalRegion("goal", kind, np.full(3, 0.3), np.zeros(3), upright, RED[:3], hull)
         with_, without = (
-            draw_shapes(shapes, CAMERA, LIGHT) for shapes in (goal_shapes([goal]), [])
+            draw_shapes(shapes, CAMERA, LIGHT) for shapes in (goal_shapes([goal]).listed(), [])
         )
         assert (with_.rgb != without.rgb).any(axis=0).sum() > 400
         np.testing.assert_array_equal(with_.depth, without.depth)

@@ -36,7 +36,7 @@ def agents(tmp_path: Path) -> dict[str, Any]:
     second = trained(
         tmp_path / "b.safetensors", 56 + CONTEXT, task="picking", env=OTHER, inputs=INPUTS
     )
-    return {"one": str(first.parent), "two": str(second), "grasp": "grasp", "still": "still"}
+    return {"one": str(first.parent), "two": str(second), "feedback": "feedback", "still": "still"}
 
 
 def test_agents_of_several_forms_meet_the_same_draws(agents: dict[str, Any]) -> None:
@@ -45,13 +45,13 @@ def test_agents_of_several_forms_meet_the_same_draws(agents: dict[str, Any]) -> 
     assert found.task == "picking"
     drawn = [column for name, column in found.columns.items() if name.startswith("drawn ")]
     assert drawn
-    for name in ("two", "grasp", "still"):
+    for name in ("two", "feedback", "still"):
         for protocol in ("P0", "P6"):
             mine, its = (found.only(agent=a, protocol=protocol).columns for a in ("one", name))
             for column in mine:
                 if column.startswith("drawn "):
                     np.testing.assert_array_equal(mine[column], its[column])
-    assert found.difference("one", "grasp", "P6").n == 3
+    assert found.difference("one", "feedback", "P6").n == 3
     assert len(set(found.columns["hash"].tolist())) > 8
 
 
@@ -71,7 +71,7 @@ def test_results_say_how_each_agent_acted(agents: dict[str, Any], tmp_path: Path
     assert said == {
         "one": RELATIVE,
         "two": {**RELATIVE, "context": "privileged"},
-        "grasp": None,
+        "feedback": None,
         "still": None,
     }
     assert found.about["env"] == SHORT

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib
-import multiprocessing
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +16,6 @@ import numpy as np
 import pytest
 
 from scm_world.backends import read_model
-from scm_world.backends.mujoco.opengl import opengl
 from scm_world.backends.renderer import (
     Convention,
     automatic_camera,
@@ -32,7 +29,7 @@ from scm_world.backends.renderer import (
     scene_camera,
 )
 from scm_world.backends.step import StepModel
-from scm_world.errors import EngineError, ModelError, UnknownOption
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.models import GoalRegion, Model, Scene
 from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
@@ -122,7 +119,7 @@ def colored(scene: Scene, element: str, attribute: str, value: object) -> Scene:
 
 def software(scene: Scene, camera: Camera | str | None = None) -> np.ndarray:
     """Draw with the software renderer."""
-    return picture(scene, camera, SIZE, "software")
+    return picture(scene, camera, SIZE)
 
 
 def test_every_body_is_seen(scene: Scene) -> None:
@@ -242,10 +239,10 @@ def test_the_size_of_a_picture(scene: Scene) -> None:
     """It is what is asked for, or that of the camera, or 480 by 640."""
     camera = automatic_camera(scene, size=(30, 50))
 
-    assert picture(scene, camera, renderer="software").shape == (30, 50, 3)
-    assert picture(scene, camera, SIZE, "software").shape == (*SIZE, 3)
-    assert picture(scene, renderer="software").shape == (480, 640, 3)
-    assert picture(scene, camera, renderer="software", samples=2).shape == (30, 50, 3)
+    assert picture(scene, camera).shape == (30, 50, 3)
+    assert picture(scene, camera, SIZE).shape == (*SIZE, 3)
+    assert picture(scene).shape == (480, 640, 3)
+    assert picture(scene, camera, samples=2).shape == (30, 50, 3)
     with pytest.raises(ValueError, match="samples"):
         picture(scene, camera, samples=0)
 
@@ -264,22 +261,13 @@ def test_one_camera_for_two_scenes(scene: Scene) -> None:
     assert following_camera(camera, scene).eye != camera.eye
 
 
-def test_the_trifinger_looks_as_published() -> None:
-    """Its pictures are those of ``render``, from the overview, and its renderer is ours."""
+def test_pictures_of_the_trifinger_are_those_of_render() -> None:
+    """They are taken from the overview."""
     scene = trifinger(blocks=("tool_block",)).default_scene()
 
-    whole = render(scene, OVERVIEW, published=True).rgb
-    np.testing.assert_array_equal(picture(scene), whole)
-    fine = render(scene, CAMERAS[0], samples=2, published=True).rgb
+    np.testing.assert_array_equal(picture(scene), render(scene, OVERVIEW).rgb)
+    fine = render(scene, CAMERAS[0], samples=2).rgb
     np.testing.assert_array_equal(picture(scene, "60", (128, 128), samples=2), fine)
-    with pytest.raises(UnknownOption, match=r"renderer.*software"):
-        picture(scene, renderer="mujoco")
-
-
-def test_unknown_renderer(scene: Scene) -> None:
-    """Only two renderers exist."""
-    with pytest.raises(UnknownOption, match="software, mujoco"):
-        picture(scene, renderer="hologram")
 
 
 def test_what_has_no_shapes_has_no_picture() -> None:
@@ -287,42 +275,6 @@ def test_what_has_no_shapes_has_no_picture() -> None:
     equations = StepModel("still", lambda *given: {}, 0.1, (), ())
     with pytest.raises(ModelError, match="StepModel says nothing about shapes"):
         picture(Scene(structure=equations, parameters={}, state=None))
-
-
-def test_without_opengl_pictures_are_ours(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where MuJoCo cannot draw, it is an error to insist, and ours takes its place otherwise."""
-    monkeypatch.setenv("MUJOCO_GL", "disabled")
-
-    np.testing.assert_array_equal(picture(scene, size=SIZE), software(scene))
-    with pytest.raises(EngineError, match="renderer='software'"):
-        picture(scene, size=SIZE, renderer="mujoco")
-
-
-def test_a_driver_that_ends_its_process_is_survived(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Libraries are tried in another process, and one that crashes is not used."""
-    module = importlib.import_module("scm_world.backends.mujoco.opengl")
-    monkeypatch.setattr(module, "_TRIAL", "import os; os.abort()")
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    module._works.cache_clear()
-
-    assert opengl() is None
-    module._works.cache_clear()
-
-
-def test_both_renderers_agree(scene: Scene) -> None:
-    """MuJoCo's own renderer shows the same bodies in the same places."""
-    if opengl() is None:
-        pytest.skip("neither EGL nor OSMesa works here")
-    for camera in ("automatic", "front", "flat"):
-        theirs = picture(scene, camera, (120, 160), "mujoco").astype(int)
-        ours = picture(scene, camera, (120, 160), "software").astype(int)
-        red = [
-            (one[:, :, 0] > 60) & (one[:, :, 0] > 3 * one[:, :, 1:].max(axis=2))
-            for one in (theirs, ours)
-        ]
-
-        assert red[0].sum() > 20
-        assert (red[0] ^ red[1]).sum() < 0.2 * red[0].sum()
 
 
 def test_threads_draw_for_themselves(scene: Scene) -> None:
@@ -344,7 +296,7 @@ def test_pictures_are_equal_in_other_processes(scene: Scene, tmp_path: Path) -> 
         "from scm_world.backends import read_model\n"
         "from scm_world.backends.renderer import picture\n"
         "scene = read_model(sys.argv[1]).default_scene()\n"
-        "rgb = picture(scene, None, (60, 80), 'software')\n"
+        "rgb = picture(scene, None, (60, 80))\n"
         "print(hashlib.sha256(rgb.tobytes()).hexdigest())"
     )
     there = subprocess.run(  # noqa: S603 # our own interpreter, our own code
@@ -420,9 +372,9 @@ def test_a_robot_of_meshes_is_drawn_quickly() -> None:
     model = read_model(inside("robosuite", "models", "assets", "robots", "panda", "robot.xml"))
     scene = model.default_scene()
     camera = automatic_camera(scene, size=(240, 320))
-    picture(scene, camera, renderer="software")  # compiles
+    picture(scene, camera)  # compiles
     start = perf_counter()
-    rgb = picture(scene, camera, renderer="software").astype(int)
+    rgb = picture(scene, camera).astype(int)
     seconds = perf_counter() - start
     robot = render(scene, camera).segmentation > 0
 
@@ -450,7 +402,7 @@ def test_a_window_shows_a_model(scene: Scene, monkeypatch: pytest.MonkeyPatch) -
     """The window shows states, colors and goals; a change of colors keeps it open."""
     import mujoco.viewer
 
-    from scm_world.backends.mujoco.opengl import Viewer
+    from scm_world.backends.mujoco.viewer import Viewer
 
     windows: list[SimpleNamespace] = []
 
@@ -493,35 +445,3 @@ def test_what_bends_is_seen() -> None:
 
         assert red.sum() > 50
         assert red[1:-1, 1:-1].sum() == red.sum()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not fork")
-def test_a_forked_process_can_draw(scene: Scene) -> None:
-    """After a picture by MuJoCo, a forked process draws, and does not hang."""
-    if opengl() is None:
-        pytest.skip("neither EGL nor OSMesa works here")
-    picture(scene, size=SIZE, renderer="mujoco")
-    with multiprocessing.get_context("fork").Pool(1) as pool:
-        theirs = pool.apply_async(picture, (scene, "front", SIZE)).get(timeout=60.0)
-
-    np.testing.assert_array_equal(theirs, software(scene, "front"))
-
-
-_DRAW_AND_LEARN = """
-from scm_world import ModelTask, World
-from scm_world.backends.renderer import picture
-
-ball = '<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
-with World(ModelTask(ball)) as world:
-    world.reset(seed=0)
-    picture(world.scene(), size=(8, 8), renderer="mujoco")
-import triton._C.libtriton  # as torch does when an optimizer is made
-"""
-
-
-def test_what_has_drawn_can_learn() -> None:
-    """An optimizer of torch is made after a picture; the LLVM of both was the end of a process."""
-    if opengl() is None:
-        pytest.skip("neither EGL nor OSMesa works here")
-    pytest.importorskip("triton")
-    subprocess.run([sys.executable, "-c", _DRAW_AND_LEARN], check=True)  # noqa: S603 # our own code

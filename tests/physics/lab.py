@@ -38,11 +38,12 @@ class Lab:
         velocities: ArrayLike = 0.0,
         joints: ArrayLike = hardware.REST,
         height: float = 1.5,
+        torques: bool = False,
     ) -> None:
         """Build a scene with blocks ``tool_block``, ``block_1``, … at positions (n, 3) [m]."""
         positions = np.atleast_2d(positions)
         names = ("tool_block", *(f"block_{i}" for i in range(1, len(positions))))
-        scene = trifinger(names, preset=self.preset).default_scene()
+        scene = trifinger(names, preset=self.preset, torques=torques).default_scene()
         changed = {key: np.asarray(value, dtype=float) for key, value in parameters.items()}
         changed["robot", "height"] = np.asarray(height)
         scene.state.positions[:] = positions

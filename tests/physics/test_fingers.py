@@ -84,7 +84,7 @@ def test_torques_and_weight_accelerate_the_fingers(lab, seed: int) -> None:
     }
     parameters["world", "gravity"] = gravity
     parameters["controller", "safety_damping"] = np.zeros(3)  # it brakes within the step
-    lab.place([1.0, 0.0, 0.5], parameters, joints=joints)
+    lab.place([1.0, 0.0, 0.5], parameters, joints=joints, torques=True)
     torques = random.uniform(-0.2, 0.2, 9)
     lab.backend.step(torques, 1)
     found = lab.backend.state().joint_velocities / lab.preset.timestep

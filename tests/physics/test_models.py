@@ -80,7 +80,7 @@ def check_motion(world: World, text: str) -> None:
         data.joint(joint).qvel[:] = values[f"{joint}.velocity"]
     data.ctrl[:] = random.uniform(-1.0, 1.0, model.nu)
     world.step(data.ctrl)
-    for _ in range(world.pace[1]):
+    for _ in range(world.substeps):
         mujoco.mj_step(model, data)
     found = [float(world[f"{joint}.velocity"]) for joint in joints]
     most = np.abs(data.qvel).max()

@@ -103,7 +103,7 @@ def test_policies_have_the_size_of_the_action(world: World) -> None:
     assert world.rollout([0.5, 0.2], steps=2).actions.tolist() == [[0.5, 0.2]] * 2
     with pytest.raises(ActionError, match=r"shape \(2,\) or \(steps, 2\), got \(1, 1\)"):
         world.rollout([0.5], steps=2)
-    for name in ("grasp", "sweep"):
+    for name in ("feedback", "sweep"):
         with pytest.raises(ActionError, match=r"one of \['random', 'mpc'\]"):
             world.rollout(name, steps=2)
 

@@ -200,7 +200,7 @@ def test_samples_are_the_same_together_and_alone(monkeypatch: pytest.MonkeyPatch
 def test_a_policy_that_looks_at_the_world_is_not_known() -> None:
     """Its actions cannot be told beforehand; nor can all variables be written down together."""
     world = World("pushing", backend="fake")
-    policies = ["random", None, "across", np.zeros(9), "grasp", lambda _: np.zeros(9)]
+    policies = ["random", None, "across", np.zeros(9), "feedback", lambda _: np.zeros(9)]
     known = [is_known(units_of(world, [{}], policy=policy)[0]) for policy in policies]
     assert known == [True, True, True, True, False, False]
     assert not is_known(units_of(world, [{}], names=("*",))[0])

@@ -128,7 +128,7 @@ def test_a_sweep_needs_positions(policy: str) -> None:
 
 def test_names_of_policies_are_told() -> None:
     """An unknown one is refused with those there are."""
-    assert set(NAMED) == {"random", "sweep", "across", "grasp", "hold", "feedback", "mpc"}
+    assert set(NAMED) == {"random", "sweep", "across", "feedback", "mpc"}
     with pytest.raises(ActionError, match="'random', 'mpc', 'sweep', 'across'"):
         as_policy("dance")
 

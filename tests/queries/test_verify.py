@@ -270,7 +270,7 @@ class _Wearing(BackendWrapper):
 
     name: ClassVar[str] = "wearing"
 
-    def step(self, mode: Any, command: Any, substeps: int) -> None:
+    def step(self, command: Any, substeps: int) -> None:
         super().step(command, substeps)
         self.apply(Difference(parameters={FLOOR: 0.99 * self.parameters([FLOOR])[FLOOR]}))
 

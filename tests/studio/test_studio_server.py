@@ -158,7 +158,7 @@ def test_the_first_messages_describe_the_world(server: Server) -> None:
         hello, scene = page.news["hello"], page.news["scene"]
         names = [variable["name"] for variable in hello["variables"]]
         assert "cube.mass" in names
-        assert {shape["kind"] for shape in scene["shapes"]} == {"plane", "mesh", "box", "sphere"}
+        assert {shape["kind"] for shape in scene["shapes"]} == {"plane", "mesh", "box", "ellipsoid"}
         head = struct.unpack("<6I", page.frames[-1][:24])
         assert head[:2] == (1, 0)
         assert head[4] == len(scene["shapes"])

@@ -31,7 +31,7 @@ def test_what_is_missing_is_said() -> None:
 def test_a_scripted_policy_pushes_the_cube() -> None:
     """The fingertips follow, and the cube is seen where it was pushed."""
     with World("pushing", backend="trifinger_platform") as world:
-        episode = world.rollout("hold", seed=0, steps=230)
+        episode = world.rollout("feedback", seed=0, steps=230)
         assert float(episode["fractional_success"][-1]) > 0.9
         world.reset(seed=0)
         for _ in range(5):

@@ -68,7 +68,7 @@ class _Interrupted:
     def __init__(self, engine: Any) -> None:
         self._engine = engine
 
-    def step(self, which: Any, mode: Any, commands: Any, substeps: int, into: Any) -> None:
+    def step(self, which: Any, commands: Any, substeps: int, into: Any) -> None:
         """Step, and do not come to reading."""
         self._engine.step(which, commands, substeps, into.copy())
         raise KeyboardInterrupt

@@ -43,7 +43,7 @@ class Payload:
         numbers: ``mjSTATE_INTEGRATION``.
         memory: What the realization keeps.
         touches: The contacts of the last physics step.
-        again: What takes that step again if they are not known: see ``Realization``.
+        replay: What takes that step again if they are not known: see ``Realization``.
     """
 
     structure: Structure
@@ -51,7 +51,7 @@ class Payload:
     numbers: Floats
     memory: Any
     touches: Touches | None
-    again: tuple[tuple[Floats, int] | None, Floats | None] = (None, None)
+    replay: tuple[Floats, int] | None = None
 
 
 def realize(structure: Any, parameters: Parameters) -> Realization:
@@ -110,8 +110,7 @@ class MujocoBackend(Backend):
         """
         self._return()
         now, structure = self._now, difference.structure
-        again = now.began is not None or now.replay is not None
-        if again and (difference.parameters or structure is not None):
+        if now.replay is not None and (difference.parameters or structure is not None):
             self._last_touches()  # later, this would be another step
         if structure is None:
             now.edit(difference.parameters)
@@ -166,8 +165,6 @@ class MujocoBackend(Backend):
         now = self._now
         now.command[:] = command
         now.forget()
-        if now.staged and substeps == 1:
-            now.began = now.numbers()
         self._touches = None
         try:
             mujoco.mj_step(now.model, now.data, substeps)
@@ -181,8 +178,7 @@ class MujocoBackend(Backend):
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step.
 
-        MuJoCo keeps those of the last stage of a Runge-Kutta step. After a call of ``step`` with
-        one physics step, pairs that touched in an earlier stage alone are listed, too.
+        Of a Runge-Kutta step MuJoCo keeps those of the last stage alone: ``Model.staged`` says so.
         """
         return self._last_touches().contacts()
 
@@ -191,9 +187,9 @@ class MujocoBackend(Backend):
         self._return()
         now = self._now
         touches = self._touches if now.replay is not None else self._last_touches()
-        again = (now.replay, now.began) if touches is None else (None, None)
+        replay = now.replay if touches is None else None
         state = now.numbers(), now.memory()
-        return self.sealed(Payload(now.structure, dict(now.kept), *state, touches, again))
+        return self.sealed(Payload(now.structure, dict(now.kept), *state, touches, replay))
 
     def restore(self, snapshot: EngineSnapshot) -> None:
         """Go back to a snapshot.
@@ -207,7 +203,7 @@ class MujocoBackend(Backend):
             now = self._realized(payload.structure, payload.parameters)
             now.applied = payload.parameters
         now.recall(payload.numbers, payload.memory)
-        now.replay, now.began = payload.again
+        now.replay = payload.replay
         self._now, self.slot, self._touches = now, None, payload.touches
 
     @classmethod

@@ -53,7 +53,6 @@ class BatchSlot:
             scene.replay = group.before[index].copy(), int(group.taken[index])
         elif not scene.lean:
             group.batch.get_data(index, scene.data)
-        scene.began = group.began[index]
 
 
 @final
@@ -79,8 +78,6 @@ class _Simulations:
         self.usual = scene.fingerprint(), copy.copy(scene.model)
         self.models: list[mujoco.MjModel] = [self.usual[1]] * n
         self.read = scene.rows(self.batch)
-        self.began: list[Floats | None] = [None] * n  # see ``Realization``
-        self._staged = scene.staged
         self._width = len(scene.command)
         self._commands = self.batch.bind("ctrl")
 
@@ -91,8 +88,6 @@ class _Simulations:
         self._commands[rows, :width] = commands[rows, :width]
         if self.before.size:
             self.before[rows], self.taken[rows] = self.batch.state[rows], substeps
-        for index in which.tolist() if self._staged else ():
-            self.began[index] = self.batch.state[index].copy() if substeps == 1 else None
         self.batch.step(ids=None if everyone else which, nstep=substeps)
 
 

@@ -1,7 +1,7 @@
 """What MuJoCo shows of a model, as shapes that any renderer can draw.
 
-They come from MuJoCo's abstract scene, which needs no OpenGL: groups, colors and decorations are
-the ones that MuJoCo shows by default.
+Geoms come from the arrays of the model, all else from MuJoCo's abstract scene, without OpenGL.
+Groups, colors and decorations are the ones that MuJoCo shows by default.
 """
 
 from __future__ import annotations
@@ -9,67 +9,132 @@ from __future__ import annotations
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from functools import cached_property
 from typing import Any, final
-from weakref import WeakKeyDictionary
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.backends.mujoco.backend import MujocoBackend
+from scm_world.backends.mujoco.backend import realize
 from scm_world.backends.mujoco.reading import body_names
-from scm_world.geometry import rotation_matrix
 from scm_world.models.camera import Camera
-from scm_world.models.scene import GoalRegion, Scene
-from scm_world.models.shapes import Kind, Mesh, Shape, Tiles, mesh_of
+from scm_world.models.scene import Parameters, Scene
+from scm_world.models.shapes import (
+    BOX,
+    CAPSULE,
+    CYLINDER,
+    ELLIPSOID,
+    KINDS,
+    MESH,
+    PLANE,
+    Mesh,
+    Shape,
+    Shapes,
+    Table,
+    Tiles,
+    mesh_of,
+)
 
-MOST_SHAPES = 10_000
+MOST_SHAPES = 10_000  # of the abstract scene
 MOST_STAGES = 4  # models that are kept compiled, in each thread
-SHOWN_GROUPS, HIDDEN_GROUP = 3, 5  # Source: MuJoCo, mjv_defaultOption
-GOAL_OPACITY = 0.3  # Source: CausalWorld 1.2, silhouettes
+SHOWN_GROUPS = 3  # Source: MuJoCo, mjv_defaultOption
+UNCOLORED = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
+"""The color of what has none of its own, so that its material decides. Source: MuJoCo, XML."""
+SHARP = 0.75  # the cosine between the normals of a corner and of its triangle that shows an edge
 FAR = 100.0  # times the height of the picture of an orthographic camera: it is drawn from there
 
 _GEOM, _OBJECT, _ROLE = mujoco.mjtGeom, mujoco.mjtObj, mujoco.mjtTextureRole
-_KINDS: dict[int, Kind] = {
-    int(_GEOM.mjGEOM_PLANE): "plane",
-    int(_GEOM.mjGEOM_SPHERE): "sphere",
-    int(_GEOM.mjGEOM_CAPSULE): "capsule",
-    int(_GEOM.mjGEOM_ELLIPSOID): "ellipsoid",
-    int(_GEOM.mjGEOM_CYLINDER): "cylinder",
-    int(_GEOM.mjGEOM_BOX): "box",
+_KINDS: dict[int, tuple[int, tuple[int, int, int]]] = {
+    int(_GEOM.mjGEOM_PLANE): (PLANE, (0, 1, 2)),
+    int(_GEOM.mjGEOM_SPHERE): (ELLIPSOID, (0, 0, 0)),
+    int(_GEOM.mjGEOM_CAPSULE): (CAPSULE, (0, 0, 1)),
+    int(_GEOM.mjGEOM_ELLIPSOID): (ELLIPSOID, (0, 1, 2)),
+    int(_GEOM.mjGEOM_CYLINDER): (CYLINDER, (0, 0, 1)),
+    int(_GEOM.mjGEOM_BOX): (BOX, (0, 1, 2)),
+    int(_GEOM.mjGEOM_MESH): (MESH, (0, 1, 2)),
+    int(_GEOM.mjGEOM_SDF): (MESH, (0, 1, 2)),
+    int(_GEOM.mjGEOM_HFIELD): (MESH, (0, 1, 2)),
 }
+"""How we draw a type of MuJoCo's, and which of its three sizes are half its edges."""
 
 
 @final
 class VisibleModel:
-    """What can be seen of a compiled model.
+    """What can be seen of a model.
 
     Where a model says of a body how it looks besides how it collides, in groups of geoms that are
-    both shown, only how it looks is: the geoms that collide are moved to a group that is hidden.
+    both shown, only how it looks is.
 
     Args:
-        model: Its colors, sizes and poses may change afterwards; its meshes and textures may not.
+        structure: What MuJoCo can realise.
+        parameters: All of them.
 
     Attributes:
-        model: What was given.
         names: Of the bodies, by number.
     """
 
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self.model = model
+    def __init__(self, structure: Any, parameters: Parameters) -> None:
+        self._now = now = realize(structure, parameters)
+        self._given: tuple[Any, bytes] = ((), b"")  # the parameters that were written last
+        self.model, self.data = now.model, now.data
+        model = now.model
         self.names = body_names(model)
-        collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-        shown = model.geom_group < SHOWN_GROUPS
-        for body in range(1, model.nbody):
-            mine = shown & (model.geom_bodyid == body)
-            looks, touches = (set(model.geom_group[mine & kind]) for kind in (~collides, collides))
-            if looks - touches:
-                model.geom_group[mine & collides] = HIDDEN_GROUP
-        self._scene = mujoco.MjvScene(model, MOST_SHAPES)
-        self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
-        self._meshes: dict[tuple[int, int], Mesh] = {}
+        mocap = model.body_mocapid[model.body_rootid] >= 0
+        self._moves: NDArray[np.bool_] = (model.body_weldid != 0) | mocap
+        self._rows = rows = np.flatnonzero(np.isin(model.geom_type, list(_KINDS)) & _looks(model))
+        known = [_KINDS[code] for code in model.geom_type[rows].tolist()]
+        self._kinds = np.array([kind for kind, _ in known], dtype=np.int64)
+        columns = [columns for _, columns in known]
+        self._columns = np.array(columns, dtype=np.int64).reshape(-1, 3)
+        self._materials = model.geom_matid[rows]
+        self._bodies = model.geom_bodyid[rows].astype(np.int64)
+        self._meshes = _meshes(model, rows.tolist())
         self._textures = [_texture(model, i) for i in range(model.nmat)]
+        sites = (model.site_group < SHOWN_GROUPS).any()
+        self._more = bool(sites or model.ntendon or model.nflex or model.nskin)
+
+    def place(self, scene: Scene) -> None:
+        """Write parameters and state of a scene of the same structure."""
+        now, parameters = self._now, scene.parameters
+        given = tuple(parameters), b"".join(value.tobytes() for value in parameters.values())
+        if given != self._given:
+            now.edit(parameters)
+            self._given = given
+        now.place(scene.state.vector)
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def shapes(self) -> Shapes:
+        """Copy what is shown: geoms, sites, tendons, height fields, flexes and skins."""
+        model, data, rows, kinds = self.model, self.data, self._rows, self._kinds
+        halves = model.geom_size[rows[:, None], self._columns]
+        halves[kinds == CAPSULE, 2] += halves[kinds == CAPSULE, 0]
+        colors, tiles = model.geom_rgba[rows], dict[int, Tiles]()
+        if self._textures:
+            plain = (colors == UNCOLORED).all(axis=1) & (self._materials >= 0)
+            colors[plain] = model.mat_rgba[self._materials[plain]]
+        colors = colors.astype(np.float64)
+        for row, material in enumerate(self._materials.tolist() if self._textures else ()):
+            texture = self._textures[material] if material >= 0 else None
+            if texture is not None and kinds[row] == PLANE:
+                tiles[row] = self._tiles(material, halves[row], colors[row, :3] * texture[1])
+                colors[row, :3] *= texture[0]
+            elif texture is not None:
+                colors[row, :3] *= texture.mean(axis=0)
+        places = data.geom_xpos[rows], data.geom_xmat[rows].reshape(-1, 3, 3)
+        table = Table(kinds, halves, *places, colors, self._bodies)
+        found = Shapes(table, self._moves[self._bodies], self._meshes, tiles)
+        return found.joined(Shapes.of(list(self._others()))) if self._more else found
+
+    def _tiles(self, material: int, halves: Floats, color: Floats) -> Tiles:
+        """Measure the tiles on a plane: a texture holds two by two."""
+        repeat = np.maximum(self.model.mat_texrepeat[material], 1e-6)
+        whole = np.ones(2) if self.model.mat_texuniform[material] else halves[:2]
+        first, second = (np.where(whole > 0.0, whole, 1.0) / repeat).tolist()
+        red, green, blue = color.tolist()
+        return Tiles((first, second), (red, green, blue))
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -77,94 +142,71 @@ class VisibleModel:
         names = (self.model.camera(i).name for i in range(self.model.ncam))
         return tuple(name for name in names if name)
 
-    def scene(self, data: mujoco.MjData) -> mujoco.MjvScene:
-        """Fill the abstract scene with what stands in the coordinates; nothing moves by that."""
-        model = self.model
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_camlight(model, data)
-        mujoco.mj_flex(model, data)
-        mujoco.mj_tendon(model, data)
-        everything = int(mujoco.mjtCatBit.mjCAT_ALL)
-        mujoco.mjv_updateScene(
-            model, data, self._option, None, self._camera, everything, self._scene
-        )
-        return self._scene
-
-    def shapes(self, data: mujoco.MjData) -> list[Shape]:
-        """List what is shown: geoms, sites, tendons, height fields, flexes and skins."""
-        scene = self.scene(data)
-        found: list[Shape | None] = []
-        for geom in scene.geoms[: scene.ngeom]:
-            if geom.type == _GEOM.mjGEOM_FLEX and scene.flexfaceused[geom.objid] == 0:
-                found += self._edges(scene, geom)
-            else:
-                found.append(self._shape(scene, geom))
-        return [shape for shape in found if shape is not None]
-
-    def camera(self, data: mujoco.MjData, name: str, size: tuple[int, int]) -> Camera:
-        """Give one of the model's own cameras, where it stands now.
+    def camera(self, name: str, size: tuple[int, int]) -> Camera:
+        """Return one of the model's own cameras, where it stands now.
 
         Args:
-            data: Coordinates.
             name: One of ``cameras``.
             size: Height and width of its picture [pixels].
         """
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = self.model.camera(name).id
-        left, right = self.scene(data).camera
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        eye = (np.array(left.pos, dtype=np.float64) + right.pos) / 2.0
-        forward = np.array(left.forward, dtype=np.float64)
-        half = (float(left.frustum_top) - float(left.frustum_bottom)) / 2.0
-        near = distance = float(left.frustum_near)
-        if left.orthographic:
-            distance = FAR * 2.0 * half
-            eye, near = eye - distance * forward, distance + near
+        model, data, i = self.model, self.data, self.model.camera(name).id
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_camlight(model, data)
+        _, up, back = data.cam_xmat[i].reshape(3, 3).T
+        eye, extent = data.cam_xpos[i], float(model.stat.extent)
+        near, far = (extent * float(ratio) for ratio in (model.vis.map.znear, model.vis.map.zfar))
+        opening = float(model.cam_fovy[i])  # [deg], or the height of an orthographic picture [m]
+        if model.cam_projection[i] == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
+            distance = FAR * opening
+            eye, near, far = eye + distance * back, near + distance, far + distance
+            opening = math.degrees(2.0 * math.atan(0.5 / FAR))
+        target, places = (eye - back).tolist(), (eye.tolist(), up.tolist())
         return Camera(
-            name,
-            tuple(eye.tolist()),
-            tuple((eye + forward).tolist()),
-            tuple(np.array(left.up, dtype=np.float64).tolist()),
-            math.degrees(2.0 * math.atan(half / distance)),
-            size[1],
-            size[0],
-            near,
-            near + float(left.frustum_far),
-        )
+            name, tuple(places[0]), tuple(target), tuple(places[1]), opening, size[1], size[0],
+            near, far,
+        )  # fmt: skip
 
-    def _shape(self, scene: mujoco.MjvScene, geom: mujoco.MjvGeom) -> Shape | None:
-        """Translate one element of the scene; None if we do not draw its kind."""
-        kind = _KINDS.get(geom.type, "mesh")
-        halves, mesh, tiles = np.array(geom.size, dtype=np.float64), None, None
-        position = np.array(geom.pos, dtype=np.float64)
-        rotation = np.array(geom.mat, dtype=np.float64)
-        if kind == "capsule":
-            halves[2] += halves[0]
-        elif kind == "mesh":
-            mesh = self._mesh(scene, geom)
-            if mesh is None:
-                return None
-            if geom.type in (_GEOM.mjGEOM_FLEX, _GEOM.mjGEOM_SKIN):  # they stand in the world
-                position, rotation = np.zeros(3), np.eye(3)
-        color = np.array(geom.rgba, dtype=np.float64)
-        texture = self._textures[geom.matid] if geom.matid >= 0 else None
-        if texture is not None and kind == "plane":
-            # A texture holds two by two tiles.
-            repeat = np.maximum(self.model.mat_texrepeat[geom.matid], 1e-6)
-            whole = np.array(geom.size[:2], dtype=np.float64)
-            if self.model.mat_texuniform[geom.matid]:
-                whole[:] = 1.0
-            first, second = (np.where(whole > 0.0, whole, 1.0) / repeat).tolist()
-            tiles = Tiles((first, second), tuple((color[:3] * texture[1]).tolist()))
-            color[:3] *= texture[0]
-        elif texture is not None:
-            color[:3] *= texture.mean(axis=0)
-        body, moves = self._body(geom)
-        return Shape(kind, halves, position, rotation, color, body, moves, mesh, tiles)
+    @cached_property
+    def _abstract(self) -> tuple[mujoco.MjvScene, mujoco.MjvOption]:
+        """The abstract scene, and what it shows: no geoms."""
+        option = mujoco.MjvOption()
+        option.geomgroup[:] = 0
+        return mujoco.MjvScene(self.model, MOST_SHAPES), option
 
-    def _edges(self, scene: mujoco.MjvScene, geom: mujoco.MjvGeom) -> Iterator[Shape]:
-        """Give a flex without faces, a cable, as a capsule for each edge."""
+    def _others(self) -> Iterator[Shape]:
+        """List sites, tendons, flexes and skins."""
+        model, data, (scene, option) = self.model, self.data, self._abstract
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_flex(model, data)
+        mujoco.mj_tendon(model, data)
+        everything, camera = int(mujoco.mjtCatBit.mjCAT_ALL), mujoco.MjvCamera()
+        mujoco.mjv_updateScene(model, data, option, None, camera, everything, scene)
+        for geom in scene.geoms[: scene.ngeom]:
+            halves, position, rotation, color = (
+                np.array(numbers, dtype=np.float64)
+                for numbers in (geom.size, geom.pos, geom.mat, geom.rgba)
+            )
+            texture = self._textures[geom.matid] if geom.matid >= 0 else None
+            if texture is not None:
+                color[:3] *= texture.mean(axis=0)
+            body, moves = -1, True
+            if geom.objtype == _OBJECT.mjOBJ_SITE:
+                body = int(model.site_bodyid[geom.objid])
+                moves = bool(self._moves[body])
+            if geom.type == _GEOM.mjGEOM_FLEX and scene.flexfaceused[geom.objid] == 0:
+                yield from self._edges(scene, geom, color)
+            elif geom.type in (_GEOM.mjGEOM_FLEX, _GEOM.mjGEOM_SKIN):  # they stand in the world
+                mesh, place = self._surface(scene, geom), (np.zeros(3), np.eye(3))
+                yield Shape("mesh", halves, *place, color, moves=True, mesh=mesh)
+            elif geom.type in _KINDS:
+                kind = _KINDS[geom.type][0]
+                halves[2] += halves[0] if kind == CAPSULE else 0.0
+                yield Shape(KINDS[kind], halves, position, rotation, color, body, moves)
+
+    def _edges(
+        self, scene: mujoco.MjvScene, geom: mujoco.MjvGeom, color: Floats
+    ) -> Iterator[Shape]:
+        """List the edges of a flex without faces, a cable, as capsules."""
         flex, radius = geom.objid, float(self.model.flex_radius[geom.objid])
         first, n = scene.flexvertadr[flex], scene.flexvertnum[flex]
         begin, m = scene.flexedgeadr[flex], scene.flexedgenum[flex]
@@ -175,104 +217,88 @@ class VisibleModel:
             mujoco.mju_quatZ2Vec(turn, end - start)
             mujoco.mju_quat2Mat(rotation, turn)
             halves = np.array([radius, radius, radius + length / 2.0])
-            color = np.array(geom.rgba, dtype=np.float64)
             middle = (start + end) / 2.0
             yield Shape("capsule", halves, middle, rotation.reshape(3, 3), color, moves=True)
 
-    def _body(self, geom: mujoco.MjvGeom) -> tuple[int, bool]:
-        """Find the body that something belongs to, and whether it moves."""
-        model = self.model
-        if geom.objtype == _OBJECT.mjOBJ_GEOM:
-            body = int(model.geom_bodyid[geom.objid])
-        elif geom.objtype == _OBJECT.mjOBJ_SITE:
-            body = int(model.site_bodyid[geom.objid])
-        else:
-            return -1, True
-        welded = int(model.body_weldid[body])
-        return body, welded != 0 or int(model.body_mocapid[model.body_rootid[body]]) >= 0
-
-    def _mesh(self, scene: mujoco.MjvScene, geom: mujoco.MjvGeom) -> Mesh | None:
-        """Find the triangles of an element of the scene; None if it has none."""
+    def _surface(self, scene: mujoco.MjvScene, geom: mujoco.MjvGeom) -> Mesh:
+        """Copy the triangles of a flex or of a skin, in the world."""
         if geom.type == _GEOM.mjGEOM_FLEX:
             first, n = 9 * scene.flexfaceadr[geom.objid], 9 * scene.flexfaceused[geom.objid]
             faces = np.arange(n // 3).reshape(-1, 3)
             vertices = scene.flexface[first : first + n].reshape(-1, 3)
             normals = scene.flexnormal[first : first + n].reshape(-1, 3)
-            return mesh_of(vertices, faces, normals[faces]) if n else None
-        if geom.type == _GEOM.mjGEOM_SKIN:
-            first, n = scene.skinvertadr[geom.objid], scene.skinvertnum[geom.objid]
-            begin, m = self.model.skin_faceadr[geom.objid], self.model.skin_facenum[geom.objid]
-            faces = self.model.skin_face[begin : begin + m]
-            vertices = scene.skinvert[3 * first : 3 * (first + n)].reshape(-1, 3)
-            normals = scene.skinnormal[3 * first : 3 * (first + n)].reshape(-1, 3)
             return mesh_of(vertices, faces, normals[faces])
-        if geom.type not in (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_SDF, _GEOM.mjGEOM_HFIELD):
-            return None
-        key = geom.type, geom.dataid
-        if key not in self._meshes:
-            field = geom.type == _GEOM.mjGEOM_HFIELD
-            self._meshes[key] = (
-                _height_field(self.model, geom.dataid)
-                if field
-                else _triangles(self.model, geom.dataid // 2)
-            )
-        return self._meshes[key]
+        first, n = scene.skinvertadr[geom.objid], scene.skinvertnum[geom.objid]
+        begin, m = self.model.skin_faceadr[geom.objid], self.model.skin_facenum[geom.objid]
+        faces = self.model.skin_face[begin : begin + m]
+        vertices = scene.skinvert[3 * first : 3 * (first + n)].reshape(-1, 3)
+        normals = scene.skinnormal[3 * first : 3 * (first + n)].reshape(-1, 3)
+        return mesh_of(vertices, faces, normals[faces])
 
 
 _local = threading.local()
 """What each thread has drawn last."""
 
 
-def drawn(scene: Scene) -> tuple[VisibleModel, mujoco.MjData]:
-    """Put the scene of a ``Model`` into MuJoCo; where it was built before, that costs little.
+def visible(scene: Scene) -> VisibleModel:
+    """Put a scene into MuJoCo; where its structure was seen before, that costs little.
 
     Args:
-        scene: Whose structure is a ``Model`` that was read by MuJoCo.
+        scene: Of any backend.
 
     Returns:
-        What is drawn, and the coordinates. They are valid until the next call in this thread.
+        What is seen, until the next call in this thread.
+
+    Raises:
+        ModelError: MuJoCo cannot realise the structure, so that there are no pictures of it.
     """
-    stages: OrderedDict[Any, MujocoBackend] = _local.__dict__.setdefault("stages", OrderedDict())
-    shown: WeakKeyDictionary[Any, VisibleModel]
-    shown = _local.__dict__.setdefault("shown", WeakKeyDictionary())
-    backend = stages.pop(scene.structure, None) or MujocoBackend()
-    stages[scene.structure] = backend
+    stages: OrderedDict[Any, VisibleModel]
+    stages = _local.__dict__.setdefault("stages", OrderedDict())
+    shown = stages.pop(scene.structure, None) or VisibleModel(scene.structure, scene.parameters)
+    stages[scene.structure] = shown
     if len(stages) > MOST_STAGES:
         stages.popitem(last=False)
-    backend.build(scene)
-    now = backend.realization
-    if now not in shown:
-        shown[now] = VisibleModel(now.model)
-    return shown[now], now.data
+    shown.place(scene)
+    return shown
 
 
-def draw_goals(scene: mujoco.MjvScene, goals: Iterable[GoalRegion]) -> None:
-    """Add goals to an abstract scene as silhouettes; of a hull, the box around it."""
-    for goal in goals:
-        if scene.ngeom >= scene.maxgeom:
-            return
-        mujoco.mjv_initGeom(
-            scene.geoms[scene.ngeom],
-            _GEOM.mjGEOM_SPHERE if goal.shape == "sphere" else _GEOM.mjGEOM_BOX,
-            np.asarray(goal.size, dtype=np.float64) / 2.0,
-            np.asarray(goal.position, dtype=np.float64),
-            rotation_matrix(goal.orientation).ravel(),
-            np.array([*goal.color, GOAL_OPACITY], dtype=np.float32),
-        )
-        scene.ngeom += 1
+def _looks(model: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Tell which geoms are shown, shape (ngeom,)."""
+    shown: NDArray[np.bool_] = model.geom_group < SHOWN_GROUPS
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    for body in range(1, model.nbody):
+        mine = shown & (model.geom_bodyid == body)
+        looks, touches = (set(model.geom_group[mine & kind]) for kind in (~collides, collides))
+        if looks - touches:
+            shown = shown & ~(mine & collides)
+    return shown
+
+
+def _meshes(model: mujoco.MjModel, geoms: list[int]) -> dict[int, Mesh]:
+    """Copy the triangles of meshes and height fields among geoms, by place in the list."""
+    found: dict[int, Mesh] = {}
+    known: dict[tuple[int, int], Mesh] = {}
+    for row, geom in enumerate(geoms):
+        kind, number = int(model.geom_type[geom]), int(model.geom_dataid[geom])
+        if _KINDS[kind][0] != MESH:
+            continue
+        if (kind, number) not in known:
+            read = _height_field if kind == _GEOM.mjGEOM_HFIELD else _triangles
+            known[kind, number] = read(model, number)
+        found[row] = known[kind, number]
+    return found
 
 
 def _triangles(model: mujoco.MjModel, mesh: int) -> Mesh:
-    """Copy a mesh of a model."""
+    """Copy a mesh of a model; edges that the smooth normals of MuJoCo would hide are seen."""
     first, n = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     begin, m = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
     at, k = model.mesh_normaladr[mesh], model.mesh_normalnum[mesh]
-    corners = model.mesh_facenormal[begin : begin + m]
-    return mesh_of(
-        model.mesh_vert[first : first + n],
-        model.mesh_face[begin : begin + m],
-        model.mesh_normal[at : at + k][corners],
-    )
+    faces = model.mesh_face[begin : begin + m]
+    flat = mesh_of(model.mesh_vert[first : first + n], faces)
+    smooth = model.mesh_normal[at : at + k][model.mesh_facenormal[begin : begin + m]]
+    cosines = (flat.normals * smooth).sum(axis=2, keepdims=True)
+    return flat._replace(normals=np.where(cosines < SHARP, flat.normals, smooth))
 
 
 def _height_field(model: mujoco.MjModel, field: int) -> Mesh:

@@ -165,7 +165,7 @@ def read_model(
     )
     with understood(where):
         mj, changed = realized(sealed)
-    _check(mj, sealed, where)
+    _check(mj, where)
     start = _start(mj, keyframe)
     trees = Couplings(mj)
     names = element_names(mj)
@@ -211,6 +211,7 @@ def read_model(
             if field.name not in chosen
         ),
         notes=(*replaced, *changed, *drift, *_notes(mj, keyframe)),
+        staged=_is_staged(mj),
         describe=described,
     )
 
@@ -228,7 +229,7 @@ def described(model: Model) -> ModelBodies:
     return describe(compiled(model))
 
 
-def _check(mj: mujoco.MjModel, source: Source, where: str) -> None:
+def _check(mj: mujoco.MjModel, where: str) -> None:
     """Refuse what has effects that no graph could declare.
 
     Raises:
@@ -238,14 +239,6 @@ def _check(mj: mujoco.MjModel, source: Source, where: str) -> None:
     if mj.nv == 0:
         hint = "add a joint, or a freejoint; for a URDF, fixed_base=False lets its root link move"
         problems.append(f"{where} has no joint, so that nothing in it can move; {hint}")
-    if mj.nplugin:
-        shown = ""
-        if source.text:
-            spec = mujoco.MjSpec.from_string(source.text, assets=dict(source.assets))
-            shown = f" ({', '.join(sorted({p.plugin_name for p in spec.plugins}))})"
-        problems.append(
-            f"{where} uses {mj.nplugin} plugin(s){shown}: what they act on is unknown; remove them"
-        )
     labels = element_names(mj)["actuator"]
     for i in range(mj.nactuator):
         kinds = mj.actuator_dyntype[i], mj.actuator_gaintype[i], mj.actuator_biastype[i]
@@ -356,6 +349,11 @@ def _notes(mj: mujoco.MjModel, keyframe: str | int | None) -> Iterator[str]:
     """Say what acts without having a variable, and what is not used."""
     if mj.nflex:
         yield f"{mj.nflex} flex(es) act through their vertices; their material has no variables."
+    if _is_staged(mj):
+        yield (
+            "RK4 looks for contacts in four stages of a physics step; those of the last one are "
+            "listed, and an edge by contact may act in an earlier one."
+        )
     if mj.nskin:
         yield f"{mj.nskin} skin(s) act on pictures only."
     if mj.nkey and keyframe is None:
@@ -363,6 +361,12 @@ def _notes(mj: mujoco.MjModel, keyframe: str | int | None) -> Iterator[str]:
             f"{mj.nkey} keyframe(s) are not used: episodes begin in the pose of the file; "
             "keyframe='name' begins with one."
         )
+
+
+def _is_staged(mj: mujoco.MjModel) -> bool:
+    """Return whether bodies may touch in several stages of a physics step."""
+    touch = mj.nflex > 0 or bool(Couplings(mj).touches.any())
+    return touch and int(mj.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
 
 
 # --- parameters --------------------------------------------------------------------------------

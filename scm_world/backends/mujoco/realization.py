@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.backends.mujoco import fields, reading
-from scm_world.backends.mujoco.contacts import Touches, earlier_stages, has_stages, touches
+from scm_world.backends.mujoco.contacts import Touches, touches
 from scm_world.backends.mujoco.slots import Slot
 from scm_world.backends.mujoco.states import (
     LastStep,
@@ -125,8 +125,6 @@ class Realization:
         applied: The parameters of a snapshot, while they are those in force.
         command: Where it is written, shape (n_commands,).
         edited: Whether the model has changed since someone last cleared this.
-        staged: Whether a physics step has stages, each with contacts of its own.
-        began: ``mjSTATE_INTEGRATION`` before the last step, if it had stages and was taken alone.
         lean: Whether ``mjSTATE_INTEGRATION`` is all that a scene has to keep.
         replay: ``mjSTATE_INTEGRATION`` before the last steps and how many these were, if they were
             taken elsewhere, so that their contacts are not in the data.
@@ -147,8 +145,6 @@ class Realization:
         self.applied: Parameters | None = None
         self._numbers: bytes | None = None  # of what is kept, if nothing was written since
         self.edited = True
-        self.staged = has_stages(model)
-        self.began: Floats | None = None
         self.replay: tuple[Floats, int] | None = None
         self.command = data.ctrl[: structure.n_commands]
         self._positions, self._velocities, self._activations = data.qpos, data.qvel, data.act
@@ -228,13 +224,13 @@ class Realization:
         places, turns = data.mocap_pos.copy(), data.mocap_quat.copy()
         mujoco.mj_resetData(self.model, data)
         data.mocap_pos[:], data.mocap_quat[:] = places, turns
-        self.began = self.replay = self._written = None
+        self.replay = self._written = None
         self._last = (), np.empty((0, 7)), np.empty((0, 7))
         self._counts[:] = 1
 
     def forget(self) -> None:
         """Forget what was before a step that is made now."""
-        self.began = self.replay = self._last = self._written = None
+        self.replay = self._last = self._written = None
 
     def problem(self) -> str:
         """Say what is wrong with what a step left, or nothing."""
@@ -256,15 +252,10 @@ class Realization:
         self._counts[:] = 1
 
     def touches(self) -> Touches:
-        """Copy the contacts of the last physics step, with those of earlier stages where known."""
-        if self.replay is None:
-            found = touches(self.model, self.data, self._owners)
-        else:
-            found = self._replayed(*self.replay)
-        if self.began is not None:
-            for earlier in earlier_stages(self.model, self.began, self._owners):
-                found = found.extended(earlier)
-        return found
+        """Copy the contacts of the last physics step; of Runge-Kutta, those of its last stage."""
+        if self.replay is not None:
+            return self._replayed(*self.replay)
+        return touches(self.model, self.data, self._owners)
 
     def _replayed(self, numbers: Floats, steps: int) -> Touches:
         """Take steps again on other data, and copy the contacts of the last one."""
@@ -293,14 +284,14 @@ class Realization:
         """Restore what was kept."""
         mujoco.mj_setState(self.model, self.data, numbers, STATE)
         self._counts[:] = 1
-        self.began = self.replay = None
+        self.replay = None
         if memory is not None:
             self._forces[:], self._last, self._written = memory
 
     def follow(self, before: Realization) -> None:
         """Continue after the last step of another realization; then the state is written."""
         self.data.time = before.data.time
-        if self._turned.names:
+        if not (self.lean and before.lean):
             self._last = before._remembered()
         there = before.structure.layout.slices
         for row in (row for row in self.structure.states if row.reported and row.name in there):

@@ -1,21 +1,21 @@
-"""Model files, read into something self-contained that can be compiled anywhere."""
+"""Model files, read and compiled into bytes that need no files."""
 
 from __future__ import annotations
 
 import codecs
+import copy
 import hashlib
 import os
 import re
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, final
 from xml.etree import ElementTree
-from xml.sax.saxutils import escape
 
 import mujoco
 import numpy as np
@@ -23,7 +23,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.output.reading import read_bytes, regular
+from scm_world.output.reading import read_bytes
 
 _CHOICES = {
     "integrator": mujoco.mjtIntegrator,
@@ -36,45 +36,37 @@ _NUMBERS = ("timestep", "iterations", "tolerance", "ls_iterations", "noslip_iter
 
 
 @final
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Source:
-    """What is compiled. It needs no files, and can be pickled.
+    """A compiled model with the options that were asked for. It needs no files.
 
     Attributes:
-        text: MJCF; empty if the model came compiled.
-        assets: Contents of the files it names.
-        binary: A compiled model (MJB); empty if there is a text. Only the same version of MuJoCo
-            reads it.
-        options: Options that were asked for instead of those of the file.
-        digest: Hash of all of that.
+        binary: What ``mj_saveModel`` writes (MJB).
+        version: Of the MuJoCo that wrote it; no other one reads it.
     """
 
-    text: str
-    assets: Mapping[str, bytes] = field(repr=False)
-    binary: bytes = field(repr=False, default=b"")
-    options: tuple[tuple[str, float], ...] = ()
-    digest: str = ""
+    binary: bytes = field(repr=False)
+    version: str
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Source) and self.digest == other.digest
-
-    def __hash__(self) -> int:
-        return hash(self.digest)
+    @cached_property
+    def digest(self) -> str:
+        """Hash of the model."""
+        return hashlib.sha256(self.binary).hexdigest()
 
     def compile(self) -> mujoco.MjModel:
-        """Compile it, with the options that were asked for.
+        """Return the model, in arrays of its own.
 
         Raises:
-            ModelError: MuJoCo refuses it.
+            ModelError: Another version of MuJoCo compiled it.
         """
-        with understood("the model"):
-            if self.binary:
-                mj = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": self.binary})
-            else:
-                mj = mujoco.MjSpec.from_string(self.text, assets=dict(self.assets)).compile()
-        for name, value in self.options:
-            setattr(mj.opt, name, type(getattr(mj.opt, name))(value))
-        return mj
+        if self.version != mujoco.__version__:
+            raise ModelError(
+                [
+                    f"the model was compiled by MuJoCo {self.version}, and MuJoCo "
+                    f"{mujoco.__version__} does not read it; read its file again"
+                ]
+            )
+        return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": self.binary})
 
 
 @lru_cache(maxsize=32)
@@ -118,7 +110,7 @@ def realized(source: Source) -> tuple[mujoco.MjModel, tuple[str, ...]]:
 def read_source(
     source: Any, *, fixed_base: bool, options: Mapping[str, Any]
 ) -> tuple[Source, str, str, tuple[str, ...]]:
-    """Read a model.
+    """Read and compile a model.
 
     Args:
         source: A path, XML text, an ``MjSpec`` or an ``MjModel``.
@@ -130,27 +122,74 @@ def read_source(
 
     Raises:
         UnreadableFile: A file cannot be read.
-        ModelError: It is no such thing, or MuJoCo refuses it.
+        ModelError: It is no such thing, MuJoCo refuses it, or it has plugins.
         UnknownOption: An option is not one.
     """
-    chosen = _options(options)
+    chosen, notes, plugins = _options(options), tuple[str, ...](), ""
     if isinstance(source, mujoco.MjModel):
-        binary = np.empty(mujoco.mj_sizeModel(source), np.uint8)
-        mujoco.mj_saveModel(source, None, binary)
-        name = source.names.split(b"\0", 1)[0].decode()
-        name = "" if name == _UNNAMED else name
-        return _sealed("", {}, binary.tobytes(), chosen), name, "the MjModel", ()
+        where, stem, mj = "the MjModel", "", copy.copy(source)
+    else:
+        spec, where, stem, urdf = _specified(source)
+        if urdf:
+            _complete(spec, where, fixed_base=fixed_base)
+        with understood(where):
+            mj = spec.compile()
+        notes = tuple(_replaced_inertia(spec, mj))
+        plugins = f" ({', '.join(sorted({plugin.plugin_name for plugin in spec.plugins}))})"
+    if mj.nplugin:
+        what = f"{where} uses {mj.nplugin} plugin(s){plugins}"
+        raise ModelError([f"{what}: what they act on is unknown; remove them"])
+    for option, value in chosen:
+        setattr(mj.opt, option, type(getattr(mj.opt, option))(value))
+    binary = np.empty(mujoco.mj_sizeModel(mj), np.uint8)
+    mujoco.mj_saveModel(mj, None, binary)
+    name = mj.names.split(b"\0", 1)[0].decode()
+    name = stem if name in ("", _UNNAMED) else name
+    return Source(binary.tobytes(), mujoco.__version__), name, where, notes
+
+
+def _options(given: Mapping[str, Any]) -> tuple[tuple[str, float], ...]:
+    """Read options: numbers, or the words of MJCF.
+
+    Raises:
+        UnknownOption: There is no such option, or no such word.
+    """
+    found = []
+    for name, value in sorted(given.items()):
+        if name in _CHOICES:
+            words = {
+                member.partition("_")[2].lower(): float(int(kind))
+                for member, kind in _CHOICES[name].__members__.items()
+            }
+            if str(value).lower() not in words:
+                raise UnknownOption(name, value, words)
+            found.append((name, words[str(value).lower()]))
+        elif name in _NUMBERS:
+            found.append((name, float(value)))
+        else:
+            raise UnknownOption("setting", name, (*_CHOICES, *_NUMBERS))
+    return tuple(found)
+
+
+def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
+    """Parse what is given.
+
+    Returns:
+        The specification, how to call it, the stem of its file, and whether it is a URDF.
+
+    Raises:
+        UnreadableFile: There is no such file, or it is no text.
+        ModelError: It is neither MJCF nor URDF, or MuJoCo does not understand it.
+    """
+    path = None
     if isinstance(source, mujoco.MjSpec):
-        where, folder, stem = "the MjSpec", Path(source.modelfiledir), ""
-        spec, urdf = source.copy(), False
-    elif isinstance(source, str) and source.lstrip().startswith("<"):
-        where, folder, stem = "the XML text", Path(), ""
-        spec, urdf = _parsed(source, where), _root_tag(source) == "robot"
+        return source.copy(), "the MjSpec", "", False
+    if isinstance(source, str) and source.lstrip().startswith("<"):
+        where, text, plain = "the XML text", source, True
     elif isinstance(source, str | os.PathLike):
         path = Path(source)
-        where, folder, stem = str(path), path.parent, path.stem
-        text = _contents(path)
-        spec, urdf = _parsed(text, where, path), _root_tag(text) == "robot"
+        data = _contents(path)
+        where, text, plain = str(path), _decoded(data), _is_utf8(data)
     else:
         raise ModelError(
             [
@@ -158,26 +197,30 @@ def read_source(
                 "a mujoco.MjSpec or a mujoco.MjModel"
             ]
         )
-    name = stem if spec.modelname in ("", _UNNAMED) else spec.modelname
-    for body in spec.worldbody.bodies if urdf and not fixed_base else ():
-        if not body.joints:  # MuJoCo fixes the root link of a URDF to the world
-            body.add_freejoint()
-    whole = spec.copy()
-    try:
-        files = _located(spec, folder, where)
-    except ModelError:
-        attached = _compiled_whole(whole)  # parts of other files keep their own folders
-        if urdf or attached is None:
-            raise
-        return read_source(attached, fixed_base=fixed_base, options=options)[0], name, where, ()
-    if urdf:
-        _repair(spec, where)
-        _add_motors(spec)
-    notes = tuple(_replaced_inertia(spec, where))
-    return _sealed(*_written(spec, files, where), b"", chosen), name, where, notes
+    tag = _root_tag(text)
+    if tag not in ("mujoco", "robot"):
+        raise ModelError(
+            [
+                f"{where} begins with <{tag}>: give MJCF, which begins with <mujoco>, or URDF, "
+                "which begins with <robot>"
+            ]
+        )
+    if tag == "robot":
+        _check_names(text, where)
+    with understood(where):
+        if path is None:
+            return mujoco.MjSpec.from_string(text), where, "", tag == "robot"
+        parts = _included(text, path.parent)
+        if path.suffix in (".xml", ".urdf") and plain and all(map(_is_utf8, parts.values())):
+            spec = mujoco.MjSpec.from_file(str(path))
+        else:
+            texts = {name: _decoded(part).encode() for name, part in parts.items()}
+            spec = mujoco.MjSpec.from_string(text, include=texts)
+            spec.modelfiledir = str(path.parent)
+    return spec, where, path.stem, tag == "robot"
 
 
-def _contents(path: Path) -> str:
+def _contents(path: Path) -> bytes:
     """Read a model file.
 
     Raises:
@@ -185,12 +228,12 @@ def _contents(path: Path) -> str:
     """
     advice = "give the path of an MJCF (.xml, .mjcf) or URDF (.urdf) file, or XML text"
     try:
-        text = _decoded(read_bytes(path))
+        data = read_bytes(path)
     except OSError as error:
         raise UnreadableFile(str(path), (error.strerror or str(error)).lower(), advice) from error
-    if "\0" in text.rstrip("\0"):
+    if "\0" in _decoded(data).rstrip("\0"):
         raise UnreadableFile(str(path), "it is no text", advice)
-    return text
+    return data
 
 
 def _decoded(data: bytes) -> str:
@@ -214,35 +257,90 @@ def _decoded(data: bytes) -> str:
     return text.replace("\r\n", "\n")
 
 
+def _is_utf8(data: bytes) -> bool:
+    """Return whether a file is in UTF-8, which MuJoCo reads."""
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def _included(text: str, folder: Path) -> dict[str, bytes]:
+    """Read the files that an MJCF text includes, and those that they include."""
+    found: dict[str, bytes] = {}
+    texts = [text]
+    for one in texts:  # which grows
+        for name in re.findall(r"<include\b[^>]*\bfile\s*=\s*[\"']([^\"']+)", one):
+            if name not in found and (folder / name).exists():
+                found[name] = _contents(folder / name)
+                texts.append(_decoded(found[name]))
+    return found
+
+
 def _root_tag(text: str) -> str:
-    """Give the outermost tag of an XML text; ``""`` if there is none."""
+    """Return the outermost tag of an XML text; ``""`` if there is none."""
     plain = re.sub(r"<!--.*?-->|<\?.*?\?>|<!DOCTYPE[^>]*>", "", text, flags=re.DOTALL)
     found = re.search(r"<\s*([\w:.-]+)", plain)
     return found[1] if found else ""
 
 
-def _parsed(text: str, where: str, path: Path | None = None) -> mujoco.MjSpec:
-    """Parse MJCF or URDF.
+@contextmanager
+def understood(where: str) -> Iterator[None]:
+    """Turn MuJoCo's complaints about a model into one error, and keep its warnings.
 
     Raises:
-        ModelError: It is neither, or MuJoCo does not understand it.
+        ModelError: With what MuJoCo said.
     """
-    tag = _root_tag(text)
-    if tag not in ("mujoco", "robot"):
-        raise ModelError(
-            [
-                f"{where} begins with <{tag}>: give MJCF, which begins with <mujoco>, or URDF, "
-                "which begins with <robot>"
-            ]
-        )
-    if tag == "robot":
-        _check_names(text, where)
-    with understood(where):
-        included = _included(text, Path() if path is None else path.parent)
-        if path is not None and path.suffix in (".xml", ".urdf") and _is_plain(path, included):
-            return mujoco.MjSpec.from_file(str(path))
-        texts = {name: _decoded(data).encode() for name, data in included.items()}
-        return mujoco.MjSpec.from_string(text, include={} if path is None else texts)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except (ValueError, mujoco.FatalError) as error:
+        if isinstance(error, ModelError):
+            raise
+        said = " ".join(str(error).split())
+        lost = "opening file" in said or "decoder" in said
+        remedy = "put the file there, or correct the path to it" if lost else "correct the model"
+        raise ModelError([f"MuJoCo cannot read {where}: {said}; {remedy}"]) from error
+
+
+# --- URDF --------------------------------------------------------------------------------------
+
+
+def _complete(spec: mujoco.MjSpec, where: str, *, fixed_base: bool) -> None:
+    """Add to a URDF what MuJoCo leaves out: a free root, files of packages, motors, repairs.
+
+    Raises:
+        ModelError: MuJoCo does not compile it for another reason than its inertias.
+    """
+    for body in () if fixed_base else spec.worldbody.bodies:
+        if not body.joints:  # MuJoCo fixes the root link to the world
+            body.add_freejoint()
+    for number, mesh in enumerate(spec.meshes):
+        path = _packaged(mesh.file, Path(spec.modelfiledir)) if "://" in mesh.file else None
+        if path is not None:
+            mesh.file = f"{number}/{path.name}"
+            spec.assets = {**spec.assets, mesh.file: path.read_bytes()}
+    for repair in ({"balanceinertia": True}, {"boundmass": 1e-6, "boundinertia": 1e-9}):
+        try:
+            with understood(where):
+                spec.copy().compile()
+            break
+        except ModelError as error:
+            if "inertia" not in str(error):
+                raise
+        for name, value in repair.items():
+            setattr(spec.compiler, name, value)
+    _add_motors(spec)
+
+
+def _packaged(name: str, folder: Path) -> Path | None:
+    """Find a file in a package beside the model, or in a folder above it."""
+    plain = Path(re.sub(r"^\w+://", "", name))
+    above = (folder, *folder.resolve().parents)
+    candidates = (root / part for part in (plain, Path(*plain.parts[1:])) for root in above)
+    return next((path for path in candidates if path.is_file()), None)
 
 
 def _check_names(text: str, where: str) -> None:
@@ -269,157 +367,11 @@ def _check_names(text: str, where: str) -> None:
         raise ModelError(problems)
 
 
-def _is_plain(path: Path, included: Mapping[str, bytes]) -> bool:
-    """Tell whether a file and those that it includes are in UTF-8, which MuJoCo reads."""
-    try:
-        for data in (read_bytes(path), *included.values()):
-            data.decode()
-    except UnicodeDecodeError:
-        return False
-    return True
-
-
-def _included(text: str, folder: Path) -> dict[str, bytes]:
-    """Read the files that an MJCF text includes, and those that they include.
-
-    Raises:
-        UnreadableFile: One cannot be read to its end.
-    """
-    found: dict[str, bytes] = {}
-    texts = [text]
-    for one in texts:  # which grows
-        for name in re.findall(r"<include\b[^>]*\bfile\s*=\s*[\"']([^\"']+)", one):
-            path = folder / name
-            if name not in found and path.exists():
-                found[name] = _part(path, read_bytes)
-                texts.append(_decoded(found[name]))
-    return found
-
-
-def _part(path: Path, read: Callable[[Path], Any]) -> Any:
-    """Read a file that a model names, or look whether it can be read.
-
-    Raises:
-        UnreadableFile: It is a folder, a device or a pipe, or too large.
-    """
-    try:
-        return read(path)
-    except OSError as error:
-        advice = "correct the path that the model names"
-        raise UnreadableFile(str(path), error.strerror or str(error), advice) from None
-
-
-@contextmanager
-def understood(where: str) -> Iterator[None]:
-    """Turn MuJoCo's complaints about a model into one error, and keep its warnings.
-
-    Raises:
-        ModelError: With what MuJoCo said.
-    """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    except (ValueError, mujoco.FatalError) as error:
-        if isinstance(error, ModelError):
-            raise
-        said = " ".join(str(error).split())
-        lost = "opening file" in said or "decoder" in said
-        remedy = "put the file there, or correct the path to it" if lost else "correct the model"
-        raise ModelError([f"MuJoCo cannot read {where}: {said}; {remedy}"]) from error
-
-
-def _compiled_whole(spec: mujoco.MjSpec) -> mujoco.MjModel | None:
-    """Compile as MuJoCo itself finds the files; None where it does not."""
-    try:
-        with understood("it"):
-            return spec.compile()
-    except ModelError:
-        return None
-
-
-# --- files -------------------------------------------------------------------------------------
-
-
-def _located(spec: mujoco.MjSpec, folder: Path, where: str) -> dict[str, str]:
-    """Find the files that a specification names, and let it name them by absolute paths.
-
-    Returns:
-        A short name for each path. Files that a specification was given in memory keep theirs.
-
-    Raises:
-        ModelError: Some are not there.
-    """
-    found: dict[str, str] = {}
-    problems = []
-
-    def locate(name: str, directory: str) -> str:
-        name = os.path.basename(name) if spec.strippath else name
-        inner = os.path.join(directory, name)
-        if not name or name in spec.assets or inner in spec.assets:
-            return inner if inner in spec.assets else name
-        path = _path(name, directory, folder)
-        if path is None:
-            problems.append(
-                f"{where} names the file {name!r}, which is not in {str(folder / directory)!r}; "
-                "put it there, or correct the path"
-            )
-            return name
-        full = str(path.resolve())
-        found.setdefault(full, f"{len(found)}_{path.name}")
-        return full
-
-    for element in (*spec.meshes, *spec.hfields, *spec.skins):
-        element.file = locate(element.file, spec.meshdir)
-    for texture in spec.textures:
-        texture.file = locate(texture.file, spec.texturedir)
-        for i, name in enumerate(texture.cubefiles):
-            if name:
-                texture.cubefiles[i] = locate(name, spec.texturedir)
-    if problems:
-        raise ModelError(list(dict.fromkeys(problems)))
-    spec.meshdir = spec.texturedir = ""
-    spec.strippath = False
-    return found
-
-
-def _path(name: str, directory: str, folder: Path) -> Path | None:
-    """Find a file; one in a package beside the model, or in a folder above it."""
-    plain = re.sub(r"^(package|model|file)://", "", name)
-    candidates = [folder / directory / plain]
-    if plain != name:
-        above = [folder, *folder.resolve().parents]
-        inside = Path(*Path(plain).parts[1:])
-        candidates += [root / part for part in (plain, inside) for root in above]
-    found = next((path for path in candidates if path.exists() and not path.is_dir()), None)
-    return found if found is None else _part(found, regular)
-
-
-def _repair(spec: mujoco.MjSpec, where: str) -> None:
-    """Let the compiler balance, then bound the inertias of a URDF, as far as it has to.
-
-    Raises:
-        ModelError: MuJoCo does not compile it for another reason.
-    """
-    for repair in ({"balanceinertia": True}, {"boundmass": 1e-6, "boundinertia": 1e-9}):
-        try:
-            with understood(where):
-                spec.copy().compile()
-            return
-        except ModelError as error:
-            if "inertia" not in str(error):
-                raise
-        for name, value in repair.items():
-            setattr(spec.compiler, name, value)
-
-
-def _replaced_inertia(spec: mujoco.MjSpec, where: str) -> Iterator[str]:
-    """Say which masses and moments of inertia of a file its compiler replaces."""
+def _replaced_inertia(spec: mujoco.MjSpec, mj: mujoco.MjModel) -> Iterator[str]:
+    """List which masses and moments of inertia of a file its compiler replaces."""
     compiler = spec.compiler
     if not (compiler.balanceinertia or compiler.boundmass or compiler.boundinertia):
         return
-    with understood(where):
-        mj = spec.copy().compile()
     masses, moments = list[str](), list[str]()
     for body in spec.bodies[1:]:
         number = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_BODY, body.name)
@@ -475,65 +427,3 @@ def _add_motors(spec: mujoco.MjSpec) -> None:
         motor.gainprm[0] = 1.0
         if low < high:
             motor.ctrllimited, motor.ctrlrange = True, (low, high)
-
-
-def _written(
-    spec: mujoco.MjSpec, files: Mapping[str, str], where: str
-) -> tuple[str, dict[str, bytes]]:
-    """Write a specification as MJCF that compiles to the same model, to the last bit.
-
-    Returns:
-        The text, and the contents of the files it names.
-    """
-    if hasattr(spec.compiler, "savecompiled"):
-        spec.compiler.savecompiled = False
-    with understood(where):
-        try:
-            text = str(spec.to_xml())
-        except (ValueError, mujoco.FatalError):  # some have to be compiled before
-            spec.compile()
-            text = str(spec.to_xml())
-    assets = dict(spec.assets)
-    for path, name in files.items():
-        text = text.replace(f'"{escape(path)}"', f'"{name}"')
-        assets[name] = _part(Path(path), read_bytes)
-    return text, assets
-
-
-def _sealed(
-    text: str,
-    assets: Mapping[str, bytes],
-    binary: bytes,
-    options: tuple[tuple[str, float], ...],
-) -> Source:
-    """Hash what is compiled."""
-    digest = hashlib.sha256(text.encode())
-    for name, content in sorted(assets.items()):
-        digest.update(f"\0{name}\0{len(content)}\0".encode())
-        digest.update(content)
-    digest.update(binary)
-    digest.update(repr(options).encode())
-    return Source(text, assets, binary, options, digest.hexdigest())
-
-
-def _options(given: Mapping[str, Any]) -> tuple[tuple[str, float], ...]:
-    """Read options: numbers, or the words of MJCF.
-
-    Raises:
-        UnknownOption: There is no such option, or no such word.
-    """
-    found = []
-    for name, value in sorted(given.items()):
-        if name in _CHOICES:
-            words = {
-                member.partition("_")[2].lower(): float(int(kind))
-                for member, kind in _CHOICES[name].__members__.items()
-            }
-            if str(value).lower() not in words:
-                raise UnknownOption(name, value, words)
-            found.append((name, words[str(value).lower()]))
-        elif name in _NUMBERS:
-            found.append((name, float(value)))
-        else:
-            raise UnknownOption("setting", name, (*_CHOICES, *_NUMBERS))
-    return tuple(found)

@@ -1,17 +1,13 @@
 """A software renderer: the same picture for every engine, without a screen and without OpenGL."""
 
-from scm_world.backends.renderer.bodies import NOTHING
 from scm_world.backends.renderer.picture import (
     ORIGINAL,
     PLAIN,
-    RENDERERS,
     Convention,
-    Drawing,
     RenderedImage,
     automatic_camera,
     body_names,
     depth_and_segmentation,
-    drawing_of,
     following_camera,
     goal_pixels,
     now_pixels,
@@ -20,21 +16,21 @@ from scm_world.backends.renderer.picture import (
     render,
     resized,
     scene_camera,
+    shapes_of,
+    views_of,
     write_png,
 )
+from scm_world.backends.renderer.shapes import NOTHING
 
 __all__ = [
     "NOTHING",
     "ORIGINAL",
     "PLAIN",
-    "RENDERERS",
     "Convention",
-    "Drawing",
     "RenderedImage",
     "automatic_camera",
     "body_names",
     "depth_and_segmentation",
-    "drawing_of",
     "following_camera",
     "goal_pixels",
     "now_pixels",
@@ -43,5 +39,7 @@ __all__ = [
     "render",
     "resized",
     "scene_camera",
+    "shapes_of",
+    "views_of",
     "write_png",
 ]

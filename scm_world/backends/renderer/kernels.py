@@ -14,8 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from scm_world._types import Floats
-from scm_world.backends.renderer.bodies import BOX, CAPSULE, CYLINDER, ELLIPSOID, HULL, Bodies
+from scm_world._types import Floats, Integers
 from scm_world.backends.renderer.rays import (
     Hit,
     Triple,
@@ -23,16 +22,15 @@ from scm_world.backends.renderer.rays import (
     hit_box,
     hit_capsule,
     hit_cylinder,
-    hit_hull,
 )
 from scm_world.models.camera import Camera
+from scm_world.models.shapes import BOX, CAPSULE, CYLINDER, ELLIPSOID, Table
 
 Depths = NDArray[np.float32]
 Owners = NDArray[np.int32]
 Colors = NDArray[np.uint8]
 
 EDGE = 0.06  # how wide the edge of a silhouette is, in halves of its size
-SHARP = 0.9  # the cosine between the normals of two sides below which they meet in an edge
 SHADOW = 0.45 / 0.7  # how much of the light that is not ambient a full shadow takes away
 TIE = 1e-5  # [m] what lies this close to a silhouette is drawn over it
 
@@ -67,19 +65,19 @@ class Canvas(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def _rectangle(
-    bodies: Bodies, n: int, view: View, width: int, height: int
+def rectangle(
+    shapes: Table, n: int, view: View, width: int, height: int
 ) -> tuple[int, int, int, int]:
-    """Bound the pixels a body can cover: first and last column plus one, the same for rows."""
+    """Bound the pixels a shape can cover: first and last column plus one, the same for rows."""
     left, right, top, bottom = math.inf, -math.inf, math.inf, -math.inf
     ahead = 0
     for corner in range(8):
         u, v, w = view.projection[0, 3], view.projection[1, 3], view.projection[2, 3]
         for i in range(3):
-            x = bodies.centers[n, i]
+            x = shapes.positions[n, i]
             for j in range(3):
                 sign = 1.0 if (corner >> j) & 1 else -1.0
-                x += sign * bodies.rotations[n, i, j] * bodies.halves[n, j]
+                x += sign * shapes.rotations[n, i, j] * shapes.halves[n, j]
             u += view.projection[0, i] * x
             v += view.projection[1, i] * x
             w += view.projection[2, i] * x
@@ -134,7 +132,7 @@ def _round_span(rays: Floats, v: int, third: float, left: int, right: int) -> tu
     side makes up for rounding.
 
     Args:
-        rays: In the frame of the body, shape (6, 3).
+        rays: In the frame of the shape, shape (6, 3).
         v: The row.
         third: 1 for a ball, 0 for a cylinder along z.
         left: First column of the rectangle.
@@ -159,11 +157,11 @@ def _round_span(rays: Floats, v: int, third: float, left: int, right: int) -> tu
 
 
 @njit(cache=True, error_model="numpy")
-def _span(shape: int, rays: Floats, v: int, left: int, right: int) -> tuple[int, int]:
-    """Bound the columns of a row that a body can cover, within those of its rectangle."""
-    if shape in (CAPSULE, CYLINDER):
+def _span(kind: int, rays: Floats, v: int, left: int, right: int) -> tuple[int, int]:
+    """Bound the columns of a row that a shape can cover, within those of its rectangle."""
+    if kind in (CAPSULE, CYLINDER):
         return _round_span(rays, v, 0.0, left, right)
-    if shape == ELLIPSOID:
+    if kind == ELLIPSOID:
         return _round_span(rays, v, 1.0, left, right)
     return left, right
 
@@ -197,34 +195,26 @@ def shade_at(shadow: Floats, half: float, x: float, y: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _opacity(shape: int, facets: Floats, point: Triple, n: Triple) -> float:
-    """Give silhouettes of boxes and hulls visible edges: twice as opaque where sides meet.
+def _opacity(kind: int, point: Triple) -> float:
+    """Give silhouettes of boxes visible edges: twice as opaque where sides meet.
 
-    The point is on the cube from -1 to 1, or on a hull; ``n`` is the normal there.
+    The point is on the cube from -1 to 1.
     """
+    if kind != BOX:
+        return 1.0
     x, y, z = point
-    if shape == BOX:
-        edge = 1.0 - EDGE
-        return 1.0 if (abs(x) > edge) + (abs(y) > edge) + (abs(z) > edge) < 2 else 2.0
-    if shape == HULL:
-        for p in range(len(facets)):
-            a, b, c, offset = facets[p, 0], facets[p, 1], facets[p, 2], facets[p, 3]
-            close = a * x + b * y + c * z > (1.0 - EDGE) * offset
-            if close and abs(a * n[0] + b * n[1] + c * n[2]) < SHARP:
-                return 2.0
-    return 1.0
+    edge = 1.0 - EDGE
+    return 1.0 if (abs(x) > edge) + (abs(y) > edge) + (abs(z) > edge) < 2 else 2.0
 
 
 @njit(cache=True, error_model="numpy")
-def _scale(bodies: Bodies, n: int) -> tuple[Floats, float]:
-    """Give the unit of length in the frame of a body, and half the length of what is round."""
-    scale = bodies.halves[n].copy()
-    if bodies.shapes[n] == HULL:
-        scale[:] = 1.0
-    if bodies.shapes[n] not in (CAPSULE, CYLINDER):
+def _scale(shapes: Table, n: int) -> tuple[Floats, float]:
+    """Give the unit of length in the frame of a shape, and half the length of what is round."""
+    scale = shapes.halves[n].copy()
+    if shapes.kinds[n] not in (CAPSULE, CYLINDER):
         return scale, 0.0
     segment = scale[2] / scale[0]
-    if bodies.shapes[n] == CAPSULE:
+    if shapes.kinds[n] == CAPSULE:
         segment -= 1.0
     scale[2] = scale[0]
     return scale, segment
@@ -232,7 +222,7 @@ def _scale(bodies: Bodies, n: int) -> tuple[Floats, float]:
 
 @njit(cache=True, error_model="numpy")
 def turned(rotation: Floats, vector: Floats) -> Triple:
-    """Express a direction of the world in the frame of a body."""
+    """Express a direction of the world in the frame of a shape."""
     x = rotation[0, 0] * vector[0] + rotation[1, 0] * vector[1] + rotation[2, 0] * vector[2]
     y = rotation[0, 1] * vector[0] + rotation[1, 1] * vector[1] + rotation[2, 1] * vector[2]
     z = rotation[0, 2] * vector[0] + rotation[1, 2] * vector[1] + rotation[2, 2] * vector[2]
@@ -240,13 +230,13 @@ def turned(rotation: Floats, vector: Floats) -> Triple:
 
 
 @njit(cache=True, error_model="numpy")
-def _cosine(shape: int, n: Triple, scale: Floats, lamp: Triple) -> float:
-    """Give the cosine between a normal and the light, both in the frame of the body.
+def _cosine(kind: int, n: Triple, scale: Floats, lamp: Triple) -> float:
+    """Give the cosine between a normal and the light, both in the frame of the shape.
 
     The normal of a scaled ball, divided by the scale, is normal to the ellipsoid; those of
     other shapes have unit length as they are.
     """
-    if shape != ELLIPSOID:
+    if kind != ELLIPSOID:
         return n[0] * lamp[0] + n[1] * lamp[1] + n[2] * lamp[2]
     x, y, z = n[0] / scale[0], n[1] / scale[1], n[2] / scale[2]
     product: float = x * lamp[0] + y * lamp[1] + z * lamp[2]
@@ -268,27 +258,24 @@ def _at(first: Triple, step: Triple, u: float) -> Triple:
 
 @njit(cache=True, error_model="numpy")
 def _meet_row(
-    shape: int, measures: tuple[float, float], facets: Floats, rays: Floats,
-    v: int, span: tuple[int, int], hits: Floats,
+    kind: int, measures: tuple[float, float], rays: Floats, v: int, span: tuple[int, int],
+    hits: Floats,
 ) -> None:  # fmt: skip
-    """Write where the rays of a row meet a body, shape (w, 4); one loop per shape is faster."""
+    """Write where the rays of a row meet a shape, shape (w, 4); one loop per kind is faster."""
     near, segment = measures
     o, d, step_o, step_d = _along_row(rays, v)
-    if shape == BOX:
+    if kind == BOX:
         for u in range(span[0], span[1]):
             _write(hits, u, hit_box(_at(o, step_o, u), _at(d, step_d, u), near))
-    elif shape == ELLIPSOID:
+    elif kind == ELLIPSOID:
         for u in range(span[0], span[1]):
             _write(hits, u, hit_ball(_at(o, step_o, u), _at(d, step_d, u), near))
-    elif shape == CAPSULE:
+    elif kind == CAPSULE:
         for u in range(span[0], span[1]):
             _write(hits, u, hit_capsule(_at(o, step_o, u), _at(d, step_d, u), segment, near))
-    elif shape == CYLINDER:
-        for u in range(span[0], span[1]):
-            _write(hits, u, hit_cylinder(_at(o, step_o, u), _at(d, step_d, u), segment, near))
     else:
         for u in range(span[0], span[1]):
-            _write(hits, u, hit_hull(facets, _at(o, step_o, u), _at(d, step_d, u), near))
+            _write(hits, u, hit_cylinder(_at(o, step_o, u), _at(d, step_d, u), segment, near))
 
 
 @njit(cache=True, error_model="numpy")
@@ -312,55 +299,57 @@ def blend(rgb: Colors, v: int, u: int, color: Triple, light: float, paint: float
 
 
 @njit(cache=True, error_model="numpy")
-def _draw_body(
-    bodies: Bodies, n: int, view: View, light: Floats, alpha: float, canvas: Canvas
+def _draw_one(
+    shapes: Table, n: int, view: View, light: Floats, alpha: float, canvas: Canvas
 ) -> None:
-    """Draw one body where it is nearer than what is there; see ``draw``."""
+    """Draw one solid where it is nearer than what is there; see ``draw``."""
     depth, owners, rgb = canvas
-    left, right, top, bottom = _rectangle(bodies, n, view, depth.shape[1], depth.shape[0])
-    shape, (scale, segment) = bodies.shapes[n], _scale(bodies, n)
-    facets = bodies.facets[bodies.first[n] : bodies.first[n + 1]]
-    tint = bodies.colors[n]
+    left, right, top, bottom = rectangle(shapes, n, view, depth.shape[1], depth.shape[0])
+    kind, (scale, segment) = shapes.kinds[n], _scale(shapes, n)
+    tint = shapes.colors[n]
     color = (255.0 * tint[0], 255.0 * tint[1], 255.0 * tint[2])
     solid, behind = alpha == 1.0, 0.0 if alpha == 1.0 else TIE
     colored, owned = rgb.shape[1] > 0, solid and owners.shape[0] > 0
-    lamp = turned(bodies.rotations[n], light)
-    rays = to_frame(bodies.centers[n], bodies.rotations[n], view.rays, scale)
+    lamp = turned(shapes.rotations[n], light)
+    rays = to_frame(shapes.positions[n], shapes.rotations[n], view.rays, scale)
     hits = np.empty((depth.shape[1], 4))
     for v in range(top, bottom):
-        start, stop = _span(shape, rays, v, left, right)
-        _meet_row(shape, (view.near, segment), facets, rays, v, (start, stop), hits)
+        start, stop = _span(kind, rays, v, left, right)
+        _meet_row(kind, (view.near, segment), rays, v, (start, stop), hits)
         for u in range(start, stop):
             t = hits[u, 0]
             if t + behind >= depth[v, u]:
                 continue
             if colored:
                 normal = (hits[u, 1], hits[u, 2], hits[u, 3])
-                cosine = _cosine(shape, normal, scale, lamp)
+                cosine = _cosine(kind, normal, scale, lamp)
                 paint = alpha
                 if not solid:
                     point = _at(ray(rays, 0, u, v), ray(rays, 3, u, v), t)
-                    paint = min(paint * _opacity(shape, facets, point, normal), 1.0)
+                    paint = min(paint * _opacity(kind, point), 1.0)
                 blend(rgb, v, u, color, brightness(cosine, light[3]), paint)
             if solid:
                 depth[v, u] = t
             if owned:
-                owners[v, u] = bodies.owners[n]
+                owners[v, u] = shapes.bodies[n]
 
 
 @njit(cache=True, error_model="numpy")
-def draw(bodies: Bodies, view: View, light: Floats, alpha: float, canvas: Canvas) -> None:
+def draw(
+    shapes: Table, which: Integers, view: View, light: Floats, alpha: float, canvas: Canvas
+) -> None:
     """Draw solids over what is there, where they are nearer.
 
     Args:
-        bodies: What to draw, in this order.
+        shapes: What there is.
+        which: Rows of what to draw, in this order; neither planes nor meshes.
         view: The rays of the pixels.
         light: Unit vector towards the light, and the ambient brightness, shape (4,).
         alpha: Opacity. Below 1 colors are blended, and depth and owners stay as they are.
         canvas: What to draw on.
     """
-    for n in range(len(bodies.shapes)):
-        _draw_body(bodies, n, view, light, alpha, canvas)
+    for n in which:
+        _draw_one(shapes, n, view, light, alpha, canvas)
 
 
 @lru_cache(maxsize=64)

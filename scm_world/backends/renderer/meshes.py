@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -11,7 +11,6 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import Floats, Integers
-from scm_world.backends.renderer.bodies import NOTHING, Bodies
 from scm_world.backends.renderer.kernels import (
     SHADOW,
     Canvas,
@@ -22,65 +21,37 @@ from scm_world.backends.renderer.kernels import (
     draw,
     parallel_view,
     ray,
+    rectangle,
     shade_at,
     to_frame,
     turned,
 )
 from scm_world.backends.renderer.rays import Triple
 from scm_world.models.scene import Light
-
-
-class Triangles(NamedTuple):
-    """A mesh in the world.
-
-    Attributes:
-        vertices: In the frame of the mesh, shape (n, 3) [m].
-        faces: Shape (m, 3).
-        normals: Unit outward normals at the corners, shape (m, 3, 3).
-        position: Origin of the frame of the mesh, shape (3,) [m].
-        rotation: From that frame to the world, shape (3, 3).
-        color: Red, green, blue in [0, 1], shape (3,).
-        owner: What the mesh belongs to.
-    """
-
-    vertices: Floats
-    faces: Integers
-    normals: Floats
-    position: Floats
-    rotation: Floats
-    color: Floats
-    owner: int
+from scm_world.models.shapes import MESH, Mesh, Table
 
 
 class Ground(NamedTuple):
-    """A plane in the world, seen from the side of its third axis.
+    """What lies on a plane.
 
     Attributes:
-        position: Its origin, shape (3,) [m].
-        rotation: From its frame to the world, shape (3, 3).
-        halves: Half its edges, infinite where it does not end, shape (2,) [m].
         tiles: Edges of its tiles, shape (2,) [m].
-        colors: Red, green, blue in [0, 1] of the two kinds of tiles, shape (2, 3).
+        other: Red, green, blue in [0, 1] of every other tile, shape (3,).
         shadow: How dark it is, shape (n, n) in [0, 1]; of shape (0, 0) without shadows.
         square: First and second coordinate of the middle of the shadow, and half the edge of its
             square, shape (3,) [m].
-        owner: What the plane belongs to.
     """
 
-    position: Floats
-    rotation: Floats
-    halves: Floats
     tiles: Floats
-    colors: Floats
+    other: Floats
     shadow: Floats
     square: Floats
-    owner: int
 
 
 @njit(cache=True, error_model="numpy")
-def _projected(mesh: Triangles, view: View) -> Floats:
+def _projected(mesh: Mesh, position: Floats, rotation: Floats, view: View) -> Floats:
     """Give the homogeneous pixels of the vertices, shape (n, 3)."""
-    p, r, o = view.projection, mesh.rotation, mesh.position
+    p, r, o = view.projection, rotation, position
     matrix = np.empty((3, 4))
     for i in range(3):
         matrix[i, 3] = p[i, 0] * o[0] + p[i, 1] * o[1] + p[i, 2] * o[2] + p[i, 3]
@@ -151,7 +122,9 @@ def _edges(corners: Floats, edges: Floats) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def draw_mesh(mesh: Triangles, view: View, light: Floats, alpha: float, canvas: Canvas) -> None:
+def draw_mesh(
+    mesh: Mesh, shapes: Table, n: int, view: View, light: Floats, alpha: float, canvas: Canvas
+) -> None:
     """Draw triangles over what is there, where they are nearer. Both of their sides are seen.
 
     The triangle with the homogeneous pixels a, b, c covers the pixel q where the products of q
@@ -159,7 +132,9 @@ def draw_mesh(mesh: Triangles, view: View, light: Floats, alpha: float, canvas: 
     negative.
 
     Args:
-        mesh: What to draw.
+        mesh: What to draw, in the frame of its shape.
+        shapes: With the shape.
+        n: Its row.
         view: The rays of the pixels.
         light: Unit vector towards the light, and the ambient brightness, shape (4,).
         alpha: Opacity. Below 1, ``canvas.depth`` has to hold the depth of what is nearest, this
@@ -172,9 +147,10 @@ def draw_mesh(mesh: Triangles, view: View, light: Floats, alpha: float, canvas: 
     """
     depth, owners, rgb = canvas
     colored, owned = rgb.shape[1] > 0, alpha == 1.0 and owners.shape[0] > 0
-    color = (255.0 * mesh.color[0], 255.0 * mesh.color[1], 255.0 * mesh.color[2])
-    lamp = turned(mesh.rotation, light)
-    pixels, near = _projected(mesh, view), view.near
+    tint, rotation = shapes.colors[n], shapes.rotations[n]
+    color = (255.0 * tint[0], 255.0 * tint[1], 255.0 * tint[2])
+    lamp = turned(rotation, light)
+    pixels, near = _projected(mesh, shapes.positions[n], rotation, view), view.near
     corners, edges, box = np.empty((3, 3)), np.empty((3, 3)), np.empty(4)
     for f in range(len(mesh.faces)):
         for i in range(3):
@@ -201,7 +177,7 @@ def draw_mesh(mesh: Triangles, view: View, light: Floats, alpha: float, canvas: 
                     cosine = -side * _cosine(mesh.normals[f], (a, b, c), lamp)
                     blend(rgb, v, u, color, brightness(cosine, light[3]), alpha)
                 if owned:
-                    owners[v, u] = mesh.owner
+                    owners[v, u] = shapes.bodies[n]
 
 
 @njit(cache=True, error_model="numpy")
@@ -217,18 +193,18 @@ def _cosine(normals: Floats, weights: Triple, lamp: Triple) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _tint(ground: Ground, x: float, y: float, spread: float) -> Triple:
+def _tint(
+    ground: Ground, color: Floats, halves: Floats, x: float, y: float, spread: float
+) -> Triple:
     """Give the color, 255 where it is full, of a point of a plane that a pixel spreads over."""
-    left = -ground.halves[0] if ground.halves[0] < math.inf else 0.0
-    back = ground.halves[1] if ground.halves[1] < math.inf else 0.0
-    tiles, one, two = ground.tiles, ground.colors[0], ground.colors[1]
+    left, back, tiles, other = -halves[0], halves[1], ground.tiles, ground.other
     odd = (math.floor((x - left) / tiles[0]) + math.floor((back - y) / tiles[1])) % 2.0
     clear = max(1.0 - spread / min(tiles[0], tiles[1]), 0.0)
     share = 0.5 + clear * (odd - 0.5)
     return (
-        255.0 * (one[0] + share * (two[0] - one[0])),
-        255.0 * (one[1] + share * (two[1] - one[1])),
-        255.0 * (one[2] + share * (two[2] - one[2])),
+        255.0 * (color[0] + share * (other[0] - color[0])),
+        255.0 * (color[1] + share * (other[1] - color[1])),
+        255.0 * (color[2] + share * (other[2] - color[2])),
     )
 
 
@@ -243,13 +219,17 @@ def _shadow_at(ground: Ground, x: float, y: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def draw_ground(ground: Ground, view: View, light: Floats, alpha: float, canvas: Canvas) -> None:
+def draw_ground(
+    ground: Ground, shapes: Table, n: int, view: View, light: Floats, alpha: float, canvas: Canvas
+) -> None:
     """Draw a plane over what is there, where it is nearer.
 
     Tiles fade into one color where they are smaller than a pixel.
 
     Args:
-        ground: What to draw.
+        ground: What lies on it.
+        shapes: With the plane.
+        n: Its row.
         view: The rays of the pixels.
         light: Unit vector towards the light, and the ambient brightness, shape (4,).
         alpha: Opacity. Below 1 colors are blended, and depth and owners stay as they are.
@@ -258,28 +238,33 @@ def draw_ground(ground: Ground, view: View, light: Floats, alpha: float, canvas:
     depth, owners, rgb = canvas
     colored, solid = rgb.shape[1] > 0, alpha == 1.0
     owned = solid and owners.shape[0] > 0
-    rays = to_frame(ground.position, ground.rotation, view.rays, np.ones(3))
-    top = brightness(turned(ground.rotation, light)[2], light[3])
+    halves, rotation, color = shapes.halves[n], shapes.rotations[n], shapes.colors[n]
+    wide = halves[0] if halves[0] > 0.0 else math.inf
+    long = halves[1] if halves[1] > 0.0 else math.inf
+    left, right, upper, lower = 0, depth.shape[1], 0, depth.shape[0]
+    if wide + long < math.inf:
+        left, right, upper, lower = rectangle(shapes, n, view, right, lower)
+    rays = to_frame(shapes.positions[n], rotation, view.rays, np.ones(3))
+    top = brightness(turned(rotation, light)[2], light[3])
     dark = SHADOW * (1.0 - light[3])
     pixel = math.sqrt(rays[4, 0] ** 2 + rays[4, 1] ** 2 + rays[4, 2] ** 2)
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
+    for v in range(upper, lower):
+        for u in range(left, right):
             dx, dy, dz = ray(rays, 3, u, v)
             if not rays[0, 2] > 0.0 > dz:
                 continue
             t = -rays[0, 2] / dz
             x, y = rays[0, 0] + t * dx, rays[0, 1] + t * dy
-            inside = abs(x) <= ground.halves[0] and abs(y) <= ground.halves[1]
-            if not (inside and view.near <= t < depth[v, u]):
+            if not (abs(x) <= wide and abs(y) <= long and view.near <= t < depth[v, u]):
                 continue
             if colored:
                 spread = t * pixel * math.sqrt(dx * dx + dy * dy + dz * dz) / -dz
                 shade = top * (1.0 - dark * _shadow_at(ground, x, y))
-                blend(rgb, v, u, _tint(ground, x, y, spread), shade, alpha)
+                blend(rgb, v, u, _tint(ground, color, halves, x, y, spread), shade, alpha)
             if solid:
                 depth[v, u] = t
             if owned:
-                owners[v, u] = ground.owner
+                owners[v, u] = shapes.bodies[n]
 
 
 SHADOW_BLUR = 2  # passes of a box filter three texels wide
@@ -304,19 +289,15 @@ def lamp(light: Light) -> Floats:
 
 
 def shadow_map(
-    bodies: Bodies,
-    light: Light,
-    meshes: Iterable[Triangles] = (),
-    *,
-    half: float,
-    n: int,
+    table: Table, meshes: Mapping[int, Mesh], which: Integers, light: Light, *, half: float, n: int
 ) -> Floats:
     """Look from the floor towards the light, and soften what stands in the way.
 
     Args:
-        bodies: What throws shadows, z from the floor.
+        table: Of shapes, z from the floor.
+        meshes: Triangles, by row.
+        which: Rows of what throws shadows.
         light: That they stand in the way of.
-        meshes: What else throws shadows.
         half: Half the edge of the square around the origin that is looked at [m].
         n: Texels along an edge.
 
@@ -328,12 +309,12 @@ def shadow_map(
     if towards[2] < LOWEST:
         return NO_SHADOW
     view = parallel_view(towards[:3] / towards[2], half, n)
-    depth, owners = np.full((n, n), np.inf, dtype=np.float32), np.full((n, n), NOTHING, np.int32)
-    canvas = Canvas(depth, owners, NO_COLORS)
-    draw(bodies, view, towards, 1.0, canvas)
-    for mesh in meshes:
-        draw_mesh(mesh, view, towards, 1.0, canvas)
-    shadow = np.where(np.isfinite(depth), 1.0, 0.0)
+    canvas = Canvas(np.full((n, n), np.inf, dtype=np.float32), NO_OWNERS, NO_COLORS)
+    draw(table, which[table.kinds[which] != MESH], view, towards, 1.0, canvas)
+    for row in which.tolist():
+        if row in meshes:
+            draw_mesh(meshes[row], table, row, view, towards, 1.0, canvas)
+    shadow = np.where(np.isfinite(canvas.depth), 1.0, 0.0)
     for _ in range(SHADOW_BLUR):
         _soften(shadow)
     return shadow

@@ -7,92 +7,92 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from os import PathLike
 from pathlib import Path
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.backends.renderer.bodies import model_camera, model_shapes
-from scm_world.backends.renderer.kernels import Canvas, Colors
-from scm_world.backends.renderer.shapes import SKY, corners_of_what_moves, draw_shapes, goal_shapes
-from scm_world.errors import EngineError, UnknownOption
-from scm_world.models.camera import Camera
+from scm_world.backends.renderer.kernels import Colors
+from scm_world.backends.renderer.shapes import (
+    Parts,
+    corners_of_what_moves,
+    draw_parts,
+    goal_shapes,
+    parted,
+)
+from scm_world.errors import ModelError, UnknownOption
+from scm_world.models.camera import Camera, Views
 from scm_world.models.model import Model
-from scm_world.models.scene import Scene
-from scm_world.models.shapes import Shape
+from scm_world.models.scene import Light, Scene
+from scm_world.models.shapes import Shapes
+
+if TYPE_CHECKING:
+    from scm_world.backends.mujoco.drawing import VisibleModel
 
 
-class Drawing:
-    """How scenes of a ``Model`` are drawn; other structures bring a class derived from it.
-
-    Attributes:
-        overview: The camera of pictures for people; None for one that follows what moves.
-        cameras: Those of policies, by default.
-        original_cameras: The same as the published code realises them.
-    """
-
-    overview: Camera | None = None
-    cameras: tuple[Camera, ...] = ()
-    original_cameras: tuple[Camera, ...] = ()
-
-    def names(self, structure: Any) -> tuple[str, ...]:
-        """Name what the numbers of a segmentation stand for."""
-        return model_shapes(structure.default_scene())[1]
-
-    def content(self, scene: Scene, *, shadows: bool, published: bool = False) -> Any:
-        """Gather what all pictures of a scene have in common, for any camera.
-
-        Args:
-            scene: What to show.
-            shadows: Whether there are any.
-            published: Whether bodies look as their makers published them, where that is something
-                else than the shapes of physics.
-        """
-        return self.shapes(scene), shadows
-
-    def shapes(self, scene: Scene) -> list[Shape]:
-        """List everything that is seen, goals last; for renderers other than this one."""
-        return model_shapes(scene)[0] + goal_shapes(scene.goals)
-
-    def background(self, scene: Scene, *, obstacles: bool) -> Scene:
-        """Return a scene without what moves, for pictures of goals."""
-        return scene  # what moves is left out of its content
-
-    def draw(
-        self, scene: Scene, content: Any, camera: Camera, *, samples: int = 1, colors: bool = True
-    ) -> Canvas:
-        """Draw a scene.
-
-        Args:
-            scene: What to show.
-            content: Of this scene.
-            camera: Where from.
-            samples: Per pixel and axis.
-            colors: Whether to color pixels.
-
-        Returns:
-            New arrays: depth, owners and, with colors, red, green and blue.
-        """
-        shapes, shadows = content
-        light = scene.light
-        return draw_shapes(shapes, camera, light, samples=samples, shadows=shadows, colors=colors)
-
-
-_MODELS = Drawing()
-
-
-def drawing_of(structure: Any) -> Drawing:
-    """Return how scenes of a structure are drawn."""
-    found: Drawing = structure.realization("renderer") or _MODELS
+def views_of(structure: Any) -> Views | None:
+    """Return the cameras that a structure brings, if it does."""
+    found: Views | None = structure.realization("renderer")
     return found
+
+
+def _visible(scene: Scene) -> VisibleModel:
+    """Put a scene into MuJoCo, which is imported only where it is needed.
+
+    Raises:
+        ModelError: The structure says nothing about shapes.
+    """
+    if not isinstance(scene.structure, Model):
+        kind = type(scene.structure).__name__
+        raise ModelError([f"{kind} says nothing about shapes, so there are no pictures of it"])
+    from scm_world.backends.mujoco.drawing import visible
+
+    return visible(scene)
+
+
+def shapes_of(scene: Scene, *, goals: bool = True) -> Shapes:
+    """Collect everything that is seen, goals last, whatever backend steps the scene.
+
+    Args:
+        scene: What to show.
+        goals: Whether to show the goals.
+
+    Raises:
+        ModelError: The structure says nothing about shapes.
+    """
+    shapes = _visible(scene).shapes()
+    return shapes.joined(goal_shapes(scene.goals)) if goals and scene.goals else shapes
+
+
+def background_of(scene: Scene, *, obstacles: bool = True) -> Shapes:
+    """Collect what pictures of the goals of a scene show: nothing that moves.
+
+    In scenes whose structure has ``Views``, these say what is shown besides the goals.
+
+    Args:
+        scene: Whose goals to show.
+        obstacles: Whether obstacles are wanted, where there are any.
+
+    Raises:
+        ModelError: The structure says nothing about shapes.
+    """
+    views = views_of(scene.structure)
+    shown, hidden = (scene, None) if views is None else views.background(scene, obstacles)
+    shapes, names = shapes_of(shown), body_names(scene.structure)
+    gone = shapes.moves
+    if hidden is not None:
+        gone = np.isin(shapes.table.bodies, [names.index(name) for name in hidden])
+    shapes.table.colors[gone, 3] = 0.0
+    return shapes
 
 
 def body_names(structure: Any) -> tuple[str, ...]:
     """Name what the numbers of a segmentation stand for."""
-    return drawing_of(structure).names(structure)
+    return _visible(structure.default_scene()).names
 
 
 USUAL_SIZE = 480, 640  # [pixels] height and width of a picture for people
@@ -103,8 +103,6 @@ AUTOMATIC = "automatic"
 FIELD_OF_VIEW = 40.0  # [deg] of an automatic camera
 MARGIN = 1.3  # how much more an automatic camera sees than it has to
 STILL = 0.05  # of the distance: how far from the middle of a picture is near it
-
-RENDERERS = ("software", "mujoco")
 
 
 @final
@@ -139,9 +137,9 @@ class RenderedImage:
 
 
 def render(
-    scene: Scene, camera: Camera, *, samples: int = 1, published: bool = False
+    scene: Scene, camera: Camera, *, samples: int = 1, goals_only: bool = False
 ) -> RenderedImage:
-    """Take a picture of a scene with the software renderer; ``picture`` can do with less.
+    """Take a picture of a scene; ``picture`` can do with less.
 
     A camera inside a body sees its inside. Light comes from one direction, that of the scene;
     shadows fall on floors only.
@@ -152,7 +150,7 @@ def render(
         camera: Where from.
         samples: How many samples per pixel and axis the colors are averaged over; 2 or 3 make
             smooth edges. Depth and segmentation are those of the center of the pixel.
-        published: Draw the links of the robot as published, not as the capsules of physics.
+        goals_only: Show the goals, and what ``goal_pixels`` shows with them.
 
     Raises:
         ValueError: ``samples`` is not positive, or the camera has no optical axis.
@@ -167,12 +165,11 @@ def render(
     """
     if samples < 1:
         raise ValueError(f"samples: expected a positive number, got {samples}")
-    drawing = drawing_of(scene.structure)
-    content = drawing.content(scene, shadows=True, published=published)
-    names = drawing.names(scene.structure)
-    canvas = drawing.draw(scene, content, camera)
-    fine = canvas if samples == 1 else drawing.draw(scene, content, camera, samples=samples)
+    parts = parted(background_of(scene) if goals_only else shapes_of(scene), shadows=True)
+    canvas = draw_parts(parts, camera, scene.light)
+    fine = canvas if samples == 1 else draw_parts(parts, camera, scene.light, samples)
     shown = _average(np.ascontiguousarray(fine.rgb.transpose(1, 2, 0)), samples)
+    names = body_names(scene.structure)
     return RenderedImage(shown, canvas.depth, canvas.owners, names)
 
 
@@ -180,30 +177,22 @@ def picture(
     scene: Scene,
     camera: Camera | str | None = None,
     size: tuple[int, int] | None = None,
-    renderer: str | None = None,
     *,
     samples: int = 1,
 ) -> NDArray[np.uint8]:
     """Take a picture for people, of any scene that has shapes. No screen is needed.
 
-    The links of the robot look as published; ``render`` shows the capsules that physics knows.
-
     Args:
         scene: What to show.
         camera: Where from: see ``scene_camera``.
         size: Height and width [pixels]; if not given, those of the camera.
-        renderer: ``"mujoco"`` for MuJoCo's own, which needs EGL or OSMesa and draws models only;
-            ``"software"`` for ours, whose pictures are the same on all machines. If not given,
-            models are drawn by MuJoCo's where that works, and all else by ours.
-        samples: How many samples per pixel and axis colors are averaged over. MuJoCo's renderer
-            takes two at least.
+        samples: How many samples per pixel and axis colors are averaged over.
 
     Returns:
         Red, green and blue, shape (h, w, 3).
 
     Raises:
-        UnknownOption: There is no such camera, or no such renderer for this scene.
-        EngineError: MuJoCo's renderer was asked for, and cannot draw here.
+        UnknownOption: There is no such camera.
         ModelError: The structure says nothing about shapes.
         ValueError: ``samples`` is not positive, or the camera has no optical axis.
 
@@ -212,30 +201,7 @@ def picture(
         >>> picture(trifinger().default_scene(), size=(60, 80)).shape
         (60, 80, 3)
     """
-    if samples < 1:
-        raise ValueError(f"samples: expected a positive number, got {samples}")
-    modeled = isinstance(scene.structure, Model)
-    known = RENDERERS if modeled else RENDERERS[:1]
-    if renderer not in (None, *known):
-        raise UnknownOption("renderer", renderer, known)
-    camera = scene_camera(scene, camera, size)
-    library = None
-    if modeled and renderer != "software":
-        from scm_world.backends.mujoco.opengl import draw_scene as draw_by_mujoco
-        from scm_world.backends.mujoco.opengl import opengl
-
-        library = opengl()
-    if library is None:
-        if renderer == "mujoco":
-            raise EngineError(
-                "MuJoCo cannot draw here: neither EGL nor OSMesa works (or MUJOCO_GL forbids it); "
-                "install libegl1 or libosmesa6, or use renderer='software'",
-                "mujoco",
-            )
-        return render(scene, camera, samples=samples, published=True).rgb
-    samples = max(samples, 2)
-    fine = replace(camera, height=camera.height * samples, width=camera.width * samples)
-    return _average(draw_by_mujoco(scene, fine, SKY, library), samples)
+    return render(scene, scene_camera(scene, camera, size), samples=samples).rgb
 
 
 def scene_camera(
@@ -259,15 +225,18 @@ def scene_camera(
     height, width = size or USUAL_SIZE
     if isinstance(camera, Camera):
         return camera if size is None else replace(camera, height=height, width=width)
-    drawing = drawing_of(scene.structure)
-    if drawing.overview is not None:
-        known = {one.name: one for one in (drawing.overview, *drawing.cameras)}
+    views = views_of(scene.structure)
+    if views is not None:
+        known = {one.name: one for one in (views.overview, *views.cameras)}
         if camera not in (None, *known):
             raise UnknownOption("camera", camera, known)
-        return replace(known[camera or drawing.overview.name], height=height, width=width)
+        return replace(known[camera or views.overview.name], height=height, width=width)
     if camera in (None, AUTOMATIC):
         return automatic_camera(scene, size=(height, width))
-    return model_camera(scene, str(camera), (height, width))
+    seen = _visible(scene)
+    if camera not in seen.cameras:
+        raise UnknownOption("camera", camera, (AUTOMATIC, *seen.cameras))
+    return seen.camera(str(camera), (height, width))
 
 
 def automatic_camera(*scenes: Scene, size: tuple[int, int] = (480, 640)) -> Camera:
@@ -283,10 +252,11 @@ def automatic_camera(*scenes: Scene, size: tuple[int, int] = (480, 640)) -> Came
     Raises:
         ModelError: The structure says nothing about shapes.
     """
-    return framing([shape for scene in scenes for shape in model_shapes(scene)[0]], size)
+    found = [shapes_of(scene, goals=False) for scene in scenes]
+    return framing(reduce(Shapes.joined, found), size)
 
 
-def framing(shapes: Sequence[Shape], size: tuple[int, int]) -> Camera:
+def framing(shapes: Shapes, size: tuple[int, int]) -> Camera:
     """Place a camera as ``automatic_camera`` does."""
     points = corners_of_what_moves(shapes)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
@@ -325,10 +295,10 @@ def following_camera(camera: Camera, scene: Scene) -> Camera:
     Raises:
         ModelError: The structure says nothing about shapes.
     """
-    return following(camera, model_shapes(scene)[0])
+    return following(camera, shapes_of(scene, goals=False))
 
 
-def following(camera: Camera, shapes: Sequence[Shape]) -> Camera:
+def following(camera: Camera, shapes: Shapes) -> Camera:
     """Move a camera as ``following_camera`` does."""
     points = corners_of_what_moves(shapes)
     eye, target = np.array(camera.eye), np.array(camera.target)
@@ -429,9 +399,8 @@ def now_pixels(
         >>> out[0, :, 127, 64].tolist()  # the floor
         [74, 65, 60]
     """
-    scene = scene.with_(goals=())
-    content = drawing_of(scene.structure).content(scene, shadows=False)
-    _draw_all(scene, content, cameras, out, convention)
+    parts = parted(shapes_of(scene, goals=False), shadows=False)
+    _draw_all(parts, scene.light, cameras, out, convention)
 
 
 def goal_pixels(
@@ -454,12 +423,8 @@ def goal_pixels(
     Source:
         CausalWorld 1.2, ``envs/causalworld.py``: its goal world.
     """
-    drawing = drawing_of(scene.structure)
-    scene = drawing.background(scene, obstacles=convention.goal_obstacles)
-    content = drawing.content(scene, shadows=False)
-    if isinstance(scene.structure, Model):
-        content = [shape for shape in content[0] if not shape.moves], False
-    _draw_all(scene, content, cameras, out, convention)
+    parts = parted(background_of(scene, obstacles=convention.goal_obstacles), shadows=False)
+    _draw_all(parts, scene.light, cameras, out, convention)
 
 
 def depth_and_segmentation(
@@ -481,9 +446,8 @@ def depth_and_segmentation(
     """
     if len({(camera.height, camera.width) for camera in cameras}) != 1:
         raise ValueError("cameras: there must be at least one, and all with pictures of one size")
-    scene, drawing = scene.with_(goals=()), drawing_of(scene.structure)
-    content = drawing.content(scene, shadows=False)
-    drawn = [drawing.draw(scene, content, camera, colors=False) for camera in cameras]
+    parts = parted(shapes_of(scene, goals=False), shadows=False)
+    drawn = [draw_parts(parts, camera, scene.light, colors=False) for camera in cameras]
     depths, owners = (
         np.stack([getattr(one, name) for one in drawn]) for name in ("depth", "owners")
     )
@@ -496,11 +460,7 @@ def _rows(stack: NDArray[Any], convention: Convention) -> NDArray[Any]:
 
 
 def _draw_all(
-    scene: Scene,
-    content: Any,
-    cameras: Sequence[Camera],
-    out: Colors,
-    convention: Convention,
+    parts: Parts, light: Light, cameras: Sequence[Camera], out: Colors, convention: Convention
 ) -> None:
     """Draw a scene with all cameras in the layout that is asked for."""
     if out.dtype != np.uint8:
@@ -508,8 +468,7 @@ def _draw_all(
     for shape in {convention.shape(camera) for camera in cameras} or {(0, 0, 0)}:
         if out.shape != (len(cameras), *shape):
             raise ValueError(f"out: expected shape {(len(cameras), *shape)}, got {out.shape}")
-    drawing = drawing_of(scene.structure)
     for picture, camera in zip(out, cameras, strict=True):
-        rgb = drawing.draw(scene, content, camera).rgb
+        rgb = draw_parts(parts, camera, light).rgb
         rows = rgb[:, ::-1] if convention.flipped else rgb
         picture[:] = rows.transpose(1, 2, 0) if convention.channels_last else rows

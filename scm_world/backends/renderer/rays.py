@@ -13,8 +13,6 @@ import math
 
 from numba import njit
 
-from scm_world._types import Floats
-
 Triple = tuple[float, float, float]
 Hit = tuple[float, float, float, float]
 """The depth at which a ray is seen to meet a surface, and the normal towards the ray."""
@@ -125,29 +123,3 @@ def hit_cylinder(o: Triple, d: Triple, half: float, near: float) -> Hit:
     if t == (enter if side > 0.0 else leave):
         return t, side * (o[0] + t * d[0]), side * (o[1] + t * d[1]), 0.0
     return t, 0.0, 0.0, -math.copysign(1.0, d[2])
-
-
-@njit(cache=True, error_model="numpy")
-def hit_hull(
-    facets: Floats,
-    o: Triple,
-    d: Triple,
-    near: float,
-) -> Hit:
-    """Meet the polyhedron behind all planes ``facets``, shape (p, 4)."""
-    enter, leave, enter_facet, leave_facet = -math.inf, math.inf, 0, 0
-    for p in range(len(facets)):
-        slope = facets[p, 0] * d[0] + facets[p, 1] * d[1] + facets[p, 2] * d[2]
-        gap = facets[p, 3] - (facets[p, 0] * o[0] + facets[p, 1] * o[1] + facets[p, 2] * o[2])
-        if slope < 0.0:
-            if gap < enter * slope:
-                enter, enter_facet = gap / slope, p
-        elif slope > 0.0:
-            if gap < leave * slope:
-                leave, leave_facet = gap / slope, p
-        elif gap < 0.0:
-            return math.inf, 0.0, 0.0, 0.0
-    if enter > leave or leave < near:
-        return math.inf, 0.0, 0.0, 0.0
-    t, facet, side = (enter, enter_facet, 1.0) if enter >= near else (leave, leave_facet, -1.0)
-    return t, side * facets[facet, 0], side * facets[facet, 1], side * facets[facet, 2]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, final
 
 from scm_world._arguments import load, one_of, typed, whole_number
-from scm_world.backends.renderer import drawing_of, png, render, scene_camera
+from scm_world.backends.renderer import png, render, scene_camera
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Scene
 
@@ -64,16 +64,14 @@ class Pictures:
             UnknownOption: There is no such camera.
         """
         own: dict[str | None, Camera] = {camera.name: camera for camera in placed}
-        scenes = {label: scene}
-        if self.goals:
-            scenes[f"goal_{label}"] = drawing_of(scene.structure).background(scene, obstacles=True)
-        return {
-            name + (f".{camera}" if len(self.cameras) > 1 else ""): png(
-                render(shown, scene_camera(shown, own.get(camera, camera), self.size)).rgb
-            )
-            for name, shown in scenes.items()
-            for camera in self.cameras
-        }
+        found: Row = {}
+        for goals_only in (False, True) if self.goals else (False,):
+            name = f"goal_{label}" if goals_only else label
+            for camera in self.cameras:
+                from_ = scene_camera(scene, own.get(camera, camera), self.size)
+                column = f"{name}.{camera}" if len(self.cameras) > 1 else name
+                found[column] = png(render(scene, from_, goals_only=goals_only).rgb)
+        return found
 
     def encoded(self, rows: Sequence[Row], keys: Sequence[str]) -> bytes:
         """Write rows as the bytes of a file; the same ones every time.

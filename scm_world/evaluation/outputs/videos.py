@@ -131,7 +131,7 @@ def _film(
         every = math.ceil(round(1.0 / (FASTEST * period), 9))
         if step % every == 0:
             scene = env.world.scene()
-            shown = render(scene, camera or scene_camera(scene), published=True).rgb
+            shown = render(scene, camera or scene_camera(scene)).rgb
             frame = captions(shown, time=f"{step * period:.2f} s")
             if not video:
                 video.append(opened(frame.shape[1::-1], 1.0 / (every * period), "libx264"))

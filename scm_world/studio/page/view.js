@@ -306,7 +306,7 @@ function solid(shape) {
   const [x, y, z] = shape.halves;
   switch (shape.kind) {
     case "box": return new THREE.BoxGeometry(2 * x, 2 * y, 2 * z);
-    case "sphere": case "ellipsoid": return new THREE.SphereGeometry(1, 28, 18).scale(x, y, z);
+    case "ellipsoid": return new THREE.SphereGeometry(1, 28, 18).scale(x, y, z);
     case "cylinder": return new THREE.CylinderGeometry(1, 1, 2, 40).rotateX(Math.PI / 2).scale(x, y, z);
     case "capsule": return new THREE.CapsuleGeometry(x, Math.max(0, 2 * (z - x)), 6, 20).rotateX(Math.PI / 2);
     case "plane": {

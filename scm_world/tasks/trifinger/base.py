@@ -117,7 +117,7 @@ class TriFingerTask(Task):
     saturates = True
     raised = hardware.RAISED
     policies: ClassVar[Mapping[str, Callable[[], Any]]] = {
-        name: partial(_scripted, name) for name in ("sweep", "across", "grasp", "hold", "feedback")
+        name: partial(_scripted, name) for name in ("sweep", "across", "feedback")
     }
     ready_terms: ClassVar[tuple[Measured, ...]] = shaping.ROBOT
     unchecked: ClassVar[tuple[str, ...]] = ()

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.models.camera import Camera, Vector, camera_from, down_and_forward
-from scm_world.tasks.trifinger.hardware import TABLE_OFFSET
+from scm_world.models.camera import Camera, Vector, Views, camera_from, down_and_forward
+from scm_world.models.scene import Scene
+from scm_world.tasks.trifinger.hardware import JOINT_LOW, TABLE_OFFSET
 
 
 def _above_table(eye: Vector) -> Vector:
@@ -70,3 +71,14 @@ OVERVIEW = Camera(
     far=10.0,
 )
 """For people: the whole arena from the front and above, between fingers 120 and 300."""
+
+
+def background(scene: Scene, obstacles: bool) -> tuple[Scene, frozenset[str]]:
+    """Park the robot, and leave out the blocks, and the obstacles unless they are wanted."""
+    structure, state = scene.structure, scene.state.copy()
+    state.joint_positions[:] = JOINT_LOW
+    left_out = structure.blocks if obstacles else (*structure.blocks, *structure.obstacles)
+    return scene.with_(state=state), frozenset(left_out)
+
+
+VIEWS = Views(OVERVIEW, CAMERAS, ORIGINAL_CAMERAS, background)

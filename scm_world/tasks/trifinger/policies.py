@@ -12,7 +12,7 @@ from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.tasks.base import Blind, kept_rows
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.grasping import Feedback, Grasp
+from scm_world.tasks.trifinger.grasping import Feedback
 from scm_world.tasks.trifinger.kinematics import forward, inverse
 
 INWARD = ((0.33, 0.12, 0.0), (1.0, 0.02, 0.0))
@@ -63,8 +63,6 @@ class Sweep(Blind):
 SCRIPTED: Mapping[str, Callable[[], Any]] = {
     "sweep": cache(Sweep),
     "across": cache(partial(Sweep, across=True)),
-    "grasp": Grasp,
-    "hold": partial(Grasp, holds=True),
     "feedback": Feedback,
 }
 """By name."""

@@ -58,6 +58,13 @@ from scm_world.tasks.trifinger.state import PhysicalState
 
 FLOOR = "floor"
 STAGE = "stage"
+ROBOT = "robot"  # the hub that carries the fingers; nothing touches it
+UNSEEN = 3  # the first group of shapes that no picture shows
+HUB_COLOR = (0.35, 0.35, 0.38, 1.0)
+HUB_HALVES = (0.034, 0.034, 0.012)  # [m] of an ellipsoid
+MOUNT = hardware.Capsule((0.012, 0.0, 0.0), (-0.004, 0.0, 0.0), 0.0235)
+"""How link 0 looks; its published mesh is a frame that hides the arena from above."""
+
 SHAPES = ("upper", "middle", "lower", "tip")  # in the order of the links 1, 2, 3 and 3
 
 CONTACT = {"fast": (0.010, 1.0), "precise": (0.004, 1.0)}
@@ -70,6 +77,7 @@ IMPRATIO = 100.0  # stiffness of friction over stiffness of the normal
 MANY = 8
 """From more blocks than this on, the Jacobian of the constraints is a sparse matrix."""
 
+_PLANE = mujoco.mjtGeom.mjGEOM_PLANE  # has no end where it collides, whatever its size
 _BLOCK_HALF = 0.0325  # [m] any positive size and mass do: parameters follow
 _BLOCK_MASS = 0.02  # [kg]
 _SPEC = ControllerSpec()
@@ -142,7 +150,7 @@ class TriFinger(Model):
 
 _REALIZATIONS = {
     "fake": ("fake", None),
-    "renderer": ("drawing", "DRAWING"),
+    "renderer": ("cameras", "VIEWS"),
 }
 
 START = "start"
@@ -247,7 +255,7 @@ def _compiled(parts: _Parts) -> mujoco.MjModel:
     spec.compiler.degree = False
     _write_options(spec, parts)
     floor = spec.worldbody.add_body(name=FLOOR)
-    _add_shape(floor, FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1.0, 1.0, 0.1))
+    _add_shape(floor, FLOOR, type=_PLANE, size=(WALL_RADIUS, WALL_RADIUS, 0.1))
     box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": (_BLOCK_HALF,) * 3}
     for name in parts.obstacles:
         _add_shape(spec.worldbody.add_body(name=name), name, **box, **_OBSTACLE_POSE)
@@ -338,9 +346,19 @@ def base_name(finger: str) -> str:
     return f"{finger}/base"
 
 
+def tip_name(finger: str) -> str:
+    """Name the tip of a finger."""
+    return f"robot_finger_{finger}_tip"
+
+
 def wall_name(segment: int) -> str:
     """Name a segment of the ring."""
     return f"{STAGE}/{segment}"
+
+
+def inside_name(segment: int) -> str:
+    """Name what is seen of a segment of the ring."""
+    return f"{wall_name(segment)}/inside"
 
 
 def link_shapes(finger: str, index: int) -> tuple[str, ...]:
@@ -424,6 +442,16 @@ def _add_wall(world: mujoco.MjsBody) -> None:
             pos=(center * math.cos(angle), center * math.sin(angle), WALL_HEIGHT / 2),
             quat=_yaw(angle),
             size=half,
+            group=UNSEEN,
+        )
+        w, _, _, z = _yaw(angle)
+        _add_shape(  # seen from within only
+            stage,
+            inside_name(i),
+            type=_PLANE,
+            pos=(WALL_RADIUS * math.cos(angle), WALL_RADIUS * math.sin(angle), WALL_HEIGHT / 2),
+            quat=(w, z, -w, z),
+            size=(WALL_HEIGHT / 2, WALL_RADIUS * math.tan(math.pi / WALL_SEGMENTS), 0.1),
         )
 
 
@@ -434,6 +462,9 @@ def _add_robot(spec: mujoco.MjSpec, contact: tuple[float, float], *, torques: bo
     and the links that cannot move outside of them, no mass changes the roundings elsewhere.
     """
     height, world = hardware.NOMINAL_HEIGHT - hardware.TABLE_OFFSET, spec.worldbody
+    hub = world.add_body(name=ROBOT, pos=(0.0, 0.0, height))
+    ellipsoid = mujoco.mjtGeom.mjGEOM_ELLIPSOID
+    _add_shape(hub, ROBOT, type=ellipsoid, size=HUB_HALVES, rgba=HUB_COLOR)
     cos, sin = math.cos(hardware.WORLD_YAW), math.sin(hardware.WORLD_YAW)
     for finger, (x, y, z), yaw in zip(
         FINGERS, hardware.FINGER_OFFSET, hardware.FINGER_YAW, strict=True
@@ -444,8 +475,7 @@ def _add_robot(spec: mujoco.MjSpec, contact: tuple[float, float], *, torques: bo
         }
         fixed = world.add_body(name=link_name(finger, 0), **pose)
         _set_inertial(fixed, 0)
-        sphere = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": (0.01, 0.0, 0.0)}
-        _add_shape(fixed, shape_name(finger, "base"), **sphere)
+        _add_capsule(fixed, shape_name(finger, "base"), MOUNT)
         body = world.add_body(name=base_name(finger), **pose)
         for index in (1, 2, 3):
             name = link_name(finger, index)
@@ -462,12 +492,14 @@ def _add_robot(spec: mujoco.MjSpec, contact: tuple[float, float], *, torques: bo
                 actfrclimited=True,  # the joint clips the sum of servo and damper
                 actfrcrange=(-_SPEC.limit, _SPEC.limit),
             )
-            _add_capsule(body, finger, SHAPES[index - 1])
-        tip = body.add_body(name=f"robot_finger_{finger}_tip", pos=hardware.TIP_ORIGIN)
+            name = SHAPES[index - 1]
+            _add_capsule(body, shape_name(finger, name), hardware.COLLISION[name])
+        tip = body.add_body(name=tip_name(finger), pos=hardware.TIP_ORIGIN)
         tip.mass, tip.inertia, tip.explicitinertial = hardware.TIP_MASS, hardware.TIP_INERTIA, True
         tip.ipos = hardware.TIP_CENTER["mujoco"]
-        tip.add_site(name=f"robot_finger_{finger}_tip")
-        _add_capsule(tip, finger, "tip")
+        tip.add_site(name=tip_name(finger), group=UNSEEN)
+        shape = hardware.COLLISION["tip"].moved(hardware.TIP_ORIGIN)
+        _add_capsule(body, shape_name(finger, "tip"), shape)
     for purpose, limit in (("servo", _SPEC.limit), ("safety", 0.0)):
         motor = float(torques and purpose == "servo")
         for joint in _JOINT_NAMES:
@@ -493,11 +525,10 @@ def _set_inertial(body: mujoco.MjsBody, index: int) -> None:
     body.explicitinertial = True
 
 
-def _add_capsule(body: mujoco.MjsBody, finger: str, shape: str) -> None:
-    capsule = hardware.COLLISION[shape]
+def _add_capsule(body: mujoco.MjsBody, name: str, capsule: hardware.Capsule) -> None:
     _add_shape(
         body,
-        shape_name(finger, shape),
+        name,
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
         fromto=(*capsule.start, *capsule.end),
         size=(capsule.radius, 0.0, 0.0),
@@ -559,10 +590,10 @@ def _bindings(mj: mujoco.MjModel, trees: Couplings, *, parts: _Parts) -> Iterato
             effect = trees.always([tree]) if index else NOTHING
             yield row(f"{link}.mass", "kg", slot, effect, "Its inertia scales with it.")
             yield color(link, link_shapes(finger, index))
-    surfaces = {FLOOR: [FLOOR], STAGE: [wall_name(i) for i in range(WALL_SEGMENTS)]}
-    for name, shapes in surfaces.items():
+    walls, insides = ([name(i) for i in range(WALL_SEGMENTS)] for name in (wall_name, inside_name))
+    for name, shapes, seen in ((FLOOR, [FLOOR], [FLOOR]), (STAGE, walls, insides)):
         yield friction(name, shapes, touching)
-        yield color(name, shapes)
+        yield color(name, seen)
     for name in parts.blocks:
         tree, hull = trees.tree(mj.body(name).id), dict(parts.hulls).get(name)
         own, contact = trees.always([tree]), trees.touching([tree])
@@ -597,7 +628,8 @@ def _spinning(mj: mujoco.MjModel, _: Any) -> Slot:
 
 
 def _height(mj: mujoco.MjModel, _: Any) -> Slot:
-    names = [name for finger in FINGERS for name in (base_name(finger), link_name(finger, 0))]
+    hanging = [name for finger in FINGERS for name in (base_name(finger), link_name(finger, 0))]
+    names = [ROBOT, *hanging]
     heights, offset = [mj.body_pos[mj.body(n).id, 2, ...] for n in names], hardware.TABLE_OFFSET
     return place(*heights, to=lambda z: z - offset, back=lambda z: z + offset, constant=True)
 

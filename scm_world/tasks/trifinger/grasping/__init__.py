@@ -1,6 +1,5 @@
-"""Scripted policies that grasp blocks and bring them to their goals."""
+"""A scripted policy that grasps blocks and brings them to their goals, by feedback."""
 
 from scm_world.tasks.trifinger.grasping.feedback import Feedback
-from scm_world.tasks.trifinger.grasping.policy import Grasp, Pace
 
-__all__ = ["Feedback", "Grasp", "Pace"]
+__all__ = ["Feedback"]

@@ -12,13 +12,11 @@ import numpy as np
 from scm_world._types import Floats, Value
 from scm_world.errors import ActionError
 from scm_world.geometry import from_rotation_vector
-from scm_world.geometry.penetration import box_box_kernel
 from scm_world.tasks.trifinger import kernels
 from scm_world.tasks.trifinger.grasping.hand import Hand
 from scm_world.tasks.trifinger.views import upright
 
 QUARTER = math.pi / 2.0
-SKY = 10.0  # [m] above and below everything
 ALIKE = 0.003  # [m] by which edges may differ of which one may stand for the other
 
 
@@ -75,20 +73,19 @@ class Cuboid:
         return (points - self.place) @ turn_about_z(self.yaw)
 
     def depth_in(self, other: Cuboid, *, margin: float = 0.0, flat: bool = False) -> float:
-        """Measure how deep it lies in another one [m].
+        """Compute how deep it lies in another one [m]: the least overlap along all axes.
 
         Args:
             other: The other one.
             margin: By which its sides are moved outwards [m].
-            flat: Whether only what is seen from above counts.
+            flat: Whether heights are left aside.
         """
-        half, place = self.half.copy(), self.place
-        half[:2] += margin
-        if flat:
-            half[2] += SKY
-            place = np.array([*place[:2], other.place[2]])
-        first = half, place, turn_about_z(self.yaw)
-        return float(box_box_kernel(*first, other.half, other.place, turn_about_z(other.yaw)))
+        between = turn_about_z(self.yaw - other.yaw)[:2, :2]
+        mine, its = self.half[:2] + margin, other.half[:2]
+        along_mine = mine + abs(between.T) @ its - abs(self.own(other.place)[:2])
+        along_its = its + abs(between) @ mine - abs(other.own(self.place)[:2])
+        high = min(self.top - other.bottom, other.top - self.bottom)
+        return float(min(*along_mine, *along_its, *[high] * (not flat)))
 
     def fills(self, goal: Cuboid) -> float:
         """Compute which share of a goal it fills."""
@@ -127,15 +124,20 @@ def turns(block: Cuboid, goal: Cuboid) -> tuple[float, ...]:
     return tuple(sorted(fitting, key=abs))
 
 
-def solids(bodies: Iterable[Cuboid], grow: float = 0.0) -> tuple[Floats, Floats, Floats]:
-    """Gather half edges, centers and axes of boxes: shapes (n, 3), (n, 3) and (n, 3, 3)."""
+def solids(bodies: Iterable[tuple[Cuboid, float]]) -> tuple[Floats, Floats, Floats]:
+    """Gather half edges, centers and axes of boxes: shapes (n, 3), (n, 3) and (n, 3, 3).
+
+    Args:
+        bodies: Each with a length by which its sides are moved outwards [m].
+    """
     listed = list(bodies)
-    if not listed:
-        return np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3))
+    halves = [body.half + grow for body, grow in listed]
+    centers = [body.place for body, _ in listed]
+    axes = [turn_about_z(body.yaw) for body, _ in listed]
     return (
-        np.array([body.half + grow for body in listed]),
-        np.array([body.place for body in listed]),
-        np.array([turn_about_z(body.yaw) for body in listed]),
+        np.array(halves).reshape(-1, 3),
+        np.array(centers).reshape(-1, 3),
+        np.array(axes).reshape(-1, 3, 3),
     )
 
 
@@ -146,12 +148,10 @@ FIRM = 0.6  # [N] with which even a block without weight is pressed
 MARGIN = 2.0
 """Pressing force, as a multiple of the force that just carries a block."""
 
-_POSE = ("size", "cartesian_position", "orientation")
-
 
 @final
 class Sight:
-    """The present of a world, looked at once per control step.
+    """The present of a world, read once per control step.
 
     Args:
         world: With blocks that have goals.
@@ -184,7 +184,7 @@ class Sight:
         if self._version == world.version:
             return  # all else moves only when someone intervenes
         self._version, task = world.version, world.compiled.task
-        self.hand = Hand(self._values, world.control_period)
+        self.hand = Hand(self._values)
         self.walls = world.composition.obstacles
         self._solid = (*world.composition.blocks, *self.walls)
         self.pairs = tuple(
@@ -200,14 +200,13 @@ class Sight:
         """See a block, a goal or an obstacle."""
         return body_of(name, self._values)
 
+    def goals(self) -> list[Cuboid]:
+        """Read all goals."""
+        return [self.body(goal) for _, goal in self.pairs]
+
     def solid(self) -> dict[str, Cuboid]:
         """See everything that fingers could run into, by name."""
         return {name: self.body(name) for name in self._solid}
-
-    def filled(self, tool: str, goal: str) -> float:
-        """Compute which share of a goal its block fills."""
-        poses = (self._values[f"{name}.{part}"] for name in (tool, goal) for part in _POSE)
-        return float(kernels.filled(*poses))
 
     def weight(self, tool: str) -> float:
         """Compute the weight of a block [N]."""

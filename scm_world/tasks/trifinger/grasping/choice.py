@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 
-from scm_world._types import Floats
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, turns
 from scm_world.tasks.trifinger.grasping.ways import Move, Planner, Way
 
-ENOUGH = 0.93
-"""Share of a goal that a block usually fills where it is left alone."""
+ENOUGH, FAIR = 0.85, 0.8
+"""Shares of a goal that a block fills where it is left alone: usually, and in the end."""
 
-FAIR = 0.8
 LATE = 70
 """So many control steps before the end less is enough, since there is no time to do it better."""
 
-HOVER = 0.001  # [m] above its goal, where a block is held that is not let go of
+HOVER = np.array([0.0, 0.0, 0.001])  # [m] of the last block above its goal, where it is held
 ON_FLOOR = 0.006  # [m] that a goal may be above the floor and still be on it
 ON_TOP = 0.01  # [m] that it may be above or in the block below it
 ROOM = 0.03  # [m] for fingers about a block that is put down on the way
@@ -44,56 +41,29 @@ STOPS = [
     for angle in np.linspace(0.0, 2.0 * math.pi, 12 if radius else 1, endpoint=False)
 ]
 
-
-@final
-@dataclass(frozen=True)
-class Job:
-    """What to do next.
-
-    Attributes:
-        tool: The block.
-        move: How it is brought where.
-        jobs: How many such moves there still are, this one included.
-    """
-
-    tool: str
-    move: Move
-    jobs: int
+Job = tuple[str, Move]
+"""A block, and how it is brought where."""
 
 
 @final
 class Choice:
-    """Chooses what to do next, from what there is now.
+    """Chooses what to do next. The block with the highest goal is held there.
 
     Args:
-        sight: Of the world.
-        holds: Whether the block with the highest goal is held there, even if it could stand.
-        swings: Whether two fingers may hold a block in the air, and rather do so than three; one
-            that is alone is then also turned less than its goal asks for, where that must be.
-        enough: Share of a goal that a block fills where it is left alone.
+        sight: The present of the world.
     """
 
-    def __init__(
-        self,
-        sight: Sight,
-        *,
-        holds: bool = False,
-        swings: bool = False,
-        enough: float = ENOUGH,
-    ) -> None:
-        self._sight, self._swings = sight, swings
+    def __init__(self, sight: Sight) -> None:
+        self._sight = sight
         self._bodies = sight.solid()
         self._goals = {goal: sight.body(goal) for _, goal in sight.pairs}
-        height = {goal: float(body.place[2]) for goal, body in self._goals.items()}
-        pairs = sorted(sight.pairs, key=lambda pair: height[pair[1]])
-        self._kept = pairs[-1][1] if holds and pairs else None
-        self._alone = len(pairs) == 1
-        if sight.left <= LATE:
-            enough = min(enough, FAIR)  # in the end, better not touch it again
+        pairs = sorted(sight.pairs, key=lambda pair: float(self._goals[pair[1]].place[2]))
+        self._last, self._alone = pairs[-1][1], len(pairs) == 1
+        enough = ENOUGH if sight.left > LATE else FAIR
         self._todo = [
             (tool, goal)
             for tool, goal in pairs
-            if sight.filled(tool, goal) < enough or self._hangs(tool, goal)
+            if self._hangs(tool, goal) or self._bodies[tool].fills(self._goals[goal]) < enough
         ]
 
     def job(self) -> Job | None:
@@ -101,27 +71,24 @@ class Choice:
         for tool, goal in self._todo:
             if self._waits(tool, goal):
                 continue
-            hangs, end, start = self._hangs(tool, goal), self._goals[goal], self._bodies[tool]
-            end = end.at(end.place + lifted(self._kept == goal), end.yaw)
-            ways = [(start.at(end.place, start.yaw + turn), turn) for turn in turns(start, end)]
-            move = self._best(tool, start, ways, release=not hangs)
-            if move is None and self._swings and self._alone and self._kept == goal:
-                move = self._turned_less(tool, start, end, [turn for _, turn in ways])
-            firm = hangs and end.bottom > ON_FLOOR and not self._swings
-            if move is not None and (move.grip.firm or not firm):
-                return Job(tool, move, len(self._todo))
-            detour = self._detour(tool, ways, release=not hangs, firm=firm) or move
-            if detour is not None:
-                return Job(tool, detour, len(self._todo) + (detour is not move))
-            found = self._make_way(tool, end)
-            if found is not None:
-                return found
+            end, start, last = self._goals[goal], self._bodies[tool], goal == self._last
+            release = not self._hangs(tool, goal)
+            end = end.at(end.place + HOVER * last, end.yaw)
+            turned = turns(start, end)
+            ways = [(start.at(end.place, start.yaw + turn), turn) for turn in turned]
+            move = self._best(tool, start, ways, release=release)
+            if move is None and self._alone:
+                move = self._turned_less(tool, start, end, turned)
+            move = move or self._detour(tool, ways, release=release)
+            job = (tool, move) if move is not None else self._make_way(tool, end)
+            if job is not None:
+                return job
         return None
 
     def _hangs(self, tool: str, goal: str) -> bool:
-        """Tell whether a block is held at its goal: there is nothing below, or it is asked for."""
+        """Return whether a block is held at its goal: it is the last, or there is nothing below."""
         end = self._goals[goal]
-        return goal == self._kept or (
+        return goal == self._last or (
             end.bottom > ON_FLOOR
             and not any(
                 abs(end.bottom - body.top) < ON_TOP and end.depth_in(body, flat=True) > 0.0
@@ -130,7 +97,7 @@ class Choice:
         )
 
     def _waits(self, tool: str, goal: str) -> bool:
-        """Tell whether a block cannot stand before another goal below its own is filled."""
+        """Return whether a block cannot stand before a goal below its own is filled."""
         return self._hangs(tool, goal) and any(
             self._goals[goal].depth_in(self._goals[other], flat=True) > 0.0
             for _, other in self._todo
@@ -142,8 +109,7 @@ class Choice:
 
     def _best(self, tool: str, start: Cuboid, ways: Iterable[Way], *, release: bool) -> Move | None:
         planner = Planner(self._sight.hand, self._sight.joints, self._others(tool))
-        wanted, swings = self._sight.wanted(tool), self._swings
-        return planner.best(start, ways, wanted=wanted, release=release, swings=swings)
+        return planner.best(start, ways, wanted=self._sight.wanted(tool), release=release)
 
     def _turned_less(
         self, tool: str, start: Cuboid, end: Cuboid, turned: Iterable[float]
@@ -174,28 +140,24 @@ class Choice:
         for other in sorted(depth, key=lambda name: -depth[name]):
             move = self._detour(other, []) if depth[other] > -NEAR else None
             if move is not None:
-                return Job(other, move, len(self._todo) + 1)
+                return other, move
         return None
 
-    def _detour(
-        self, tool: str, ways: list[Way], *, release: bool = True, firm: bool = False
-    ) -> Move | None:
+    def _detour(self, tool: str, ways: list[Way], *, release: bool = True) -> Move | None:
         """Find a way to put a block down from where it can be carried on, or out of the way.
 
         Args:
             tool: The block.
             ways: Where it should go in the end; nowhere if empty.
             release: Whether it is let go there.
-            firm: Whether all fingers must hold it there.
         """
         start = self._bodies[tool]
         for stop, turn in self._stops(tool, ways):
             move = self._best(tool, start, [(stop, turn)], release=True)
-            if move is None:
-                continue
             rest = [(end, full - turn) for end, full in ways]
-            after = self._best(tool, stop, rest, release=release)
-            if not ways or (after is not None and (after.grip.firm or not firm)):
+            if move is not None and (
+                not ways or self._best(tool, stop, rest, release=release) is not None
+            ):
                 return move
         return None
 
@@ -216,7 +178,7 @@ class Choice:
                     return
 
     def _is_free(self, tool: str, stop: Cuboid) -> bool:
-        """Tell whether a block can stand somewhere, with room for fingers and beside all goals."""
+        """Return whether a block can stand somewhere, with room for fingers and beside goals."""
         near = ((body, ROOM) for body in self._others(tool))
         wide = ((body, ASIDE) for body in self._goals.values())
         return not any(
@@ -224,8 +186,3 @@ class Choice:
             for bodies in (near, wide)
             for body, margin in bodies
         )
-
-
-def lifted(held: bool) -> Floats:
-    """Say by how much a block is held higher than its goal, so that nothing is in its way [m]."""
-    return np.array([0.0, 0.0, HOVER * held])

@@ -11,7 +11,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from scm_world._types import Floats, Value
-from scm_world.geometry.penetration import box_capsule_kernel, capsule_capsule_kernel
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import (
     FRAMES_PER_FINGER,
@@ -25,9 +24,10 @@ TIP_RADIUS = hardware.COLLISION["tip"].radius
 STRENGTH = 0.97
 """Share of the largest torque that a finger may be asked for."""
 
-STRIDE = 0.12  # [rad] that a joint may go in one control step, at most
 LEAST_GAIN = 1e-3  # [N m/rad] of a controller that can be commanded
-LEAST_DAMPING = 1e-6  # [N m s/rad]
+BALLS = 17
+"""How many balls stand for a leg, 10 mm from one another."""
+
 NUDGE = 1e-6  # [rad] by which joints are moved to find out how the fingertips move
 
 Solids = tuple[Floats, Floats, Floats]
@@ -36,7 +36,7 @@ Solids = tuple[Floats, Floats, Floats]
 _LOW, _HIGH = np.array(hardware.JOINT_LOW), np.array(hardware.JOINT_HIGH)
 _LEG = hardware.LEG_LENGTH
 _MIDDLE_CENTER, _LOWER_CENTER = (hardware.INERTIAL[link].center for link in (2, 3))
-_LOWER, _MIDDLE = hardware.COLLISION["tip"].radius, hardware.COLLISION["middle"].radius
+_RADII = (hardware.COLLISION["tip"].radius, hardware.COLLISION["middle"].radius)
 _MIDDLE_Y = hardware.COLLISION["middle"].start[1]
 _SHOULDER, _KNEE = (hardware.JOINT_ORIGINS[joint][1] for joint in (1, 2))
 _MASSES = (
@@ -48,32 +48,31 @@ _MASSES = (
 
 
 @njit(cache=True)
-def _legs_kernel(joints: Floats, height: float, ends: Floats) -> None:
-    """Write both ends of the lower and the middle legs into ``ends`` (3, 2, 2, 3) [m]."""
+def _legs_kernel(joints: Floats, height: float, balls: Floats) -> None:
+    """Write the lower and the middle legs as rows of balls into ``balls`` (3, 2, BALLS, 3) [m]."""
     frames = N_FINGERS * FRAMES_PER_FINGER
     origins, turns = np.empty((frames, 3)), np.empty((frames, 4))
     link_frames_kernel(joints, height, origins, turns)
     for finger in range(N_FINGERS):
-        first = FRAMES_PER_FINGER * finger
         for part in range(2):
-            frame = first + 4 - 2 * part
+            frame = FRAMES_PER_FINGER * finger + 4 - 2 * part
             x, y, z, w = turns[frame]
-            for k in range(3):
-                column = (2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w))
-                up = (2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y))
-                if part == 0:
-                    ends[finger, part, 0, k] = origins[frame, k]
-                    ends[finger, part, 1, k] = origins[frame, k] + _LEG * up[k]
-                else:
-                    ends[finger, part, 0, k] = origins[frame, k] + _MIDDLE_Y * column[k]
-                    ends[finger, part, 1, k] = ends[finger, part, 0, k] - _LEG * up[k]
+            aside = (2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w))
+            up = (2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y))
+            for ball in range(BALLS):
+                along = (1.0 - 2.0 * part) * _LEG * ball / (BALLS - 1)
+                for k in range(3):
+                    start = origins[frame, k] + part * _MIDDLE_Y * aside[k]
+                    balls[finger, part, ball, k] = start + along * up[k]
 
 
 @njit(cache=True)
 def deepest_kernel(
     joints: Floats, height: float, halves: Floats, centers: Floats, turns: Floats
 ) -> float:
-    """Measure how deep any leg lies in a box or in a leg of another finger.
+    """Compute how deep any leg lies in a box or in a leg of another finger.
+
+    A leg counts as a row of balls; what lies between two of them is up to 1.4 mm deeper.
 
     Args:
         joints: Shape (9,) [rad].
@@ -85,24 +84,28 @@ def deepest_kernel(
     Returns:
         The depth [m]; negative where all are apart.
     """
-    ends = np.empty((N_FINGERS, 2, 2, 3))
-    _legs_kernel(joints, height, ends)
+    balls = np.empty((N_FINGERS, 2, BALLS, 3))
+    _legs_kernel(joints, height, balls)
     deepest = -math.inf
     for finger in range(N_FINGERS):
         for part in range(2):
-            start, end = ends[finger, part]
-            radius = _LOWER if part == 0 else _MIDDLE
-            for box in range(len(halves)):
-                depth = box_capsule_kernel(
-                    halves[box], centers[box], turns[box], start, end, radius
-                )
-                deepest = max(deepest, depth)
-            for other in range(finger):
-                for piece in range(2):
-                    far = _LOWER if piece == 0 else _MIDDLE
-                    one, two = ends[other, piece]
-                    depth = capsule_capsule_kernel(start, end, radius, one, two, far)
-                    deepest = max(deepest, depth)
+            for ball in balls[finger, part]:
+                for box in range(len(halves)):
+                    outside, inside = 0.0, -math.inf
+                    for axis in range(3):
+                        along = 0.0
+                        for k in range(3):
+                            along += (ball[k] - centers[box, k]) * turns[box, k, axis]
+                        beyond = abs(along) - halves[box, axis]
+                        outside, inside = outside + max(beyond, 0.0) ** 2, max(inside, beyond)
+                    away = math.sqrt(outside) + min(inside, 0.0)
+                    deepest = max(deepest, _RADII[part] - away)
+                for other in range(finger):
+                    for piece in range(2):
+                        for one in balls[other, piece]:
+                            x, y, z = ball - one
+                            away = math.sqrt(x * x + y * y + z * z)
+                            deepest = max(deepest, _RADII[part] + _RADII[piece] - away)
     return deepest
 
 
@@ -158,30 +161,25 @@ def pressing(joints: Floats, height: float, forces: Floats) -> Floats:
 
 
 @njit(cache=True)
-def _poses_kernel(
-    tips: Floats,
-    near: Floats,
-    height: float,
-    halves: Floats,
-    centers: Floats,
-    turns: Floats,
-    joints: Floats,
-    reached: NDArray[np.bool_],
-    depths: Floats,
-) -> None:
-    """Write what ``Hand.poses`` returns into the last three."""
-    fingers = np.empty(N_FINGERS, dtype=np.bool_)
+def _poses(
+    tips: Floats, near: Floats, height: float, halves: Floats, centers: Floats, turns: Floats
+) -> tuple[Floats, NDArray[np.bool_], Floats]:
+    """Compute what ``Hand.poses`` returns."""
+    joints, fingers = np.empty(tips.shape), np.empty(N_FINGERS, dtype=np.bool_)
+    reached, depths = np.empty(len(tips), dtype=np.bool_), np.empty(len(tips))
     for row in range(len(tips)):
         inverse_kernel(tips[row], height, near[row], joints[row], fingers)
         reached[row] = fingers.all()
         depths[row] = deepest_kernel(joints[row], height, halves, centers, turns)
+    return joints, reached, depths
 
 
 @njit(cache=True)
-def _strengths_kernel(
-    joints: Floats, height: float, weights: Floats, limit: float, forces: Floats, out: Floats
-) -> None:
-    """Write what ``Hand.strengths`` returns into ``out`` (n,)."""
+def _strengths(
+    joints: Floats, height: float, weights: Floats, limit: float, forces: Floats
+) -> Floats:
+    """Compute what ``Hand.strengths`` returns."""
+    out = np.empty(len(joints))
     for row in range(len(joints)):
         own, unit = carrying(joints[row], weights), pressing(joints[row], height, forces[row])
         least = math.inf
@@ -190,6 +188,7 @@ def _strengths_kernel(
                 room = limit - own[joint] * np.sign(unit[joint])
                 least = min(least, room / abs(unit[joint]))
         out[row] = max(least, 0.0)
+    return out
 
 
 @final
@@ -198,10 +197,12 @@ class Hand:
 
     Args:
         values: Of the variables of a world.
-        period: Of control [s].
+
+    Attributes:
+        aside: Where unused fingertips are, shape (3, 3) [m].
     """
 
-    def __init__(self, values: Mapping[str, Value], period: float) -> None:
+    def __init__(self, values: Mapping[str, Value]) -> None:
         self.height = float(values["robot_height"])
         self._gains = np.tile(np.maximum(values["position_gains"], LEAST_GAIN), N_FINGERS)
         self._limit = STRENGTH * float(values["torque_limit"])
@@ -212,19 +213,13 @@ class Hand:
                 for finger in hardware.FINGERS
             ]
         )
-        # A damped spring whose target jumps once per control step lags behind a steady motion: a
-        # command must be so much earlier that a joint is there in time.
-        damping = float(values["joint_damping"]) + values["velocity_gains"]
-        damping = np.maximum(np.tile(damping + values["safety_damping"], N_FINGERS), LEAST_DAMPING)
-        left = np.exp(-period * self._gains / damping)
-        self._lead = period * left / (1.0 - left) / period
-        self._last: Floats | None = None
+        self.aside = self.tips(np.array(hardware.ASIDE)).reshape(3, 3)
 
-    def solve(self, tips: Floats, near: Floats) -> tuple[Floats, bool]:
-        """Find the joints for fingertips, shape (9,) [m]; tell whether all of them are reached."""
+    def solve(self, tips: Floats, near: Floats) -> Floats:
+        """Compute the joints for fingertips, shape (9,) [m], as near as they are reached."""
         joints, reached = np.empty(9), np.empty(3, dtype=np.bool_)
         inverse_kernel(tips, self.height, near, joints, reached)
-        return joints, bool(reached.all())
+        return joints
 
     def tips(self, joints: Floats) -> Floats:
         """Place the fingertips, shape (9,) [m]."""
@@ -232,30 +227,10 @@ class Hand:
         forward_kernel(joints, self.height, tips)
         return tips
 
-    def command(self, tips: Floats, forces: Floats, near: Floats) -> Floats:
-        """Find the joint positions to command so that fingertips come somewhere, and press.
-
-        The controller is a damped spring without gravity compensation: what it should carry and
-        press, and how far it lags behind, is added to where the joints should be.
-
-        Args:
-            tips: Shape (9,) [m].
-            forces: On what they touch, shape (3, 3) [N].
-            near: Joint positions to stay close to, shape (9,) [rad].
-
-        Returns:
-            Shape (9,) [rad], within the bounds of a command.
-        """
-        joints, _ = self.solve(tips, near)
-        wanted = joints + self.more(joints, forces)
-        if self._last is not None:
-            stride = np.minimum(np.maximum(joints - self._last, -STRIDE), STRIDE)
-            wanted += self._lead * stride
-        self._last = joints
-        return self.bounded(wanted)
-
     def more(self, joints: Floats, forces: Floats) -> Floats:
-        """Say what is added to joints so that they carry the fingers and press, shape (9,) [rad].
+        """Compute what joints need in addition to carry the fingers and press, shape (9,) [rad].
+
+        The controller is a damped spring without gravity compensation.
 
         Args:
             joints: Shape (9,) [rad].
@@ -284,21 +259,15 @@ class Hand:
             Joints, shape (n, 9) [rad]; whether all fingertips are reached, shape (n,); and the
             depths, shape (n,) [m].
         """
-        joints, reached, depths = (
-            np.empty(tips.shape),
-            np.empty(len(tips), bool),
-            np.empty(len(tips)),
-        )
-        _poses_kernel(tips, near, self.height, *boxes, joints, reached, depths)
-        return joints, reached, depths
+        found: tuple[Floats, NDArray[np.bool_], Floats] = _poses(tips, near, self.height, *boxes)
+        return found
 
     def strengths(self, joints: Floats, forces: Floats) -> Floats:
-        """Tell how many times some forces the fingers can exert, shape (n,).
+        """Compute how many times some forces the fingers can exert, shape (n,).
 
         Args:
             joints: Shape (n, 9) [rad].
             forces: Shape (n, 3, 3).
         """
-        strengths = np.empty(len(joints))
-        _strengths_kernel(joints, self.height, self.weights, self._limit, forces, strengths)
-        return strengths
+        found: Floats = _strengths(joints, self.height, self.weights, self._limit, forces)
+        return found

@@ -12,8 +12,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._types import Floats
-from scm_world.tasks.trifinger import hardware
+from scm_world._types import ArrayLike, Floats
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, solids, turn_about_z
 from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand
 
@@ -33,41 +32,13 @@ _Point = tuple[float, float, float]
 @final
 @dataclass(frozen=True)
 class Grip:
-    """Where fingertips touch a block, in its own frame.
+    """Where fingertips touch a block, in its own frame; or n such grips, with a leading axis.
 
     Attributes:
         touch: Centers of the fingertips as they touch, shape (3, 3) [m].
         inward: In which direction they press, each force as a share of the grip's, shape (3, 3).
-        used: Which fingers take part.
-        opening: How far from there they are while open [m].
-    """
-
-    touch: Floats
-    inward: Floats
-    used: tuple[bool, bool, bool]
-    opening: float
-
-    @property
-    def firm(self) -> bool:
-        """Whether all fingers take part, so that the block cannot swing."""
-        return all(self.used)
-
-    def points(self, opening: float) -> Floats:
-        """Give the fingertips at a distance from the faces, shape (3, 3) [m]."""
-        points: Floats = self.touch - opening * np.sign(self.inward)
-        return points
-
-
-@final
-@dataclass(frozen=True)
-class Grips:
-    """A table of grips; see ``Grip``.
-
-    Attributes:
-        touch: Shape (n, 3, 3) [m].
-        inward: Shape (n, 3, 3).
-        used: Shape (n, 3).
-        opening: Shape (n,) [m].
+        used: Which fingers take part, shape (3,).
+        opening: How far from there they are while open, shape () [m].
     """
 
     touch: Floats
@@ -75,18 +46,30 @@ class Grips:
     used: NDArray[np.bool_]
     opening: Floats
 
-    def only(self, rows: Any) -> Grips:
-        """Return some of them, by a mask or by their numbers."""
-        return Grips(self.touch[rows], self.inward[rows], self.used[rows], self.opening[rows])
+    @property
+    def firm(self) -> Any:
+        """Whether all fingers take part, so that the block cannot swing."""
+        return self.used.all(axis=-1)
 
-    def grip(self, row: int) -> Grip:
-        """Return one of them."""
-        one, two, three = self.used[row].tolist()
-        return Grip(self.touch[row], self.inward[row], (one, two, three), float(self.opening[row]))
+    def only(self, rows: Any) -> Grip:
+        """Return some of n grips, by a mask or by their numbers."""
+        return Grip(self.touch[rows], self.inward[rows], self.used[rows], self.opening[rows])
+
+    def place(self, hand: Hand, body: Cuboid, opening: ArrayLike) -> Floats:
+        """Place the fingertips about a block, shape (3, 3) [m]; unused ones are out of the way.
+
+        Args:
+            hand: The robot.
+            body: The block.
+            opening: How far from its faces the fingertips are, shape () [m].
+        """
+        points = self.touch - np.reshape(opening, (-1, 1, 1)) * np.sign(self.inward)
+        tips = np.where(self.used[..., None], body.world(points), hand.aside)
+        return tips.reshape(self.touch.shape)
 
 
 @lru_cache(maxsize=64)
-def gripped(x: float, y: float, z: float) -> Grips:
+def gripped(x: float, y: float, z: float) -> Grip:
     """List the ways to hold a block with these half edges [m]: one finger against two, or one."""
     half, found = (x, y, z), list[tuple[Floats, Floats, float]]()
     for axis, level, opening in product((0, 1), LEVELS, OPENINGS):
@@ -109,7 +92,7 @@ def gripped(x: float, y: float, z: float) -> Grips:
     touches, presses, openings = zip(*found, strict=True)
     inwards: Floats = np.array(presses)
     used: NDArray[np.bool_] = np.any(inwards != 0.0, axis=2)
-    return Grips(np.array(touches), inwards, used, np.array(openings))
+    return Grip(np.array(touches), inwards, used, np.array(openings))
 
 
 Way = tuple[Cuboid, float]
@@ -129,8 +112,6 @@ SAMPLES = 9
 FIRMNESS = 0.5
 TURNING = 0.3  # [1/rad]
 TIGHT = 0.1
-REACHING = 0.5  # [1/m]
-MEETING = 0.3
 PLENTY = 0.05
 """What makes a way better or worse. A force that is just enough is worth 1."""
 
@@ -148,7 +129,6 @@ class Move:
         height: Of its center as it is carried [m].
         above: Of the fingertips on their way to it, and away [m].
         strength: With which it can be pressed everywhere on the way [N].
-        worth: How good the way is; more is better.
         release: Whether it is let go at the end.
     """
 
@@ -159,7 +139,6 @@ class Move:
     height: float
     above: float
     strength: float
-    worth: float
     release: bool
 
     @property
@@ -181,8 +160,6 @@ class Planner:
     def __init__(self, hand: Hand, joints: Floats, others: Iterable[Cuboid]) -> None:
         self._hand, self._joints = hand, joints
         self._others = tuple(others)
-        self._boxes = solids(self._others, CLEAR)
-        self._aside = hand.tips(np.array(hardware.ASIDE)).reshape(3, 3)
 
     def best(
         self,
@@ -191,17 +168,17 @@ class Planner:
         *,
         wanted: float,
         release: bool,
-        swings: bool = False,
     ) -> Move | None:
         """Find the best way to bring a block to one of some places.
+
+        Two fingers rather than three lift it from the floor: each of the two on one side of three
+        presses half as much, and slips sooner.
 
         Args:
             start: The block as it is.
             ends: Where it may go, and by how much it turns on the way [rad].
             wanted: With which force it should be pressed [N].
             release: Whether it is let go there.
-            swings: Whether two fingers rather than three lift it from the floor: each of the two
-                on one side of three presses half as much, and slips sooner.
 
         Returns:
             The best way, or None if the fingers can go none.
@@ -217,8 +194,7 @@ class Planner:
         table = table.only(self._opens(table, start, over))
         first = self._strengths(table, start)
         table, first = table.only(first > 0.0), first[first > 0.0]
-        ease = FIRMNESS * table.used.all(axis=1) - TIGHT * (table.opening < max(OPENINGS))
-        ease += self._transit(table, start, over)
+        ease = FIRMNESS * table.firm - TIGHT * (table.opening < max(OPENINGS))
         worths, strengths = (
             np.full((len(ease), len(ways)), -np.inf),
             np.zeros((len(ease), len(ways))),
@@ -235,37 +211,16 @@ class Planner:
                 rows, held = rows[held > 0.0], held[held > 0.0]
             share = held / wanted
             enough = np.minimum(share, 1.0) + PLENTY * np.minimum(share, 3.0)
-            loose = 2.0 * FIRMNESS * (swings and height > start.place[2] + CLEARANCE)
-            worths[rows, way] = (
-                ease[rows] - loose * table.used[rows].all(axis=1) - TURNING * abs(turn) + enough
-            )
+            loose = 2.0 * FIRMNESS * (height > start.place[2] + CLEARANCE)
+            worths[rows, way] = ease[rows] - loose * table.firm[rows] - TURNING * abs(turn) + enough
             strengths[rows, way] = held
         if not np.isfinite(worths).any():
             return None
         row, way = divmod(int(worths.argmax()), len(ways))
         _, turn, height, end = ways[way]
         above = self._above(start, *[end] * release)
-        numbers = float(strengths[row, way]), float(worths[row, way])
-        return Move(table.grip(row), start, end, turn, height, above, *numbers, release)
-
-    def place(self, grip: Grip, body: Cuboid, opening: float, above: float | None = None) -> Floats:
-        """Place the fingertips about a block.
-
-        Args:
-            grip: How it is held.
-            body: Where it is.
-            opening: How far from its faces the fingertips are [m].
-            above: Their height, if they are not yet beside it [m].
-
-        Returns:
-            Shape (9,) [m]; unused fingers are out of the way.
-        """
-        tips = body.world(grip.points(opening))
-        if above is not None:
-            tips[:, 2] = above
-        idle = ~np.array(grip.used)
-        tips[idle] = self._aside[idle]
-        return tips.ravel()
+        strength = float(strengths[row, way])
+        return Move(table.only(row), start, end, turn, height, above, strength, release)
 
     # --- heights ------------------------------------------------------------------------------
 
@@ -287,62 +242,35 @@ class Planner:
 
     # --- judging ------------------------------------------------------------------------------
 
-    def _tips(
-        self, table: Grips, body: Cuboid, opening: Floats | float, above: float | None = None
-    ) -> Floats:
-        """Place the fingertips about a block for each grip, shape (n, 9) [m]; see ``place``."""
-        points = table.touch - np.reshape(opening, (-1, 1, 1)) * np.sign(table.inward)
-        tips = body.place + points @ turn_about_z(body.yaw).T
-        if above is not None:
-            tips[..., 2] = above
-        placed: Floats = np.where(table.used[..., None], tips, self._aside).reshape(-1, 9)
-        return placed
-
-    def _strengths(self, table: Grips, body: Cuboid) -> Floats:
+    def _strengths(self, table: Grip, body: Cuboid) -> Floats:
         """Find with which force grips can hold a block somewhere, shape (n,) [N]; 0 if not."""
-        joints, reached, depth = self._poses(
-            self._tips(table, body, 0.0), block=body, margin=-TOUCH
-        )
+        tips = table.place(self._hand, body, 0.0)
+        joints, reached, depth = self._poses(tips, None, (body, -TOUCH))
         forces = table.inward @ turn_about_z(body.yaw).T
         strengths = self._hand.strengths(joints, forces)
         return np.where(reached & (depth <= 0.0), strengths, 0.0)
 
-    def _opens(self, table: Grips, body: Cuboid, above: float) -> NDArray[np.bool_]:
+    def _opens(self, table: Grip, body: Cuboid, above: float) -> NDArray[np.bool_]:
         """Tell whether open fingers can be about a block, and above it, shape (n,)."""
-        tips = self._tips(table, body, table.opening)
-        joints, reached, depth = self._poses(tips, block=body, margin=OPEN)
+        tips = table.place(self._hand, body, table.opening)
+        joints, reached, depth = self._poses(tips, None, (body, OPEN))
         opens = reached & (depth <= 0.0)
-        tips = self._tips(table.only(opens), body, table.opening[opens], above)
-        _, reached, depth = self._poses(tips, near=joints[opens])
+        _, reached, depth = self._poses(_above(tips, table, above)[opens], joints[opens])
         opens[opens] = reached & (depth <= 0.0)
         return opens
 
-    def _transit(self, table: Grips, body: Cuboid, above: float) -> Floats:
-        """Judge ways to the block: fingers should not meet; the shorter, the better. Shape (n,)."""
-        first = self._hand.tips(self._joints)
-        first[2::3] = np.maximum(first[2::3], above)
-        last = self._tips(table, body, table.opening, above)
-        worth: Floats = -REACHING * np.abs(last - first).max(axis=1, initial=0.0)
-        for share in (0.3, 0.6, 0.9):
-            _, _, depth = self._poses((1.0 - share) * first + share * last)
-            worth -= MEETING * (depth > 0.0)
-        return worth
-
     def _poses(
-        self,
-        tips: Floats,
-        near: Floats | None = None,
-        block: Cuboid | None = None,
-        margin: float = 0.0,
+        self, tips: Floats, near: Floats | None = None, *more: tuple[Cuboid, float]
     ) -> tuple[Floats, NDArray[np.bool_], Floats]:
         """Find joints for fingertips, and how deep fingers then lie in anything; see ``Hand``."""
-        boxes = self._boxes
-        if block is not None:
-            half, place, axes = solids([block], margin)
-            boxes = (
-                np.concatenate([boxes[0], half]),
-                np.concatenate([boxes[1], place]),
-                np.concatenate([boxes[2], axes]),
-            )
-        begin = np.broadcast_to(self._joints, tips.shape) if near is None else near
-        return self._hand.poses(tips, np.ascontiguousarray(begin), boxes)
+        rows = np.ascontiguousarray(tips).reshape(-1, 9)
+        begin = np.tile(self._joints, (len(rows), 1)) if near is None else near
+        clear = ((other, CLEAR) for other in self._others)
+        return self._hand.poses(rows, begin, solids((*clear, *more)))
+
+
+def _above(tips: Floats, table: Grip, height: float) -> Floats:
+    """Bring the fingertips of grips to a height, shape (n, 3, 3) [m]; unused ones stay."""
+    raised = tips.copy()
+    raised[..., 2] = np.where(table.used, height, tips[..., 2])
+    return raised

@@ -1,0 +1,898 @@
+"""The parameters of a compiled model: a table of rows, and what makes fields of them.
+
+What may be changed, and what has to follow, is MuJoCo's own table (*Programming, Simulation,
+mjModel changes*); every class was tried on foreign models by writing, undoing and comparing all
+arrays bit by bit. Since MuJoCo 3.16 ``mj_setConst`` derives the bounds of shapes from their sizes
+and places, so that nothing here needs another compilation.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from typing import Any, Literal, NamedTuple, final
+
+import mujoco
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.backends.mujoco.slots import Slot, color, direction, first, gain, option, place, turn
+from scm_world.backends.mujoco.trees import NOTHING, Couplings, Effect, disabled
+from scm_world.models.model import Numbers
+from scm_world.models.scene import ParameterKey
+
+_OBJ, _TRN, _WRAP, _OFF = mujoco.mjtObj, mujoco.mjtTrn, mujoco.mjtWrap, mujoco.mjtDisableBit
+_GAIN, _BIAS, _DYN, _GEOM = mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtDyn, mujoco.mjtGeom
+FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in (
+    "FREE", "BALL", "SLIDE", "HINGE",
+))  # fmt: skip
+
+FRICTIONS = ("friction", "torsional_friction", "rolling_friction")
+MEDIUM = ("density", "viscosity")
+"""Options that make a medium act, and wind with it."""
+
+SMALLEST = 1e-9
+"""Below this no mass [kg], time [s] or length [m] is accepted."""
+
+FORCES, INERTIAS = {"m": "N", "rad": "N m"}, {"m": "kg", "rad": "kg m^2"}
+"""Units of a force and of an inertia along a coordinate, by its unit."""
+
+Slots = Callable[[mujoco.MjModel, mujoco.MjData], Slot]
+"""Finds a place in a model and its data."""
+
+
+@final
+@dataclass(frozen=True)
+class Field:
+    """A parameter of one element of a compiled model.
+
+    Attributes:
+        kind: Of the element: ``"body"``, ``"joint"``, ..., or ``"option"``.
+        element: Its name, ``""`` for an option.
+        attribute: What it is.
+        unit: SI unit.
+        doc: One sentence.
+        slot: Finds its place in a model and its data.
+        effect: The trees it acts on.
+        low: Lower bound.
+        high: Upper bound.
+        nature: The kind of its values.
+        usual: Whether it is exposed unless something else is asked for.
+        visual: Whether it acts on pictures only.
+        refusal: Why it cannot be set, to be read after its name; empty if it can.
+        name: Unique in the model.
+    """
+
+    kind: str
+    element: str
+    attribute: str
+    unit: str
+    doc: str
+    slot: Slots | None
+    effect: Callable[[], Effect] = lambda: NOTHING
+    low: Numbers = -math.inf
+    high: Numbers = math.inf
+    nature: Literal["real", "rotation", "inertia", "switch"] = "real"
+    usual: bool = True
+    visual: bool = False
+    refusal: str = ""
+    name: str = ""
+
+    @property
+    def plain_name(self) -> str:
+        """The name, if no other element has the same."""
+        return f"{self.element}.{self.attribute}" if self.element else self.attribute
+
+    @property
+    def key(self) -> ParameterKey:
+        """How engines know it."""
+        element, _, attribute = self.name.rpartition(".")
+        return element, attribute
+
+
+# --- elements ----------------------------------------------------------------------------------
+
+
+@final
+@dataclass(frozen=True)
+class Element:
+    """A body, joint, shape, ... of a compiled model; ``element["mass"]`` is its entry of an array.
+
+    Attributes:
+        mj: The model, which is only read.
+        trees: Its trees.
+        fluid: Whether a medium acts, or may be made to act.
+        kind: See ``KINDS``.
+        i: Its number among those of its kind.
+        name: Its name.
+    """
+
+    mj: mujoco.MjModel
+    trees: Couplings
+    fluid: bool
+    kind: str
+    i: int
+    name: str
+
+    def __getitem__(self, array: str) -> Any:
+        return getattr(self.mj, f"{KINDS[self.kind].prefix}_{array}")[self.i]
+
+    def is_(self, array: str, *members: Any) -> bool:
+        """Return whether an entry is one of some constants of MuJoCo."""
+        return int(self[array]) in map(int, members)
+
+    @property
+    def body(self) -> int:
+        """Number of its body."""
+        return self.i if self.kind == "body" else int(self["bodyid"])
+
+    @property
+    def moves(self) -> bool:
+        """Whether it belongs to a body that moves, and is not but a vertex of a flex."""
+        vertex = self.body in self.mj.flex_vertbodyid or self.body in self.mj.flex_nodebodyid
+        return bool(self.mj.body_treeid[self.body] >= 0) and not vertex
+
+    @property
+    def heavy(self) -> bool:
+        """Whether the inertia of a body acts."""
+        return self.trees.tree(self.i) >= 0 and self["mass"] > 0.0
+
+    @property
+    def turns(self) -> bool:
+        """Whether a joint on the way to a body turns it, or it cannot move at all."""
+        body = self.i
+        while body and self.mj.body_treeid[self.i] >= 0:
+            start = int(self.mj.body_jntadr[body])
+            if any(self.mj.jnt_type[start : start + int(self.mj.body_jntnum[body])] != SLIDE):
+                return True
+            body = int(self.mj.body_parentid[body])
+        return body > 0
+
+    @property
+    def is_simple(self) -> bool:
+        """Whether the compiler has fixed the place of the center of mass and of the joints."""
+        return bool(self.mj.body_simple[self.body])
+
+    @property
+    def is_free(self) -> bool:
+        """Whether a body moves by a free joint."""
+        joint = int(self["jntadr"])
+        return joint >= 0 and bool(self.mj.jnt_type[joint] == FREE)
+
+    @property
+    def length(self) -> str:
+        """Unit of the coordinate of a joint, a tendon or an actuator."""
+        match self.kind:
+            case "joint":
+                return {SLIDE: "m", FREE: "1"}.get(int(self["type"]), "rad")
+            case "tendon":
+                return tendon_unit(self.mj, self.i)
+            case _:
+                return _length_unit(self.mj, self.i)
+
+    @property
+    def dofs(self) -> Any:
+        """Places of a joint in arrays of degrees of freedom: a number, or a slice of several."""
+        start = int(self["dofadr"])
+        count = {FREE: 6, BALL: 3}.get(int(self["type"]), 1)
+        return start if count == 1 else slice(start, start + count)
+
+    @property
+    def rolls(self) -> bool:
+        """Whether a tendon runs around shapes."""
+        start = int(self["adr"])
+        path = self.mj.wrap_type[start : start + int(self["num"])].tolist()
+        return int(_WRAP.mjWRAP_SPHERE) in path or int(_WRAP.mjWRAP_CYLINDER) in path
+
+    @property
+    def servo(self) -> str:
+        """The kind of servo that an actuator is; see ``servo``."""
+        return servo(self.mj, self.i)
+
+    @property
+    def gears(self) -> int:
+        """How many components of the gear of an actuator are in use."""
+        kind = int(self["trntype"])
+        if kind not in _JOINTS:
+            return _GEARS.get(kind, 0)
+        return {FREE: 6, BALL: 3}.get(int(self.mj.jnt_type[self["trnid"][0]]), 1)
+
+    @property
+    def times(self) -> int:
+        """How many time constants an actuator has."""
+        return _TIMES.get(int(self["dyntype"]), 0)
+
+
+_JOINTS = (int(_TRN.mjTRN_JOINT), int(_TRN.mjTRN_JOINTINPARENT))
+_GEARS = {int(_TRN.mjTRN_SITE): 6, int(_TRN.mjTRN_TENDON): 1, int(_TRN.mjTRN_SLIDERCRANK): 1}
+_TIMES = {
+    int(_DYN.mjDYN_FILTER): 1,
+    int(_DYN.mjDYN_FILTEREXACT): 1,
+    int(_DYN.mjDYN_MUSCLE): 2,
+}
+
+
+def tendon_unit(mj: mujoco.MjModel, tendon: int) -> str:
+    """Return the unit of the length of a tendon; ``"1"`` where it sums meters and radians."""
+    start, count = int(mj.tendon_adr[tendon]), int(mj.tendon_num[tendon])
+    if mj.wrap_type[start] != int(_WRAP.mjWRAP_JOINT):
+        return "m"
+    joints = mj.wrap_objid[start : start + count]
+    units = {"m" if mj.jnt_type[joint] == SLIDE else "rad" for joint in joints}
+    return units.pop() if len(units) == 1 else "1"
+
+
+def _length_unit(mj: mujoco.MjModel, actuator: int) -> str:
+    """Return the unit of the length of an actuator; ``"1"`` where a gear or several axes mix it."""
+    kind, target = int(mj.actuator_trntype[actuator]), int(mj.actuator_trnid[actuator, 0])
+    if mj.actuator_gear[int(mj.actuator_outadr[actuator]), 0] != 1.0:
+        return "1"
+    if kind == int(_TRN.mjTRN_TENDON):
+        return tendon_unit(mj, target)
+    joint = int(mj.jnt_type[target]) if kind == int(_TRN.mjTRN_JOINT) else FREE
+    return {HINGE: "rad", SLIDE: "m"}.get(joint, "1")
+
+
+def servo(mj: mujoco.MjModel, actuator: int) -> str:
+    """Return ``"position"`` or ``"velocity"`` of a servo, ``"damper"``, or ``""``."""
+    gains, bias = mj.actuator_gainprm[actuator], mj.actuator_biasprm[actuator]
+    affine = mj.actuator_biastype[actuator] == int(_BIAS.mjBIAS_AFFINE)
+    if mj.actuator_gaintype[actuator] == int(_GAIN.mjGAIN_AFFINE):
+        return "damper" if not gains[:2].any() and gains[2] <= 0.0 and not affine else ""
+    fixed = mj.actuator_gaintype[actuator] == int(_GAIN.mjGAIN_FIXED)
+    if not (fixed and affine) or bias[0] != 0.0 or gains[0] <= 0.0 or bias[2] > 0.0:
+        return ""
+    if bias[1] == -gains[0]:
+        return "position"
+    return "velocity" if bias[1] == 0.0 and bias[2] == -gains[0] else ""
+
+
+def control_unit(mj: mujoco.MjModel, actuator: int) -> str:
+    """Return the unit of the control of an actuator; ``"1"`` where gears and gains scale it."""
+    unit = _length_unit(mj, actuator)
+    match servo(mj, actuator):
+        case "position":
+            return unit if mj.actuator_dyntype[actuator] != int(_DYN.mjDYN_INTEGRATOR) else "1"
+        case "velocity":
+            return f"{unit}/s" if unit != "1" else "1"
+        case _:
+            plain = mj.actuator_gaintype[actuator] == int(_GAIN.mjGAIN_FIXED)
+            plain = plain and mj.actuator_gainprm[actuator, 0] == 1.0
+            return FORCES.get(unit, "1") if plain and not mj.actuator_dyntype[actuator] else "1"
+
+
+# --- rows --------------------------------------------------------------------------------------
+
+
+@final
+@dataclass(frozen=True)
+class Row:
+    """A parameter that every element of a kind has. What depends on the element is a function.
+
+    Attributes:
+        attribute: What it is.
+        unit: SI unit; L is that of the coordinate, F of a force and I of an inertia along it.
+        doc: One sentence.
+        array: The array of the model; a function that finds the slot; or ``""`` if nothing can be
+            written.
+        at: Place in the array; the number of the element by default.
+        constant: Whether constants of the model follow it (``mj_setConst``).
+        low: Lower bound, or a function of the present value.
+        high: Upper bound, likewise.
+        nature: The kind of its values.
+        usual: Whether it is exposed by default; a function of the element and the present value.
+        visual: Whether it acts on pictures only.
+        exists: Which elements have it.
+        flags: Flags of the model that disable it, with what they disable.
+        acts: Whether it can be set, if no flag disables it.
+        reason: Why not, to be read after its name.
+        effect: The trees it acts on; those of the kind by default.
+    """
+
+    attribute: str
+    unit: str | Callable[[Element], str]
+    doc: str | Callable[[Element], str]
+    array: str | Callable[[Element], Slots] = ""
+    at: Callable[[Element], Any] = lambda e: e.i
+    constant: bool = False
+    low: Numbers | Callable[[Floats], Numbers] = -math.inf
+    high: Numbers | Callable[[Floats], Numbers] = math.inf
+    nature: Literal["real", "rotation", "inertia", "switch"] = "real"
+    usual: bool | Callable[[Element, Floats], bool] = True
+    visual: bool | Callable[[Element], bool] = False
+    exists: Callable[[Element], bool] = lambda e: True
+    flags: tuple[tuple[mujoco.mjtDisableBit, str], ...] = ()
+    acts: Callable[[Element], bool] = lambda e: True
+    reason: str = ""
+    effect: Callable[[Element], Effect] | None = None
+
+
+def _field(row: Row, e: Element) -> Field:
+    """Return the field of an element."""
+    value = np.empty(0)
+    slot: Slots | None = None
+    if callable(row.array):
+        slot = row.array(e)
+    elif row.array:
+        index = row.at(e)
+        index = index if isinstance(index, tuple) else (index,)
+        repeated = first if isinstance(index[0], slice) else None
+        value = getattr(e.mj, row.array)[index]
+        slot = partial(_at, row.array, (*index, ...), row.constant, repeated)
+    refusal = next(
+        (f"acts on nothing: the model disables {what}" for flag, what in row.flags
+         if disabled(e.mj, flag)),
+        "" if slot is not None and row.acts(e) else row.reason.format(e.name),
+    )  # fmt: skip
+    effect = row.effect or KINDS[e.kind].effect
+    return Field(
+        e.kind,
+        e.name,
+        row.attribute,
+        row.unit(e) if callable(row.unit) else _unit(row.unit, e),
+        row.doc(e) if callable(row.doc) else row.doc,
+        slot,
+        lambda: effect(e),
+        row.low(value) if callable(row.low) else row.low,
+        row.high(value) if callable(row.high) else row.high,
+        row.nature,
+        row.usual(e, value) if callable(row.usual) else row.usual,
+        row.visual(e) if callable(row.visual) else row.visual,
+        refusal,
+    )
+
+
+def _unit(written: str, e: Element) -> str:
+    """Return the unit of a row; ``"1"`` where that of the coordinate is none."""
+    if "{" not in written:
+        return written
+    length = e.length
+    if length == "1":
+        return "1"
+    return written.format(L=length, F=FORCES[length], I=INERTIAS[length])
+
+
+def _at(
+    array: str,
+    index: tuple[Any, ...],
+    constant: bool,
+    back: Callable[[Any], Any] | None,
+    mj: mujoco.MjModel,
+    _: mujoco.MjData,
+) -> Slot:
+    return place(getattr(mj, array)[index], constant=constant, back=back)
+
+
+def _positive(value: Floats) -> float:
+    """Return a lower bound for what has to be positive."""
+    return min(SMALLEST, float(np.min(value)))
+
+
+def _not_negative(value: Floats) -> float:
+    """Return a lower bound for what is rarely negative."""
+    return min(0.0, float(np.min(value)))
+
+
+def _nonzero(_: Element, value: Floats) -> bool:
+    return bool(np.any(value))
+
+
+def _quaternion(array: str) -> Callable[[Element], Slots]:
+    return lambda e: lambda mj, _: turn(getattr(mj, array)[e.i])
+
+
+def _gains(*places: tuple[str, int, int]) -> Callable[[Element], Slots]:
+    """Find a gain in arrays of the model: each with a column, and a sign."""
+
+    def found(e: Element, mj: mujoco.MjModel, _: mujoco.MjData) -> Slot:
+        plus, minus = (
+            [getattr(mj, f"actuator_{array}")[e.i, column, ...] for array, column, of in places
+             if of == sign]
+            for sign in (1, -1)
+        )  # fmt: skip
+        return gain(plus, minus)
+
+    return lambda e: partial(found, e)
+
+
+def _pose(kind: str, what: str) -> tuple[Row, Row]:
+    """List where a shape or a site is."""
+    where = f"of the {what} in the frame of its body."
+    return (
+        Row("position", "m", f"Place {where}", f"{kind}_pos", constant=True, usual=False),
+        Row("orientation", "1", f"Orientation {where}", _quaternion(f"{kind}_quat"), low=-1.0,
+            high=1.0, nature="rotation", usual=False),
+    )  # fmt: skip
+
+
+def _solver(prefix: str, suffix: str = "", **rest: Any) -> tuple[Row, Row]:
+    """List how stiff and how hard a constraint is."""
+    rest["usual"] = False
+
+    def doc(e: Element) -> str:
+        if (getattr(e.mj, f"{prefix}_solref")[e.i] < 0.0).any():
+            return "Stiffness and damping of the constraint, both negative."
+        return "Time constant [s] and damping ratio of the constraint."
+
+    def low(v: Floats) -> Numbers:
+        return -math.inf if (v < 0.0).any() else (_positive(v[0]), _positive(v[1]))
+
+    return (
+        Row(f"solref{suffix}", "1", doc, f"{prefix}_solref", low=low,
+            high=lambda v: 0.0 if (v < 0.0).any() else math.inf, **rest),
+        Row(f"solimp{suffix}", "1",
+            "Smallest and largest impedance, width of the transition, its midpoint and power.",
+            f"{prefix}_solimp", low=(0.0, 0.0, 0.0, 0.0, 1.0),
+            high=(1.0, 1.0, math.inf, 1.0, math.inf), **rest),
+    )  # fmt: skip
+
+
+_GRAVITY = ((_OFF.mjDSBL_GRAVITY, "gravity"),)
+_DAMPER = ((_OFF.mjDSBL_DAMPER, "damping"),)
+_SPRING = ((_OFF.mjDSBL_SPRING, "springs"),)
+_LIMIT = ((_OFF.mjDSBL_LIMIT, "limits"),)
+_CONTACT = ((_OFF.mjDSBL_CONTACT, "contact"),)
+_FRICTION = ((_OFF.mjDSBL_FRICTIONLOSS, "friction loss"),)
+_CONSTRAINT = ((_OFF.mjDSBL_CONSTRAINT, "constraints"),)
+_EQUALITY = ((_OFF.mjDSBL_EQUALITY, "equality constraints"),)
+_UNLIMITED = "is not in force: it has no limits"
+_SIMPLE = "is fixed by the compiler; write simple='false' at the body"
+_WEIGHTLESS = "acts on nothing: the body cannot move, or has no mass"
+_UNTOUCHED = "acts on nothing: the shape touches nothing"
+_FRICTIONLESS = "acts on nothing: its contacts have a smaller condim, or there are none"
+_WHOLE = "is a whole number that only another file can change"
+_SHOWN = 3
+"""MuJoCo draws the first groups of shapes unless it is asked for others."""
+
+_SIZES = {
+    int(_GEOM.mjGEOM_SPHERE): (1, "Radius"),
+    int(_GEOM.mjGEOM_CAPSULE): (2, "Radius, and half length of the cylinder part,"),
+    int(_GEOM.mjGEOM_CYLINDER): (2, "Radius and half length"),
+    int(_GEOM.mjGEOM_ELLIPSOID): (3, "Radii along the axes"),
+    int(_GEOM.mjGEOM_BOX): (3, "Half edge lengths"),
+}
+
+
+def _sized(e: Element) -> bool:
+    return int(e["type"]) in _SIZES
+
+
+def _word(e: Element) -> str:
+    return str(mujoco.mjtGeom(int(e["type"])).name).removeprefix("mjGEOM_").lower()
+
+
+def _columns(count: int) -> Any:
+    """Return the first columns of an array: a number, or a slice of several."""
+    return 0 if count == 1 else slice(count)
+
+
+_BODY = (
+    Row("mass", "kg", "Mass of the body; its inertia stays as it is.", "body_mass", constant=True,
+        low=_positive, usual=lambda e, v: e.moves, acts=lambda e: e.heavy, reason=_WEIGHTLESS),
+    Row("inertia", "kg m^2", "Principal moments of inertia of the body.", "body_inertia",
+        constant=True, low=_positive, nature="inertia", usual=lambda e, v: e.moves,
+        acts=lambda e: e.heavy and e["inertia"].all() and e.turns,
+        reason="acts on nothing: the body never turns, or has no inertia"),
+    Row("center_of_mass", "m", "Center of mass in the frame of the body.", "body_ipos",
+        constant=True, usual=False, acts=lambda e: e.heavy and not e.is_simple,
+        reason=f"{_SIMPLE}, unless it has no mass"),
+    Row("gravcomp", "1", "Share of the weight of the body that is held up.", "body_gravcomp",
+        constant=True, usual=lambda e, v: e.moves and v != 0.0, acts=lambda e: e.heavy,
+        flags=_GRAVITY, reason=_WEIGHTLESS),
+    Row("position", "m", "Place of a body that is moved from outside.",
+        lambda e: lambda mj, data: place(data.mocap_pos[e["mocapid"]]),
+        exists=lambda e: e["mocapid"] >= 0, effect=lambda e: e.trees.frame(e.i)),
+    Row("orientation", "1", "Orientation of a body that is moved from outside.",
+        lambda e: lambda mj, data: turn(data.mocap_quat[e["mocapid"]], constant=False),
+        low=-1.0, high=1.0, nature="rotation", exists=lambda e: e["mocapid"] >= 0,
+        effect=lambda e: e.trees.frame(e.i)),
+    Row("position", "m", "", exists=lambda e: e["mocapid"] < 0 and e.is_free, usual=False,
+        reason="is a state: set {}.cartesian_position"),
+    Row("position", "m", "Place of the frame of the body in its parent.", "body_pos",
+        constant=True, usual=False, exists=lambda e: e["mocapid"] < 0 and not e.is_free,
+        effect=lambda e: e.trees.frame(e.i)),
+    Row("orientation", "1", "Orientation of the body in its parent.", _quaternion("body_quat"),
+        low=-1.0, high=1.0, nature="rotation", usual=False,
+        exists=lambda e: e["mocapid"] < 0 and not e.is_free,
+        effect=lambda e: e.trees.frame(e.i)),
+)  # fmt: skip
+
+
+def _resisted(e: Element, value: Floats) -> bool:
+    """Return whether what resists a joint is exposed; a free joint mixes units."""
+    return (e["type"] != FREE and e.moves) or bool(value.flat[0])
+
+
+def _alike(array: str) -> Callable[[Element], bool]:
+    """Return whether one number says what the file says."""
+    return lambda e: bool(np.ptp(getattr(e.mj, array)[e.dofs]) == 0.0)
+
+
+_UNEVEN = "is not the same about all axes of the joint"
+
+
+def _scalar(e: Element) -> bool:
+    return e["type"] in (SLIDE, HINGE)
+
+
+_LIMITED: dict[str, Any] = {
+    "exists": _scalar,
+    "usual": False,
+    "flags": _LIMIT,
+    "acts": lambda e: e["limited"],
+    "reason": _UNLIMITED,
+}
+_JOINT = (
+    Row("damping", "{F} s/{L}", "Force against the motion, for each unit of velocity.",
+        "dof_damping", lambda e: e.dofs, low=0.0, usual=_resisted, flags=_DAMPER,
+        acts=_alike("dof_damping"), reason=_UNEVEN),
+    Row("armature", "{I}", "Inertia that the joint itself adds.", "dof_armature",
+        lambda e: e.dofs, constant=True, low=0.0, usual=_resisted, acts=_alike("dof_armature"),
+        reason=_UNEVEN),
+    Row("frictionloss", "{F}", "Dry friction: the force that motion has to overcome.",
+        "dof_frictionloss", lambda e: e.dofs, low=0.0, usual=_resisted,
+        flags=_FRICTION + _CONSTRAINT, acts=_alike("dof_frictionloss"), reason=_UNEVEN),
+    Row("stiffness", "{F}/{L}", "Stiffness of a spring that pulls to springref.",
+        "jnt_stiffness", low=0.0, usual=_resisted, flags=_SPRING),
+    Row("springref", "{L}", "Position in which the spring is at rest.",
+        "qpos_spring", lambda e: int(e["qposadr"]), constant=True, exists=_scalar, flags=_SPRING,
+        usual=lambda e, v: bool(e["stiffness"])),
+    Row("ref", "{L}", "Position of the joint in the pose of the file.", "qpos0",
+        lambda e: int(e["qposadr"]), constant=True, exists=_scalar, usual=False),
+    Row("range", "{L}", "Lower and upper limit of the joint.", "jnt_range", **_LIMITED),
+    Row("margin", "{L}", "Distance from the limits at which they begin to act.", "jnt_margin",
+        low=0.0, **_LIMITED),
+    *_solver("jnt", "limit", **_LIMITED),
+    Row("actuatorfrcrange", "{F}", "Range of the force of all its actuators.",
+        "jnt_actfrcrange", exists=_scalar, usual=False, acts=lambda e: e["actfrclimited"],
+        reason=_UNLIMITED),
+    Row("axis", "1", "Unit vector of the axis in the frame of the body.",
+        lambda e: lambda mj, _: direction(mj.jnt_axis[e.i]), low=-1.0, high=1.0, exists=_scalar,
+        usual=False, acts=lambda e: not e.is_simple, reason=_SIMPLE),
+    Row("anchor", "m", "Point of the body through which the axis goes.", "jnt_pos",
+        constant=True, exists=_scalar, usual=False,
+        acts=lambda e: e["type"] != SLIDE and not e.is_simple,
+        reason=f"acts on nothing if the joint slides; otherwise it {_SIMPLE}"),
+)  # fmt: skip
+
+
+def _rubs(condim: int) -> dict[str, Any]:
+    """Return when a coefficient of friction acts."""
+    return {
+        "low": 0.0,
+        "acts": lambda e: e.trees.highest_condim(e.i) >= condim,
+        "reason": _FRICTIONLESS,
+        "effect": lambda e: e.trees.contact_of(e.i),
+    }
+
+
+_TOUCHES: dict[str, Any] = {
+    "acts": lambda e: e.trees.highest_condim(e.i) > 0,
+    "reason": _UNTOUCHED,
+    "effect": lambda e: e.trees.contact_of(e.i),
+}
+_SHAPE = (
+    Row("friction", "1", "Coefficient of sliding friction; a contact has the larger of two.",
+        "geom_friction", lambda e: (e.i, 0), **_rubs(3)),
+    Row("torsional_friction", "m", "Coefficient of friction against turning on a spot.",
+        "geom_friction", lambda e: (e.i, 1), **_rubs(4)),
+    Row("rolling_friction", "m", "Coefficient of friction against rolling.",
+        "geom_friction", lambda e: (e.i, 2), **_rubs(6)),
+    Row("margin", "m", "How far around it contacts act.", "geom_margin", constant=True,
+        low=_not_negative, usual=_nonzero, **_TOUCHES),
+    Row("gap", "m", "How much further contacts are found without acting.", "geom_gap",
+        constant=True, low=0.0, usual=False, **_TOUCHES),
+    Row("adhesion", "N", "Force with which its contacts hold on.", "geom_adhesion",
+        constant=True, low=0.0, usual=_nonzero, **_TOUCHES),
+    Row("surfacevel", "1", "Velocity of its surface in its frame: linear [m/s], angular [rad/s].",
+        "geom_surfacevel", constant=True, usual=_nonzero, **_TOUCHES),
+    Row("solmix", "1", "Weight of this shape when the solref of a contact is mixed.",
+        "geom_solmix", low=0.0, usual=False, **_TOUCHES),
+    *_solver("geom", **_TOUCHES),
+    Row("size", "m", lambda e: f"{_SIZES[int(e['type'])][1]} of the {_word(e)}; "
+        "mass and inertia stay as they are.", "geom_size",
+        lambda e: (e.i, _columns(_SIZES[int(e["type"])][0])), constant=True, low=_positive,
+        exists=_sized, usual=lambda e, v: any(e.trees.shape(e.i)),
+        visual=lambda e: not any(e.trees.shape(e.i))),
+    Row("size", "m", "", exists=lambda e: not _sized(e),
+        reason="belongs to a shape that only another file can change"),
+    Row("color", "1", "Red, green, blue and opacity of the shape.",
+        lambda e: lambda mj, _: color(
+            mj.geom_rgba[e.i], mj.mat_rgba[e["matid"]] if e["matid"] >= 0 else None),
+        low=0.0, high=1.0, usual=lambda e, v: e["group"] < _SHOWN, visual=True,
+        effect=lambda e: NOTHING),
+    *_pose("geom", "shape"),
+    *(Row(name, "1", "", reason=_WHOLE) for name in ("contype", "conaffinity", "condim", "type")),
+)  # fmt: skip
+_PAIR = (
+    Row("friction", "1", "Friction of the pair: sliding (2), torsional [m] and rolling [m] (2).",
+        "pair_friction", low=0.0, flags=_CONTACT),
+    Row("margin", "m", "The margin of contacts of the pair.", "pair_margin", constant=True,
+        low=_not_negative, usual=False, flags=_CONTACT),
+    Row("gap", "m", "The gap of contacts of the pair.", "pair_gap", constant=True,
+        low=_not_negative, usual=False, flags=_CONTACT),
+    *_solver("pair", flags=_CONTACT),
+)  # fmt: skip
+
+
+def _stretched(e: Element, _: Floats) -> bool:
+    return bool(e["stiffness"] or e["damping"] or e["frictionloss"])
+
+
+_TENDON = (
+    Row("stiffness", "{F}/{L}", "Stiffness of the tendon as a spring.",
+        "tendon_stiffness", constant=True, low=0.0, usual=_stretched, flags=_SPRING),
+    Row("damping", "{F} s/{L}", "Force against changes of length, for each unit of speed.",
+        "tendon_damping", constant=True, low=0.0, usual=_stretched, flags=_DAMPER),
+    Row("frictionloss", "{F}", "Dry friction along the tendon.",
+        "tendon_frictionloss", constant=True, low=0.0, usual=_stretched, flags=_FRICTION),
+    Row("armature", "{I}", "Inertia that the tendon adds.", "tendon_armature",
+        constant=True, low=0.0, usual=_nonzero, acts=lambda e: not e.rolls,
+        reason="is not possible: the tendon runs around shapes"),
+    Row("springlength", "{L}", "Lengths between which the spring is at rest.",
+        "tendon_lengthspring", constant=True, usual=lambda e, v: bool(e["stiffness"]),
+        flags=_SPRING),
+    Row("range", "{L}", "Shortest and longest length of the tendon.",
+        "tendon_range", usual=False, acts=lambda e: e["limited"], reason=_UNLIMITED),
+)  # fmt: skip
+_CONSTRAINED = (
+    Row("active", "1", "Whether the constraint is in force: 1, or 0.",
+        lambda e: lambda mj, data: place(mj.eq_active0[e.i, ...], data.eq_active[e.i, ...]),
+        low=0.0, high=1.0, nature="switch", flags=_EQUALITY + _CONSTRAINT),
+    *_solver("eq"),
+    Row("polycoef", "1", "Coefficients of the polynomial that gives one from the other.",
+        "eq_data", lambda e: (e.i, slice(5)), constant=True, usual=False,
+        exists=lambda e: e.is_("type", mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtEq.mjEQ_TENDON)),
+)  # fmt: skip
+_DRIVES: dict[str, Any] = {
+    "acts": lambda e: any(e.trees.actuator(e.i)),
+    "reason": "acts on nothing: it is off or moves nothing",
+}
+_SERVO: dict[str, Any] = {"low": 0.0, **_DRIVES}
+_AFFINE, _FIXED, _UNBIASED = _BIAS.mjBIAS_AFFINE, _GAIN.mjGAIN_FIXED, _BIAS.mjBIAS_NONE
+_ABOUT = "Force of the servo for each unit of"
+_ACTUATOR = (
+    Row("gear", "1", "Factor from the force of the actuator to that on what it moves.",
+        "actuator_gear", lambda e: (int(e["outadr"]), _columns(e.gears)), constant=True,
+        exists=lambda e: e.gears > 0, **_DRIVES),
+    Row("kp", "{F}/{L}", f"{_ABOUT} distance.",
+        _gains(("gainprm", 0, 1), ("biasprm", 1, -1)),
+        exists=lambda e: e.servo == "position", **_SERVO),
+    Row("kv", "{F} s/{L}", f"{_ABOUT} velocity.", _gains(("biasprm", 2, -1)),
+        exists=lambda e: e.servo == "position", **_SERVO),
+    Row("kv", "{F} s/{L}", f"{_ABOUT} velocity.",
+        _gains(("gainprm", 0, 1), ("biasprm", 2, -1)),
+        exists=lambda e: e.servo == "velocity", **_SERVO),
+    Row("kv", "1", f"{_ABOUT} velocity and control.", _gains(("gainprm", 2, -1)),
+        exists=lambda e: e.servo == "damper", **_SERVO),
+    Row("gain", "1", "Force for each unit of control.", "actuator_gainprm", lambda e: (e.i, 0),
+        usual=False, exists=lambda e: not e.servo and e.is_("gaintype", _FIXED), **_DRIVES),
+    Row("gainprm", "1", "Parameters of its gain, as MuJoCo numbers them.", "actuator_gainprm",
+        usual=False, exists=lambda e: not e.servo and not e.is_("gaintype", _FIXED), **_DRIVES),
+    Row("bias", "1", "Force without control: constant, for each unit of length, of velocity.",
+        "actuator_biasprm", lambda e: (e.i, slice(3)), usual=_nonzero,
+        exists=lambda e: not e.servo and e.is_("biastype", _AFFINE), **_DRIVES),
+    Row("biasprm", "1", "Parameters of its bias, as MuJoCo numbers them.", "actuator_biasprm",
+        usual=False, exists=lambda e: not e.servo and not e.is_("biastype", _AFFINE, _UNBIASED),
+        **_DRIVES),
+    Row("timeconst", "s", "Time that the activation takes to follow the control.",
+        "actuator_dynprm", lambda e: (e.i, _columns(e.times)), low=_positive,
+        exists=lambda e: e.times > 0, **_DRIVES),
+    Row("ctrlrange", lambda e: control_unit(e.mj, e.i), "Range to which its control is clipped.",
+        "actuator_ctrlrange", lambda e: int(e["ctrladr"]), usual=False,
+        exists=lambda e: e["ctrlnum"] == 1, acts=lambda e: (
+            any(e.trees.actuator(e.i)) and e.mj.actuator_ctrllimited[e["ctrladr"]]),
+        reason="is not in force: it is not limited, or the actuator is off"),
+    Row("forcerange", "{F}", "Range to which its force is clipped.",
+        "actuator_forcerange", usual=False,
+        acts=lambda e: any(e.trees.actuator(e.i)) and e["forcelimited"],
+        reason="is not in force: it is not limited, or the actuator is off"),
+    Row("damping", "1", "The damping that the actuator adds to what it moves.",
+        "actuator_damping", constant=True, usual=_nonzero, **_SERVO),
+    Row("armature", "1", "The armature that the actuator adds to what it moves.",
+        "actuator_armature", constant=True, usual=_nonzero, **_SERVO),
+)  # fmt: skip
+
+
+def _number(name: str) -> Callable[[Element], Slots]:
+    return lambda e: lambda mj, _: option(mj.opt, name)
+
+
+_OPTION = (
+    Row("gravity", "m/s^2", "Acceleration that acts on every mass.",
+        lambda e: lambda mj, _: place(mj.opt.gravity), flags=_GRAVITY),
+    Row("timestep", "s", "Physics step; a control step has a fixed number of them.",
+        _number("timestep"), low=SMALLEST),
+    Row("wind", "m/s", "Velocity of the medium.", lambda e: lambda mj, _: place(mj.opt.wind),
+        acts=lambda e: e.fluid, reason="acts on nothing: density and viscosity are zero"),
+    Row("density", "kg/m^3", "The density of the medium.", _number("density"), low=0.0,
+        usual=lambda e, v: e.fluid),
+    Row("viscosity", "Pa s", "The viscosity of the medium.", _number("viscosity"), low=0.0,
+        usual=lambda e, v: e.fluid),
+    Row("impratio", "1", "Stiffness of friction in relation to that of contact.",
+        _number("impratio"), low=SMALLEST, usual=False,
+        effect=lambda e: e.trees.touching(e.trees.every)),
+)  # fmt: skip
+
+
+class Kind(NamedTuple):
+    """Elements: their type in MuJoCo, number, arrays, parameters and the trees these act on."""
+
+    obj: Any
+    size: str
+    prefix: str
+    rows: tuple[Row, ...] = ()
+    effect: Callable[[Element], Effect] = lambda e: NOTHING
+
+
+KINDS = {
+    "body": Kind(_OBJ.mjOBJ_BODY, "nbody", "body", _BODY, lambda e: e.trees.body(e.i)),
+    "joint": Kind(_OBJ.mjOBJ_JOINT, "njnt", "jnt", _JOINT, lambda e: e.trees.body(e.body)),
+    "geom": Kind(_OBJ.mjOBJ_GEOM, "ngeom", "geom", _SHAPE, lambda e: e.trees.shape(e.i)),
+    "pair": Kind(_OBJ.mjOBJ_PAIR, "npair", "pair", _PAIR, lambda e: e.trees.pair(e.i)),
+    "site": Kind(
+        _OBJ.mjOBJ_SITE, "nsite", "site", _pose("site", "site"), lambda e: e.trees.site(e.i)
+    ),
+    "tendon": Kind(_OBJ.mjOBJ_TENDON, "ntendon", "tendon", _TENDON, lambda e: e.trees.tendon(e.i)),
+    "equality": Kind(
+        _OBJ.mjOBJ_EQUALITY, "neq", "eq", _CONSTRAINED, lambda e: e.trees.equality(e.i)
+    ),
+    "actuator": Kind(
+        _OBJ.mjOBJ_ACTUATOR, "nactuator", "actuator", _ACTUATOR, lambda e: e.trees.actuator(e.i)
+    ),
+    "option": Kind(None, "", "opt", _OPTION, lambda e: e.trees.always(e.trees.every)),
+    "sensor": Kind(_OBJ.mjOBJ_SENSOR, "nsensor", "sensor"),
+    "flex": Kind(_OBJ.mjOBJ_FLEX, "nflex", "flex"),
+}
+"""In the order in which parameters are listed."""
+
+
+@lru_cache(maxsize=32)
+def table(mj: mujoco.MjModel, *, fluid: bool = False) -> tuple[Field, ...]:
+    """List the parameters of a compiled model, each with its own name.
+
+    Where two elements have the same name and attribute, the usual one keeps the plain name; if
+    none or both are usual, both are distinguished by their kind: ``"geom:torso.color"``. So is what
+    has the name of a state.
+
+    Args:
+        mj: The model, which must not be changed afterwards.
+        fluid: Whether a medium may be made to act although it does not now.
+    """
+    fluid = fluid or mj.opt.density > 0.0 or mj.opt.viscosity > 0.0
+    names, trees, found = element_names(mj), Couplings(mj, fluid), list[Field]()
+    for kind, about in KINDS.items():
+        for i, name in enumerate(names.get(kind, ("",))):
+            element = Element(mj, trees, fluid, kind, i, name)
+            rows = about.rows if (kind, i) != ("body", 0) else ()  # the world has none
+            found += [_field(row, element) for row in rows if row.exists(element)]
+    claims: dict[str, list[Field]] = {}
+    for field in found:
+        claims.setdefault(field.plain_name, []).append(field)
+    states = _state_names(mj, names)
+    named = []
+    for field in found:
+        usual = [rival for rival in claims[field.plain_name] if rival.usual and not rival.refusal]
+        alone = len(claims[field.plain_name]) == 1 or (len(usual) == 1 and usual[0] is field)
+        plain = alone and field.plain_name not in states
+        named.append(
+            replace(field, name=field.plain_name if plain else f"{field.kind}:{field.plain_name}")
+        )
+    return tuple(named)
+
+
+def _state_names(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> set[str]:
+    """Name the states that have an attribute in common with parameters."""
+    found = set()
+    for joint, kind in enumerate(mj.jnt_type.tolist()):
+        name, body = names["joint"][joint], names["body"][int(mj.jnt_bodyid[joint])]
+        if kind in (SLIDE, HINGE):
+            found.add(f"{name}.position")
+        else:
+            found.add(f"{body if kind == FREE else name}.orientation")
+    return found
+
+
+def slots(
+    compiled: mujoco.MjModel,
+    keys: Iterable[ParameterKey],
+    mj: mujoco.MjModel,
+    data: mujoco.MjData,
+) -> dict[ParameterKey, Slot]:
+    """Find the places of some parameters in a model.
+
+    What is written there with ``constant`` slots takes effect with ``mj_setConst``.
+
+    Args:
+        compiled: What was compiled; it is not written.
+        keys: Of the parameters.
+        mj: A copy of it.
+        data: Where the copy is stepped.
+    """
+    wanted = frozenset(keys)
+    return {
+        field.key: field.slot(mj, data)
+        for field in table(compiled)
+        if field.key in wanted and field.slot is not None
+    }
+
+
+# --- names -------------------------------------------------------------------------------------
+
+
+def clean(name: str) -> str:
+    """Replace what may not stand in the name of an element.
+
+    Example:
+        >>> clean("arm/joint.1"), clean("left hand")
+        ('arm_joint_1', 'left_hand')
+    """
+    return re.sub(r"[^\w-]", "_", name)
+
+
+@lru_cache(maxsize=32)
+def element_names(mj: mujoco.MjModel) -> Mapping[str, tuple[str, ...]]:
+    """Name the elements of each kind: their own names, cleaned, or names made from their body."""
+    found: dict[str, tuple[str, ...]] = {}
+    for kind in _NAMED:
+        about = KINDS[kind]
+        given = [mujoco.mj_id2name(mj, about.obj, i) or "" for i in range(getattr(mj, about.size))]
+        taken: set[str] = set()
+        names = [_free(clean(name), taken) if name else "" for name in given]
+        for i, name in enumerate(names):
+            names[i] = name or _free(_made(mj, kind, i, names, found), taken)
+        found[kind] = tuple(names)
+    return found
+
+
+_NAMED = (
+    "body", "joint", "geom", "site", "tendon", "equality", "actuator", "pair", "sensor", "flex",
+)  # fmt: skip
+"""An order in which those come first after which others are named."""
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """Give a name that is not taken, with a number if need be, and take it."""
+    free, n = name, 1
+    while free in taken:
+        n += 1
+        free = f"{name}_{n}"
+    taken.add(free)
+    return free
+
+
+def _made(
+    mj: mujoco.MjModel, kind: str, i: int, names: list[str], found: Mapping[str, tuple[str, ...]]
+) -> str:
+    """Name an element that has no name: after its body, its shapes or what it acts on."""
+    match kind:
+        case "body":
+            parent = int(mj.body_parentid[i])
+            before = int(np.count_nonzero(mj.body_parentid[1:i] == parent))
+            return f"{names[parent]}_body_{before}"
+        case "joint" | "geom" | "site":
+            bodies = getattr(mj, f"{KINDS[kind].prefix}_bodyid")
+            body = found["body"][int(bodies[i])]
+            if kind == "joint" and mj.body_jntnum[bodies[i]] == 1:
+                return body
+            return f"{body}_{kind}_{int(np.count_nonzero(bodies[:i] == bodies[i]))}"
+        case "actuator":
+            acts, (target, second) = int(mj.actuator_trntype[i]), mj.actuator_trnid[i].tolist()
+            on_site = acts == int(_TRN.mjTRN_SO3) and second >= 0
+            of = "site" if on_site else _ACTS_ON.get(acts, "joint")
+            return found[of][int(target)]
+        case "pair":
+            return "_".join(found["geom"][pair[i]] for pair in (mj.pair_geom1, mj.pair_geom2))
+        case _:
+            return f"{kind}_{i}"
+
+
+_ACTS_ON = {
+    int(_TRN.mjTRN_TENDON): "tendon",
+    int(_TRN.mjTRN_SITE): "site",
+    int(_TRN.mjTRN_SLIDERCRANK): "site",
+    int(_TRN.mjTRN_BODY): "body",
+}

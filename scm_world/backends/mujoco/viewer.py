@@ -1,0 +1,72 @@
+"""MuJoCo's window."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from typing import Any, final
+
+import mujoco
+import numpy as np
+
+from scm_world.backends.mujoco.backend import MujocoBackend
+from scm_world.backends.mujoco.realization import Realization
+from scm_world.geometry import rotation_matrix
+from scm_world.models.scene import GoalRegion, Scene
+from scm_world.models.shapes import GOAL_OPACITY
+
+
+@final
+class Viewer:
+    """A window that shows what it is given; it simulates nothing."""
+
+    def __init__(self) -> None:
+        self._backend = MujocoBackend()
+        self._shown: Realization | None = None
+        self._handle: Any = None
+
+    def show(self, scene: Scene) -> None:
+        """Show a scene; the first one, and one with other bodies, opens the window.
+
+        Once someone has closed the window, nothing is shown.
+        """
+        engine, handle = self._backend, self._handle
+        with nullcontext() if handle is None else handle.lock():
+            engine.build(scene)
+            now = engine.realization
+            mujoco.mj_forward(now.model, now.data)
+        if now is not self._shown:
+            self.close()
+            from mujoco import viewer  # loads a window system, so only when a window is wanted
+
+            self._shown = now
+            self._handle = viewer.launch_passive(
+                now.model, now.data, show_left_ui=False, show_right_ui=False
+            )
+        handle = self._handle
+        if not handle.is_running():
+            return
+        with handle.lock():
+            handle.user_scn.ngeom = 0
+            for goal in scene.goals[: handle.user_scn.maxgeom]:
+                _add_goal(handle.user_scn, goal)
+        handle.sync()
+
+    def close(self) -> None:
+        """Close the window, if it is open."""
+        if self._handle is not None:
+            self._handle.close()
+        self._handle = None
+
+
+def _add_goal(scene: mujoco.MjvScene, goal: GoalRegion) -> None:
+    """Add a goal to an abstract scene as a silhouette; of a hull, the box around it."""
+    sphere, box = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_BOX
+    mujoco.mjv_initGeom(
+        scene.geoms[scene.ngeom],
+        sphere if goal.shape == "sphere" else box,
+        np.asarray(goal.size, dtype=np.float64) / 2.0,
+        np.asarray(goal.position, dtype=np.float64),
+        rotation_matrix(goal.orientation).ravel(),
+        np.array([*goal.color, GOAL_OPACITY], dtype=np.float32),
+    )
+    scene.ngeom += 1
