@@ -213,12 +213,16 @@ def _made(
     if plan.bodies:
         unit = _tree(engine, client, mj, data, plan, made_of)
     else:
-        (geom,), turn = plan.geoms, np.empty(4)
+        (geom,), body = plan.geoms, int(mj.geom_bodyid[plan.geoms[0]])
+        place, turn = data.geom_xpos[geom], np.empty(4)
         mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
+        hull = bool(mj.geom_type[geom] == MESH)  # in the frame of the body, as it was drawn
+        if hull:
+            place, turn = data.xpos[body], data.xquat[body]
         multibody = engine.createMultiBody(
             0,
-            _shape(engine, client, mj, geom),
-            basePosition=data.geom_xpos[geom].tolist(),
+            _shape(engine, client, mj, geom, np.zeros(3) if hull else None),
+            basePosition=place.tolist(),
             baseOrientation=plain(turn),
             useMaximalCoordinates=True,
             physicsClientId=client,

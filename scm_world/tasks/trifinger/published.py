@@ -23,15 +23,16 @@ from scm_world.tasks.trifinger.hardware import FINGERS, WALL_SEGMENTS
 
 DAMPING = (0.5, 0.04)
 """What robot and blocks lose of their speed in a second; see ``backends.bullet.build``."""
-MARGIN = 0.001  # [m] by which the engine inflates the hulls
+MARGIN = 0.001  # [m] by which the engine inflates the hulls, so that the table begins below zero
+TABLE = "table"
 LINKS = ("upper", "middle", "lower")
 
 
 @cache
 def meshes() -> dict[str, Floats]:
-    """Return the corners of the hull of each link, shape (n, 3) [m]."""
+    """Return the corners of the hulls of links and table, shape (n, 3) [m]."""
     with np.load(Path(__file__).with_name("meshes.npz")) as file:
-        return {name: file[name] for name in LINKS}
+        return {name: file[name] for name in (*LINKS, TABLE)}
 
 
 def alter(spec: mujoco.MjSpec) -> None:
@@ -41,14 +42,14 @@ def alter(spec: mujoco.MjSpec) -> None:
     spec.add_numeric(name="bullet_damping", size=2, data=DAMPING)
     for finger in FINGERS:
         spec.body(f"robot_finger_{finger}_tip").ipos = (0.0, 0.0, 0.0)
-    for link, corners in meshes().items():
-        spec.add_mesh(name=link, uservert=corners.ravel().tolist())
-        for finger in FINGERS:
-            shape = spec.geom(f"{finger}/{link}")
-            shape.type, shape.meshname = mujoco.mjtGeom.mjGEOM_MESH, link
+    for name, corners in meshes().items():
+        spec.add_mesh(name=name, uservert=corners.ravel().tolist())
+        shapes = ["floor"] if name == TABLE else [f"{finger}/{name}" for finger in FINGERS]
+        for shape in map(spec.geom, shapes):
+            shape.type, shape.meshname = mujoco.mjtGeom.mjGEOM_MESH, name
             shape.pos, shape.quat = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-            shape.fromto = [np.nan] * 6
-            shape.margin = MARGIN
+            shape.fromto, shape.margin = [np.nan] * 6, MARGIN
+    spec.geom("floor").pos = (0.0, 0.0, -MARGIN)
 
 
 def touching(
