@@ -23,7 +23,7 @@ from scm_world.backends.bullet.client import (
     plain,
 )
 from scm_world.backends.bullet.engine import load, version
-from scm_world.backends.bullet.honoured import supports
+from scm_world.backends.bullet.honoured import check, heavy, keys, settle, supports
 from scm_world.errors import EngineFailure, Infeasible, ModelError
 from scm_world.models.model import Model
 from scm_world.models.scene import (
@@ -118,7 +118,7 @@ class Record:
 
 @final
 class BulletBackend(Backend):
-    """Bullet, through pybullet: what it can honour of a ``Model``, and custom realisations.
+    """Bullet, through pybullet: what it can honour of a ``Model``.
 
     The engine cannot set a state exactly, because contact caches survive. So a state is set by
     bringing about a *canonical* world, which is a function of parameters and state alone. It is
@@ -161,15 +161,6 @@ class BulletBackend(Backend):
 
     # --- clients -------------------------------------------------------------------------------
 
-    @staticmethod
-    def _kind(structure: Structure) -> Any:
-        """Give the class of the clients that realise a structure."""
-        kind = structure.realization("bullet") or Client
-        if kind is Client and not isinstance(structure, Model):
-            name = type(structure).__name__
-            raise ModelError([f"Bullet cannot realise a {name}; it takes models"])
-        return kind
-
     def _lived(self) -> History:
         if self._history is None:
             raise EngineFailure("there is no scene yet; call build() first", self.name)
@@ -178,42 +169,36 @@ class BulletBackend(Backend):
     def _last(self) -> Client:
         """Give the client that holds the world of the last step."""
         history = self._lived()
-        base = self._fitting(self._base, history.origin.structure)
-        if base is not self._base:
-            self._base, self._lost = base, True
+        if self._base is None:
+            self._base, self._lost = Client(self._engine), True
         if self._lost:
-            history.relive(base)
+            history.relive(self._base)
             self._lost = False
-        return base
+        return self._base
 
-    def _other(self, structure: Structure) -> Client:
+    def _other(self) -> Client:
         """Give the client that does not hold the last step."""
-        self._spare = self._fitting(self._spare, structure)
+        if self._spare is None:
+            self._spare = Client(self._engine)
         return self._spare
-
-    def _fitting(self, client: Client | None, structure: Structure) -> Client:
-        """Pass on a client that can hold a structure; else close it, and open another one."""
-        kind = self._kind(structure)
-        if isinstance(client, kind):
-            return client
-        if client is not None:
-            client.close()
-        return kind(self._engine)
 
     def _now(self) -> Client:
         """Give the client that holds the present."""
-        return self._last() if self._light else self._other(self.structure)
+        return self._last() if self._light else self._other()
 
     # --- the interface -------------------------------------------------------------------------
 
     def build(self, scene: Scene) -> None:
         """Realise a scene from nothing; with the bodies that are there already, where possible."""
-        structure, kind = scene.structure, self._kind(scene.structure)
-        parameters = plain(scene.parameters, known(scene.parameters, kind.keys(structure)))
-        kind.check(structure, parameters)
-        origin = Instant(structure, parameters, kind.settle(structure, scene.state))
+        structure = scene.structure
+        if not isinstance(structure, Model):
+            name = type(structure).__name__
+            raise ModelError([f"Bullet cannot realise a {name}; it takes models"])
+        parameters = plain(scene.parameters, known(scene.parameters, keys(structure)))
+        check(structure, parameters)
+        origin = Instant(structure, parameters, settle(structure, scene.state))
         with self._all_or_nothing():
-            self._other(structure).canonicalize(origin)
+            self._other().canonicalize(origin)
         self._present, self._light = origin, False
         self._reported = [0.0] * int((~structure.layout.can_be_set).sum())
         self._commit()
@@ -235,10 +220,10 @@ class BulletBackend(Backend):
                 changed = difference.parameters if self._light else wish.parameters
                 self._last().edit({key: wish.parameters[key] for key in changed})
             elif not self._light and self._is_light(present, wish):
-                spare = self._other(wish.structure)
+                spare = self._other()
                 spare.edit({key: wish.parameters[key] for key in difference.parameters})
             else:
-                self._other(wish.structure).canonicalize(wish)
+                self._other().canonicalize(wish)
         self._present, self._light = wish, light
 
     def _described_base(self) -> Instant:
@@ -255,7 +240,6 @@ class BulletBackend(Backend):
     def _wish(self, present: Instant, difference: Difference) -> Instant:
         """Say which world the difference makes of the present."""
         structure, parameters, state = present.structure, present.parameters, present.state
-        kind = self._kind(difference.structure or structure)
         if difference.structure is not None:
             now = Scene(
                 structure,
@@ -265,14 +249,14 @@ class BulletBackend(Backend):
             structure = difference.structure
             difference = complete(now, structure, difference)
             given = difference.parameters
-            parameters = plain(given, known(given, kind.keys(structure)))
+            parameters = plain(given, known(given, keys(structure)))
         elif difference.parameters:
             given = difference.parameters
             parameters = {**parameters, **plain(given, known(parameters, given))}
         if difference.structure is not None or difference.parameters:
-            kind.check(structure, parameters)
+            check(structure, parameters)
         if difference.state is not None:
-            state = kind.settle(structure, difference.state)
+            state = settle(structure, difference.state)
         return Instant(structure, parameters, state)
 
     def _is_light(self, here: Instant, there: Instant) -> bool:
@@ -283,10 +267,7 @@ class BulletBackend(Backend):
         return (
             here.structure == there.structure
             and here.state == there.state
-            and all(
-                here.parameters[key] == there.parameters[key]
-                for key in self._kind(here.structure).heavy(here.structure)
-            )
+            and all(here.parameters[k] == there.parameters[k] for k in heavy(here.structure))
         )
 
     @contextmanager
@@ -312,10 +293,10 @@ class BulletBackend(Backend):
         if self._light:
             self._last().edit(present.parameters)
         else:
-            self._other(present.structure).canonicalize(present)
+            self._other().canonicalize(present)
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Read parameters back from the engine itself; see ``Client.parameter``.
+        """Read parameters back; see ``Client.parameters``.
 
         Raises:
             UnknownOption: The scene has no such parameter.
@@ -387,7 +368,7 @@ class BulletBackend(Backend):
 
     def supports(self, structure: Structure, key: ParameterKey) -> bool:
         """Tell whether a parameter of a structure can be set."""
-        return not isinstance(structure, Model) or supports(structure, key)
+        return isinstance(structure, Model) and supports(structure, key)
 
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""

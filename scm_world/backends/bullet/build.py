@@ -1,9 +1,9 @@
 """The bodies of a compiled model in a physics client.
 
-What can move is one multibody for each free body and what hangs on it, and one for all that hangs on the world. A body is one link for each of its joints,
-all but the last without mass, and each of its shapes is a further link without mass that is fixed
-to the last. So shapes of one body can differ in what they touch, have frames of their own, and no
-link has two of them. A shape that cannot move is a body by itself.
+What can move is one multibody for each free body with what hangs on it, and one for all that hangs
+on the world. A body is one link for each of its joints, all but the last without mass. Its first
+shape is that of the last link; each further one is a link without mass that is fixed there, so that
+shapes of one body can differ in what they touch. A shape that cannot move is a body by itself.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Handle = tuple[int, int]
 
 MOST_LINKS = 127  # the engine has room for no more of them in a multibody
 FASTEST = 1e4  # [rad/s] or [m/s]; the engine would cut at 100
-HULL_MARGIN = 1e-5  # [m] a mesh is inflated by so much
+HULL_MARGIN = 1e-5  # [m] a mesh is inflated by so much, or by the margin of its shape
 GEAR_ERP = 0.2  # share of the error of a coupling that a step takes away
 STRONGEST = 1e9  # [N m] or [N] of a coupling
 
@@ -176,6 +176,7 @@ def _made_of(mj: mujoco.MjModel, data: mujoco.MjData, plan: Plan) -> tuple[Any, 
     place = {body: index for index, body in enumerate(bodies)}
     found: list[Any] = [
         *(len(bodies), len(joints), mj.opt.disableflags, mj.jnt_limited[joints]),
+        *(mj.numeric_data, mj.geom_margin[geoms]),
         np.isin(geoms, [mj.pair_geom1, mj.pair_geom2]),
         *(mj.geom_type[geoms], mj.geom_size[geoms]),
         *(_corners(mj, geom) for geom in geoms),
@@ -212,12 +213,16 @@ def _made(
     if plan.bodies:
         unit = _tree(engine, client, mj, data, plan, made_of)
     else:
-        (geom,), turn = plan.geoms, np.empty(4)
+        (geom,), body = plan.geoms, int(mj.geom_bodyid[plan.geoms[0]])
+        place, turn = data.geom_xpos[geom], np.empty(4)
         mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
+        hull = bool(mj.geom_type[geom] == MESH)  # in the frame of the body, as it was drawn
+        if hull:
+            place, turn = data.xpos[body], data.xquat[body]
         multibody = engine.createMultiBody(
             0,
-            _shape(engine, client, mj, geom),
-            basePosition=data.geom_xpos[geom].tolist(),
+            _shape(engine, client, mj, geom, np.zeros(3) if hull else None),
+            basePosition=place.tolist(),
             baseOrientation=plain(turn),
             useMaximalCoordinates=True,
             physicsClientId=client,
@@ -226,7 +231,8 @@ def _made(
     for geom, link in zip(plan.geoms, unit.geoms, strict=True):
         place = unit.multibody, link
         if mj.geom_type[geom] == MESH:
-            engine.changeDynamics(*place, collisionMargin=HULL_MARGIN, physicsClientId=client)
+            margin = max(HULL_MARGIN, float(mj.geom_margin[geom]))
+            engine.changeDynamics(*place, collisionMargin=margin, physicsClientId=client)
     return unit
 
 
@@ -447,9 +453,9 @@ def _tree(
     for equality in couplings(mj, plan.joints):
         _couple(engine, client, mj, equality, made, joint_links)
     carriers = [carrier[body] for body in plan.bodies]
-    joints = [joint_links[joint] for joint in plan.joints]
-    geoms = [geom_links[geom] for geom in plan.geoms]
-    return Unit(made_of, made, carriers, joints, geoms)
+    hinges = [joint_links[joint] for joint in plan.joints]
+    shapes = [geom_links[geom] for geom in plan.geoms]
+    return Unit(made_of, made, carriers, hinges, shapes)
 
 
 def _settle(
@@ -457,8 +463,9 @@ def _settle(
 ) -> None:
     """Take away what the engine does by itself: damping, motors, sleep, a highest speed."""
     # One property a call: beside damping or maxJointVelocity, all others would land on the base.
-    engine.changeDynamics(made, -1, linearDamping=0, physicsClientId=client)
-    engine.changeDynamics(made, -1, angularDamping=0, physicsClientId=client)
+    damping = _damping(mj, free=-1 in joints.values())
+    engine.changeDynamics(made, -1, linearDamping=damping, physicsClientId=client)
+    engine.changeDynamics(made, -1, angularDamping=damping, physicsClientId=client)
     engine.changeDynamics(made, -1, maxJointVelocity=FASTEST, physicsClientId=client)
     engine.changeDynamics(
         made, -1, activationState=engine.ACTIVATION_STATE_DISABLE_SLEEPING, physicsClientId=client
@@ -479,6 +486,16 @@ def _settle(
             engine.setJointMotorControl2(
                 made, link, engine.VELOCITY_CONTROL, force=0.0, physicsClientId=client
             )
+
+
+def _damping(mj: mujoco.MjModel, *, free: bool) -> float:
+    """Return what a multibody loses of its speed in a second, roughly; usually nothing.
+
+    A model says that for this engine with two custom numbers ``bullet_damping``: for what hangs on
+    the world, and for free bodies.
+    """
+    number = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_NUMERIC, "bullet_damping")
+    return 0.0 if number < 0 else float(mj.numeric_data[mj.numeric_adr[number] + int(free)])
 
 
 def _couple(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import ContactPoint
 from scm_world.backends.bullet.build import BALL, FREE, Built, Handle, solid
-from scm_world.backends.bullet.honoured import check, heavy, keys, rotations, settle
+from scm_world.backends.bullet.honoured import heavy, realized, rotations
 from scm_world.backends.bullet.joints import Part, parts
 from scm_world.backends.mujoco import reading
 from scm_world.backends.mujoco.backend import realize
@@ -52,7 +52,7 @@ class Instant:
         state: The numbers of a ``State``, with unit quaternions.
     """
 
-    structure: Any
+    structure: Model
     parameters: Values
     state: list[float]
 
@@ -213,9 +213,6 @@ class Client:
         generation: Counts the canonical states; a saved state is exact within one of them.
     """
 
-    keys = staticmethod(keys)
-    check, settle, heavy = staticmethod(check), staticmethod(settle), staticmethod(heavy)
-
     def __init__(self, engine: Any) -> None:
         self.engine = engine
         self.handle = engine.connect(engine.DIRECT)
@@ -271,7 +268,8 @@ class Client:
         self._untouched = instant.state
 
     def _construct(self, model: Model, parameters: Values) -> None:
-        """Make everything again, unless live bodies can take on what differs from what is there."""
+        """Make what differs from what is there, and what live bodies cannot take on."""
+        model = realized(model)
         if self._model != model:
             compiled = reading.compiled(model)
             self._model, self._inside = model, None
@@ -429,12 +427,13 @@ class Client:
         """Ask the engine for principal moments of inertia, shape (3,) [kg m²].
 
         Raises:
-            UnknownOption: There is no such body that can move.
+            UnknownOption: There is no such body.
         """
-        handles = {self._names[number]: handle for number, handle in self._built.bodies.items()}
-        if body not in handles:
-            raise UnknownOption("body", body, handles)
-        return np.array(self.engine.getDynamicsInfo(*handles[body], physicsClientId=self.handle)[2])
+        moments = self._twin.inertia(body)
+        place = self._built.bodies.get(self._names.index(body))
+        if place is None:  # it cannot move
+            return moments
+        return np.array(self.engine.getDynamicsInfo(*place, physicsClientId=self.handle)[2])
 
     def remarks(self, before: Parameters) -> tuple[str, ...]:
         """Say which frictions were changed without an effect; see ``shares``."""
@@ -460,14 +459,16 @@ class Client:
         What brakes in proportion to speed acts with the speed at the end of the step: with that
         before the step, light links would turn back faster than they came. With mass matrix M,
         bias b, forces f and slopes D, MuJoCo's integrator ``implicitfast`` has the acceleration
-        ``a = (M + h D)^-1 (f - b)``; the forces ``M a + b`` let the engine's explicit step have it.
+        ``a = (M + h D)^-1 (f - b)``, and ``Euler`` has the slopes of passive dampers alone; the
+        forces ``M a + b`` let the engine's explicit step have it.
         """
         self._untouched = None
         self._twin.forget()
         mj, data, options = self._twin.model, self._twin.data, self._twin.model.opt
         asked = options.disableflags, options.integrator
         options.disableflags |= SMOOTH
-        options.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        if options.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+            options.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         self._twin.command[:] = command
         forces, rates, step = np.empty(mj.nv), np.empty(mj.nv), options.timestep
         for _ in range(substeps):

@@ -33,10 +33,16 @@ from scm_world.models.scene import ParameterKey, State
 UNIT = 1e-12  # a quaternion whose squared norm is this near to 1 is taken as it is
 
 
+def realized(model: Model) -> Model:
+    """Return the model that stands for another one in this engine; usually itself."""
+    instead: Any = model.realization("bullet")  # type: ignore[func-returns-value]
+    return instead or model
+
+
 @lru_cache(maxsize=64)
 def unsupported(model: Model) -> tuple[str, ...]:
     """List everything in a model that the engine cannot honour."""
-    mj = reading.compiled(model)
+    mj = reading.compiled(realized(model))
     names, trees = fields.element_names(mj), Couplings(mj)
     parts = _of_joints(mj, names), _of_contacts(mj, names, trees), _of_bodies(mj, names, trees)
     return tuple(sentence for part in parts for sentence in part)
@@ -102,7 +108,7 @@ def _multiplied(mj: mujoco.MjModel) -> NDArray[np.bool_]:
     """Tell which pairs have the product of the frictions of their shapes, shape (npair,)."""
     factors = mj.geom_friction[:, 0]
     products = factors[mj.pair_geom1] * factors[mj.pair_geom2]
-    found: NDArray[np.bool_] = (mj.pair_friction[:, :2] == products[:, None]).all(axis=1)
+    found: NDArray[np.bool_] = np.equal(mj.pair_friction[:, :2], products[:, None]).all(axis=1)
     return found
 
 
@@ -255,8 +261,8 @@ def changes(model: Model) -> Mapping[ParameterKey, Kind]:
     Each is tried on a copy of the compiled model: the engine has a parameter if nothing is written
     but what it honours.
     """
-    compiled = reading.compiled(model)
-    mj = copy.copy(compiled)
+    model = realized(model)
+    mj = copy.copy(reading.compiled(model))
     slots = slots_of(model, mj, mujoco.MjData(mj))
     untouched, found = _saved(mj), dict[ParameterKey, Kind]()
     rows = [(name, kind, which, _read(mj, name)) for name, kind, which in _honoured(mj)]

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from importlib import import_module
 from typing import Any, final
@@ -53,6 +53,7 @@ from scm_world.tasks.trifinger.hardware import (
     joints_of,
     link_name,
 )
+from scm_world.tasks.trifinger.published import alter, touching
 from scm_world.tasks.trifinger.state import PhysicalState
 
 FLOOR = "floor"
@@ -98,8 +99,8 @@ class TriFinger(Model):
             and fingertips collide with them.
         hulls: The movable blocks that are no boxes, each with its convex shape.
         torques: Whether joint torques are commanded [N m], and not joint positions [rad].
-        published: Whether Bullet realises all bodies as the predecessor does; see
-            ``bullet.published``.
+        published: What Bullet realises in place of it: the bodies of the predecessor; see
+            ``published``. None where that is the same.
     """
 
     blocks: tuple[str, ...] = ()
@@ -137,17 +138,17 @@ class TriFinger(Model):
         return PhysicalState(self.layout)
 
     def realization(self, backend: str) -> Any:
-        """Return how the robot is realised on Bullet, without physics, or drawn."""
-        name = "published" if self.published and backend == "bullet" else backend
-        if name not in _REALIZATIONS:
+        """Return what Bullet realises, or how the robot is realised without physics, or drawn."""
+        if backend == "bullet":
+            return self.published
+        if backend not in _REALIZATIONS:
             return None
-        module, what = _REALIZATIONS[name]
+        module, what = _REALIZATIONS[backend]
         found = import_module(f"scm_world.tasks.trifinger.{module}")
         return found if what is None else getattr(found, what)
 
 
 _REALIZATIONS = {
-    "published": ("bullet.published", "PublishedClient"),
     "fake": ("fake", None),
     "renderer": ("cameras", "VIEWS"),
 }
@@ -200,15 +201,24 @@ def trifinger(
         published: See ``TriFinger``.
     """
     parts = _Parts(blocks, preset, obstacles, hulls, torques)
+    read = _read(parts, resolution)
+    described = {name: getattr(read, name) for name in read.__dataclass_fields__}
+    described["digest"] += f" {published}"
+    instead = _read(replace(parts, published=True), resolution) if published else None
+    return TriFinger(**described, **{**vars(parts), "published": instead})
+
+
+def _read(parts: _Parts, resolution: str) -> Model:
+    """Compile what there is, and describe it."""
     states: dict[str, list[str]] = {}
     for index, what in enumerate(("position", "velocity", "actuator_torque")):
         for group in joints_of(resolution):
             joints = range(group.where.start, group.where.stop)
             states[group.names[index]] = [f"{_JOINT_NAMES[i]}.{what}" for i in joints]
-    for block in blocks:
+    for block in parts.blocks:
         names = (f"{block}.{what}" for what in MOTION)
         states |= {name: [name] for name in names}
-    read = read_model(
+    return read_model(
         _compiled(parts),
         name="trifinger",
         keyframe=START,
@@ -217,9 +227,6 @@ def trifinger(
         bindings=partial(_bindings, parts=parts),
         frame="world",
     )
-    described = {name: getattr(read, name) for name in read.__dataclass_fields__}
-    described["digest"] += f" {published}"
-    return TriFinger(**described, **vars(parts), published=published)
 
 
 MOTION = ("cartesian_position", "orientation", "linear_velocity", "angular_velocity")
@@ -230,13 +237,14 @@ _JOINT_NAMES = tuple(link_name(finger, index) for finger in FINGERS for index in
 @final
 @dataclass(frozen=True)
 class _Parts:
-    """What there is, and how it is commanded; see ``TriFinger``."""
+    """What there is, and how it is commanded; see ``TriFinger``. ``published`` is the variant."""
 
     blocks: tuple[str, ...]
     preset: Preset
     obstacles: tuple[str, ...]
     hulls: tuple[tuple[str, Hull], ...]
     torques: bool
+    published: bool = False
 
 
 def _compiled(parts: _Parts) -> mujoco.MjModel:
@@ -274,7 +282,11 @@ def _compiled(parts: _Parts) -> mujoco.MjModel:
         pair.condim, pair.margin, pair.gap = 4, 0.0, 0.0
         pair.solref, pair.solreffriction = contact, friction
         pair.friction = (1.0, 1.0, SPINNING_FRICTION, _ROLLING_FRICTION, _ROLLING_FRICTION)
-    for one, other, slides in contact_pairs(parts):
+    pairs = contact_pairs(parts)
+    if parts.published:
+        alter(spec)
+        pairs = touching(parts.blocks, parts.obstacles)
+    for one, other, slides in pairs:
         spec.add_pair(sliding if slides else gripping, geomname1=one, geomname2=other)
     start = [*hardware.REST]
     for index in range(len(parts.blocks)):

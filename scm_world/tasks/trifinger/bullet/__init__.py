@@ -1,1 +1,0 @@
-"""How Bullet realizes the TriFinger."""

@@ -1,0 +1,67 @@
+"""The TriFinger as CausalWorld 1.2 has it in Bullet, so that policies from there act here alike.
+
+What differs was found by comparing states step by step: the links are the convex hulls of their
+meshes, everything that can touch does, robot and blocks lose speed as they move, and torques are
+those before a step.
+
+``meshes.npz`` has the corners of these hulls, from CausalWorld 1.2 (MIT license), in the frames of
+the links [m].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from itertools import combinations
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.tasks.trifinger.hardware import FINGERS, WALL_SEGMENTS
+
+DAMPING = (0.5, 0.04)
+"""What robot and blocks lose of their speed in a second; see ``backends.bullet.build``."""
+MARGIN = 0.001  # [m] by which the engine inflates the hulls, so that the table begins below zero
+TABLE = "table"
+LINKS = ("upper", "middle", "lower")
+
+
+@cache
+def meshes() -> dict[str, Floats]:
+    """Return the corners of the hulls of links and table, shape (n, 3) [m]."""
+    with np.load(Path(__file__).with_name("meshes.npz")) as file:
+        return {name: file[name] for name in (*LINKS, TABLE)}
+
+
+def alter(spec: mujoco.MjSpec) -> None:
+    """Make a robot that of the predecessor; its contacts are ``touching``."""
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    spec.add_numeric(name="bullet_damping", size=2, data=DAMPING)
+    for finger in FINGERS:
+        spec.body(f"robot_finger_{finger}_tip").ipos = (0.0, 0.0, 0.0)
+    for name, corners in meshes().items():
+        spec.add_mesh(name=name, uservert=corners.ravel().tolist())
+        shapes = ["floor"] if name == TABLE else [f"{finger}/{name}" for finger in FINGERS]
+        for shape in map(spec.geom, shapes):
+            shape.type, shape.meshname = mujoco.mjtGeom.mjGEOM_MESH, name
+            shape.pos, shape.quat = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+            shape.fromto, shape.margin = [np.nan] * 6, MARGIN
+    spec.geom("floor").pos = (0.0, 0.0, -MARGIN)
+
+
+def touching(
+    blocks: tuple[str, ...], obstacles: tuple[str, ...]
+) -> Iterator[tuple[str, str, bool]]:
+    """List which shapes can touch: all that are not fixed, but for links that a joint joins."""
+    fixed = ["floor", *(f"stage/{segment}" for segment in range(WALL_SEGMENTS)), *obstacles]
+    links = [(finger, index) for finger in range(len(FINGERS)) for index in range(len(LINKS))]
+    shapes = {link: f"{FINGERS[link[0]]}/{LINKS[link[1]]}" for link in links}
+    yield from ((one, other, False) for one in fixed for other in (*shapes.values(), *blocks))
+    yield from ((one, other, False) for one in shapes.values() for other in blocks)
+    yield from ((one, other, False) for one, other in combinations(blocks, 2))
+    for (finger, index), (its, other) in combinations(links, 2):
+        if finger != its or other - index > 1:
+            yield shapes[finger, index], shapes[its, other], False
