@@ -14,6 +14,8 @@ import mujoco
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from robot_scenes import busy_scene
+from robot_scenes import play as play_robot
 
 from scm_world import World
 from scm_world.backends import Backend, make_backend, read_model
@@ -28,8 +30,6 @@ from scm_world.backends.mujoco.reading import compiled, permutation
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
 from scm_world.models import ControlMode, Difference, Model, Parameter, Scene
 from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
-from scm_world.testing.backend import busy_scene
-from scm_world.testing.backend import play as play_robot
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="needs pybullet"

@@ -6,6 +6,7 @@ import sys
 import mujoco
 import numpy as np
 import pytest
+from robot_scenes import busy_scene, other_value, play
 
 from scm_world.backends import BACKENDS, EngineSnapshot, make_backend
 from scm_world.backends.mujoco import MujocoBackend, judge
@@ -16,7 +17,6 @@ from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import forward
 from scm_world.tasks.trifinger.mujoco.model import compiled
 from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
-from scm_world.testing.backend import busy_scene, other_value, play
 
 REST = np.array(hardware.REST)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from robot_scenes import busy_scene, other_value
 
 from scm_world.geometry.hulls import box_hull
 from scm_world.models import Difference, Scene, diff
@@ -16,7 +17,6 @@ from scm_world.tasks.trifinger.structure import (
     default_scene,
     parameter_keys,
 )
-from scm_world.testing.scenes import busy_scene, other_value
 
 
 def changed_scene() -> Scene:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from robot_scenes import octahedron
 
 from scm_world._types import ArrayLike
 from scm_world.geometry import from_rotation_vector
@@ -20,7 +21,6 @@ from scm_world.tasks.trifinger.structure import (
     TriFingerStructure,
     default_scene,
 )
-from scm_world.testing.scenes import octahedron
 
 TOLERANCE = 1e-4  # [m]
 CUBE = 0.065  # [m]
