@@ -143,7 +143,9 @@ class BackendConformance(ABC):
         if key[1] in RANGES:
             return 0.8 * value
         shift = np.where(value == 0.0, 0.01, 0.1 * np.abs(value))
-        return np.where(value + shift <= row.high, value + shift, np.maximum(value - shift, row.low))
+        return np.where(
+            value + shift <= row.high, value + shift, np.maximum(value - shift, row.low)
+        )
 
     def changed_states(self, state: State) -> Iterator[State]:
         """Change one quantity of a state after the other."""
@@ -584,9 +586,7 @@ class BackendConformance(ABC):
         with pytest.raises(EngineFailure):
             self.explode(
                 many[1],
-                lambda: batch.step(
-                    np.arange(COUNT), self.mode, rows, self.substeps, _table(many)
-                ),
+                lambda: batch.step(np.arange(COUNT), self.mode, rows, self.substeps, _table(many)),
             )
 
 
