@@ -18,7 +18,7 @@ from scm_world.errors import ActionError, InterventionError, ModelError, Unknown
 from scm_world.geometry.clipping import clip_kernel
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
-from scm_world.tasks import Conventions, Task, Timing, conventions
+from scm_world.tasks import Conventions, Task, Timing
 from scm_world.variables import Action, Derived, Exogenous, Intervention, Measured
 from scm_world.variables.checks import check_bounds, coerce
 from scm_world.world.mechanisms import Mechanisms, wrong_value
@@ -148,7 +148,9 @@ class Options:
         fine = task.resolutions[0] if resolution is None else resolution
         if fine not in task.resolutions:
             raise UnknownOption("resolution", fine, task.resolutions)
-        kept = conventions(conventions_name)
+        if conventions_name not in task.choices:
+            raise UnknownOption("conventions", conventions_name, task.choices)
+        kept = task.choices[conventions_name]
         return cls(name, mode, fine, skip, task.time_unit, max_episode_length, kept)
 
     @property

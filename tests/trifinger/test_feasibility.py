@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from robot_scenes import octahedron
 
 from scm_world._types import ArrayLike
 from scm_world.geometry import from_rotation_vector
@@ -16,7 +17,6 @@ from scm_world.tasks.trifinger.feasibility import overlaps
 from scm_world.tasks.trifinger.hardware import WALL_HEIGHT, WALL_RADIUS
 from scm_world.tasks.trifinger.kinematics import inverse, link_frames
 from scm_world.tasks.trifinger.system import trifinger
-from scm_world.testing.scenes import octahedron
 
 TOLERANCE = 1e-4  # [m]
 CUBE = 0.065  # [m]

@@ -12,8 +12,8 @@ from scm_world.geometry.hulls import Hull
 from scm_world.models import GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.scene import Overlap, State
 from scm_world.tasks.composition import Commands, Composition, Entity
-from scm_world.tasks.conventions import CONVENTIONS, Conventions
 from scm_world.tasks.model import ModelComposition
+from scm_world.tasks.trifinger.conventions import CONVENTIONS, TriFingerConventions
 from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
 from scm_world.tasks.trifinger.hardware import (
     FINGERS,
@@ -52,7 +52,7 @@ class BlockWorld(Composition):
     deciding: tuple[str, ...] = ()
     torques: bool = False
     resolution: str = RESOLUTIONS[0]
-    conventions: Conventions = CONVENTIONS["scm_world"]
+    conventions: TriFingerConventions = CONVENTIONS["scm_world"]
     unchecked: tuple[str, ...] = ()
     solid: bool = field(init=False, default=True)
     blocks: tuple[str, ...] = field(init=False)
