@@ -126,7 +126,7 @@ class TriFinger(Model):
             hulls=self.hulls,
             torques=self.torques,
             resolution=next(r for r in RESOLUTIONS if joints_of(r)[0].names[0] in names),
-            published=self.published,
+            published=self.published is not None,
         )
 
     def hull(self, block: str) -> Hull | None:
