@@ -205,7 +205,7 @@ class Composition(ABC):
         blocks: Names of the movable blocks.
         obstacles: Names of the obstacles.
         hulls: The blocks that are no boxes.
-        solid: Whether ``overlaps`` tells which bodies are in one place.
+        solid: Whether no episode may begin with two bodies in one place.
         mode: What a command means.
         commands: What turns an action into a command; None where they are the same.
     """
@@ -246,17 +246,6 @@ class Composition(ABC):
         None stands for what the task allows after an intervention on the variables asked for.
         """
         return ()
-
-    def thin(  # noqa: B027 # a composition that knows nothing of bodies leaves all
-        self, candidates: Any, before: Iterable[Overlap], *, whole: bool = True
-    ) -> None:
-        """Leave out candidates that put two bodies in one place; it may leave in such.
-
-        Args:
-            candidates: Draws of an intervention, with ``parameter``, ``state`` and ``keep``.
-            before: The bodies that lie in one another already, and may continue to.
-            whole: Whether all candidates have the blocks and obstacles of this structure.
-        """
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         """List goals, of some, that lie in something that never moves: nothing can fill them."""

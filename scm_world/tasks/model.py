@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
+from functools import cached_property
 from typing import Any, Self, final
 
 import numpy as np
@@ -17,6 +18,7 @@ from scm_world.errors import UnknownOption, blamed
 from scm_world.geometry import chains
 from scm_world.graph import SCM
 from scm_world.models import Model, ParameterKey, Readout, Row, State
+from scm_world.models.scene import TOLERANCE, Overlap, Scene
 from scm_world.tasks.base import Observed, Task, Timing
 from scm_world.tasks.composition import Clock, Composition
 from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
@@ -61,6 +63,27 @@ class ModelComposition(Composition):
 
     def __init__(self, model: Model) -> None:
         self._model = model
+
+    @cached_property
+    def _meant(self) -> Container[tuple[int, int]]:
+        """The shapes that lie in one another in the pose of the file: they are meant to."""
+        from scm_world.backends.mujoco.overlaps import touching
+
+        return frozenset(touching(self._model.default_scene(), TOLERANCE))
+
+    def overlaps(
+        self, scene: Scene, tolerance: float | None = None, asked: Iterable[str] = ()
+    ) -> tuple[Overlap, ...]:
+        """List the bodies that lie deeper in one another than a tolerance [m].
+
+        Not listed are shapes that do so in the pose of the file. All is listed of a model that
+        describes no bodies.
+        """
+        if self._model.describe is None:
+            return ()
+        from scm_world.backends.mujoco.overlaps import overlaps
+
+        return overlaps(scene, TOLERANCE if tolerance is None else tolerance, self._meant)
 
     def structure(self, values: Mapping[str, Any]) -> Model:
         """Give the model: it is compiled once."""

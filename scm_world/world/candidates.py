@@ -10,8 +10,7 @@ import numpy as np
 
 from scm_world._types import Integers, Value
 from scm_world.graph import NoiseKey
-from scm_world.models import ParameterKey
-from scm_world.models.scene import Overlap
+from scm_world.models.scene import SURFACES, Overlap, Scene
 from scm_world.variables import Draw, Hard, Natural, Rotations, Variable, whole_of
 from scm_world.variables.noise import word_of
 from scm_world.world.compiled_task import Plan, StepBase
@@ -19,6 +18,8 @@ from scm_world.world.philox import philox
 from scm_world.world.plan import InterventionPlan
 from scm_world.world.solver import Solver, same
 
+ROUNDING = 1e-6
+"""How much deeper than before is no deeper [m]."""
 CHUNK = 64
 """How many draws are looked at together."""
 
@@ -36,10 +37,7 @@ class Candidates:
     Args:
         solver: Of an earlier draw.
         key: Where to draw.
-        attempts: Numbers of the draws.
-
-    Attributes:
-        attempts: Those that are left, shape (n,).
+        attempts: Numbers of the draws, shape (n,).
     """
 
     def __init__(self, solver: Solver, key: NoiseKey, attempts: Integers) -> None:
@@ -47,35 +45,26 @@ class Candidates:
         self._solver, self._key, self._task = solver, key, solver.base.compiled
         self._known = solver.same_at(key)
         self._carried = {variable.name: variable for variable in self._task.carried}
-        self._keys = {key: name for name, key in self._task.parameter_keys.items()}
         self._found: dict[str, Value] = {}
         self._varying: set[str] = set()
 
-    def keep(self, which: Value) -> None:
-        """Leave out draws; ``which`` tells of each whether it stays, shape (n,)."""
-        self.attempts = self.attempts[which]
-        for name in self._varying:
-            self._found[name] = self._found[name][which]
-
-    def parameter(self, key: ParameterKey) -> Value:
-        """Give a physical parameter, shape (n or 1, *shape).
-
-        Raises:
-            Unknown: It is no variable.
-        """
-        if key not in self._keys:
-            raise Unknown
-        return self._value(self._keys[key])
-
-    def state(self, where: slice) -> Value:
-        """Give some numbers of the state vector, shape (n or 1, size)."""
-        bundles, parts = self._task.bundles, []
-        for name, own in self._task.slices.items():
-            if where.start <= own.start and own.stop <= where.stop and name not in bundles:
-                value = self._value(name)
-                parts.append(value.reshape(len(value), -1))
-        n = max(map(len, parts))
-        return np.hstack([np.broadcast_to(part, (n, part.shape[1])) for part in parts])
+    def scenes(self) -> Iterator[Scene]:
+        """Yield the scene of each draw, as far as it says where surfaces are."""
+        task, solver = self._task, self._solver
+        scene = task.describe(solver.static, solver.state)
+        keys = {name: key for name, key in task.parameter_keys.items() if key[1] in SURFACES}
+        surfaces = {key: self._value(name) for name, key in keys.items()}
+        places = [
+            (where, self._value(name))
+            for name, where in task.places.items()
+            if name not in task.bundles
+        ]
+        for row in range(len(self.attempts)):
+            state = scene.state.copy()
+            for where, value in places:
+                state.vector[where] = value[min(row, len(value) - 1)].ravel()
+            found = {key: value[min(row, len(value) - 1)] for key, value in surfaces.items()}
+            yield Scene(scene.structure, {**scene.parameters, **found}, state)
 
     def _value(self, name: str) -> Value:
         if name not in self._found:
@@ -181,6 +170,18 @@ class Candidates:
         return found
 
 
+def overlaps_before(base: StepBase) -> tuple[Overlap, ...]:
+    """List what lies in one another as physics left it, however little."""
+    scene = base.compiled.describe(base.static, base.state)
+    return base.compiled.composition.overlaps(scene, 0.0)
+
+
+def deeper(found: Iterable[Overlap], before: Iterable[Overlap]) -> list[Overlap]:
+    """List those that are deeper than before."""
+    depths = {overlap.bodies: overlap.depth for overlap in before}
+    return [one for one in found if one.depth > depths.get(one.bodies, 0.0) + ROUNDING]
+
+
 def promising(
     base: StepBase,
     made: Mapping[Plan | None, InterventionPlan],
@@ -204,20 +205,13 @@ def promising(
     Yields:
         The number of a draw, and its structure.
     """
-    before = base.compiled.composition.overlaps(
-        base.compiled.describe(base.static, base.state), 0.0
-    )
-    here, plan = next(iter(made.items()))
-    # What is asked of a body is refused where the body is not there.
-    asked = {name.partition(".")[0] for name in (*plan.asked, *plan.removals)}
-    alike_everywhere = asked.isdisjoint(plan.compiled.entity_names)
+    before = overlaps_before(base)
+    here = next(iter(made))
     for begin in range(0, len(draws) - 1, CHUNK):
         attempts = list(draws[:-1][begin : begin + CHUNK])
         if structure is None:
             places: dict[int, Plan | None] = dict.fromkeys(attempts, here)
         else:
-            if alike_everywhere:
-                attempts = _thinned(plan, before, key, attempts, whole=False)
             places = {attempt: structure(replace(key, attempt=attempt)) for attempt in attempts}
         thinned: dict[Plan | None, frozenset[int]] = {}
         for attempt, where in places.items():
@@ -235,8 +229,6 @@ def _thinned(
     before: Iterable[Overlap],
     key: NoiseKey,
     attempts: list[int],
-    *,
-    whole: bool = True,
 ) -> list[int]:
     """List the draws that may be feasible.
 
@@ -245,15 +237,14 @@ def _thinned(
         before: The bodies that lie in one another already.
         key: Where to draw.
         attempts: Numbers of draws.
-        whole: Whether all of them have the bodies of the plan.
     """
     if plan.solver is None:
         return attempts
+    composition = plan.compiled.composition
     candidates = Candidates(plan.solver, replace(key, attempt=1), np.array(attempts))
     try:
         with np.errstate(all="ignore"):
-            plan.compiled.composition.thin(candidates, before, whole=whole)
+            found = [composition.overlaps(s, asked=plan.asked) for s in candidates.scenes()]
     except Exception:  # planning says what is wrong
         return attempts
-    left: list[int] = candidates.attempts.tolist()
-    return left
+    return [n for n, overlaps in zip(attempts, found, strict=True) if not deeper(overlaps, before)]

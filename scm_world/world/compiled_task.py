@@ -10,6 +10,7 @@ from math import prod
 from typing import Any, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._arguments import real_numbers, whole_number
 from scm_world._types import ArrayLike, Floats, Value, Values
@@ -241,6 +242,20 @@ class CompiledTask(ActionVector):
         static = frozenset(self.static_names)
         where = (self.slices, self.commanded)
         return Mechanisms(self.model, self.computed, static, *where, sizes)
+
+    @cached_property
+    def places(self) -> Mapping[str, slice]:
+        """Where those states stand that say where bodies are: not their velocities."""
+        units = ("m", "rad", "1")
+        return {n: at for n, at in self.slices.items() if self.model.declared(n).unit in units}
+
+    @cached_property
+    def placed(self) -> NDArray[np.bool_]:
+        """Which numbers of the state say where bodies are, shape (size,)."""
+        found = np.zeros(self._start.vector.shape, dtype=np.bool_)
+        for name, where in self.places.items():
+            found[where] |= name not in self.bundles
+        return found
 
     @cached_property
     def entity_names(self) -> frozenset[str]:

@@ -217,6 +217,7 @@ class Realization(ABC):
 
     Attributes:
         structure: What was compiled.
+        owners: Name of the body of each shape: the geoms, then the flexes.
         model: With the present parameters.
         data: With the present state.
         kept: The parameters in force; at first, none has been written.
@@ -246,7 +247,7 @@ class Realization(ABC):
         self._scratch = mujoco.MjData(model)
         self._slots = slots(model, data)
         self._constant = frozenset(key for key, slot in self._slots.items() if slot.constant)
-        self._bodies, self._owners = bodies, owners
+        self._bodies, self.owners = bodies, owners
         self.kept: dict[ParameterKey, Floats] = {}
         self.applied: Parameters | None = None
         self._numbers: bytes | None = None  # of what is kept, if nothing was written since
@@ -311,7 +312,7 @@ class Realization(ABC):
         """Copy the contacts of the last physics step; of Runge-Kutta, those of its last stage."""
         if self.replay is not None:
             return self._replayed(*self.replay)
-        return touches(self.model, self.data, self._owners)
+        return touches(self.model, self.data, self.owners)
 
     def _replayed(self, numbers: Floats, steps: int) -> Touches:
         """Take steps again on other data, and copy the contacts of the last one."""
@@ -321,7 +322,7 @@ class Realization(ABC):
             mujoco.mj_step(self.model, data, steps)
         except (mujoco.FatalError, mujoco.UnexpectedError):
             mujoco.mj_resetData(self.model, data)  # it failed then, too, and left no contacts
-        found = touches(self.model, data, self._owners)
+        found = touches(self.model, data, self.owners)
         mujoco.mj_resetData(self.model, data)
         data.warning.number[:] = 1
         return found

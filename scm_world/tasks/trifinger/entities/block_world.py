@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, final
+from typing import final
 
 from scm_world._types import Floats, Values
 from scm_world.geometry.hulls import Hull
@@ -12,7 +12,7 @@ from scm_world.models import ControlMode, GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.scene import Overlap
 from scm_world.tasks.composition import Commands, Composition, Entity
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
-from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
+from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps
 from scm_world.tasks.trifinger.hardware import (
     FINGERS,
     LINK_NAMES,
@@ -98,13 +98,6 @@ class BlockWorld(Composition):
             for overlap in overlaps(scene, tolerance=min(robot, others))
             if overlap.depth > (others if set(LINK_NAMES).isdisjoint(overlap.bodies) else robot)
         )
-
-    def thin(self, candidates: Any, before: Iterable[Overlap], *, whole: bool = True) -> None:
-        """Leave out candidates in which fingers, blocks or obstacles lie in one another."""
-        if not self.hulls:
-            tolerances = self.conventions.robot_tolerance, self.conventions.tolerance
-            blocks, obstacles = (self.blocks, self.obstacles) if whole else ((), ())
-            thin(candidates, blocks, obstacles, before, tolerances)
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable, with the states coupled to all physical quantities."""
