@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
@@ -239,13 +240,29 @@ class Composition(ABC):
         return float(self.structure(values).timestep)
 
     def overlaps(
-        self, scene: Scene, tolerance: float | None = None, asked: Iterable[str] = ()
+        self,
+        scene: Scene,
+        tolerance: float | None = None,
+        asked: Iterable[str] = (),
+        enough: float = math.inf,
     ) -> tuple[Overlap, ...]:
-        """List the bodies that lie deeper in one another than a tolerance [m].
+        """List the bodies that lie deeper in one another than a tolerance.
 
-        None stands for what the task allows after an intervention on the variables asked for.
+        Args:
+            scene: With complete parameters.
+            tolerance: How deep is too deep [m]; what the task allows if None.
+            asked: The variables that an intervention is on.
+            enough: Where some lie deeper than this in one another, those alone may be listed [m].
         """
         return ()
+
+    def thin(self, candidates: Any, limit: float) -> None:  # noqa: B027 # may leave all
+        """Leave out candidates of which it is seen at once that they put bodies in one place.
+
+        Args:
+            candidates: Draws of an intervention, with ``parameter``, ``state`` and ``keep``.
+            limit: How deep bodies lie in one another already [m].
+        """
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         """List goals, of some, that lie in something that never moves: nothing can fill them."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from typing import Any, Self, final
 
@@ -65,14 +65,18 @@ class ModelComposition(Composition):
         self._model = model
 
     @cached_property
-    def _meant(self) -> Container[tuple[int, int]]:
+    def _meant(self) -> frozenset[tuple[int, int]]:
         """The shapes that lie in one another in the pose of the file: they are meant to."""
         from scm_world.backends.mujoco.overlaps import touching
 
-        return frozenset(touching(self._model.default_scene(), TOLERANCE))
+        return touching(self._model.default_scene(), TOLERANCE)
 
     def overlaps(
-        self, scene: Scene, tolerance: float | None = None, asked: Iterable[str] = ()
+        self,
+        scene: Scene,
+        tolerance: float | None = None,
+        asked: Iterable[str] = (),
+        enough: float = math.inf,
     ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance [m].
 
@@ -83,7 +87,8 @@ class ModelComposition(Composition):
             return ()
         from scm_world.backends.mujoco.overlaps import overlaps
 
-        return overlaps(scene, TOLERANCE if tolerance is None else tolerance, self._meant)
+        tolerance = TOLERANCE if tolerance is None else tolerance
+        return overlaps(scene, tolerance, self._meant, max(enough, tolerance))
 
     def structure(self, values: Mapping[str, Any]) -> Model:
         """Give the model: it is compiled once."""

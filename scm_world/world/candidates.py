@@ -10,7 +10,8 @@ import numpy as np
 
 from scm_world._types import Integers, Value
 from scm_world.graph import NoiseKey
-from scm_world.models.scene import SURFACES, Overlap, Scene
+from scm_world.models import ParameterKey, Scene
+from scm_world.models.scene import SURFACES, Overlap
 from scm_world.variables import Draw, Hard, Natural, Rotations, Variable, whole_of
 from scm_world.variables.noise import word_of
 from scm_world.world.compiled_task import Plan, StepBase
@@ -20,8 +21,8 @@ from scm_world.world.solver import Solver, same
 
 ROUNDING = 1e-6
 """How much deeper than before is no deeper [m]."""
-CHUNK = 64
-"""How many draws are looked at together."""
+FIRST, CHUNK = 8, 64
+"""How many draws are looked at together: at first, and later."""
 
 
 class Unknown(Exception):  # no error: such draws are planned one after another
@@ -45,26 +46,46 @@ class Candidates:
         self._solver, self._key, self._task = solver, key, solver.base.compiled
         self._known = solver.same_at(key)
         self._carried = {variable.name: variable for variable in self._task.carried}
+        self._keys = {key: name for name, key in self._task.parameter_keys.items()}
         self._found: dict[str, Value] = {}
         self._varying: set[str] = set()
 
+    def keep(self, which: Value) -> None:
+        """Leave out draws; ``which`` tells of each whether it stays, shape (n,)."""
+        self.attempts = self.attempts[which]
+        for name in self._varying:
+            self._found[name] = self._found[name][which]
+
+    def parameter(self, key: ParameterKey) -> Value:
+        """Compute a physical parameter, shape (n or 1, *shape); it must be a variable."""
+        return self._value(self._keys[key])
+
+    def state(self, where: slice) -> Value:
+        """Compute some numbers of the state vector, shape (n or 1, size)."""
+        bundles, parts = self._task.bundles, []
+        for name, own in self._task.slices.items():
+            if where.start <= own.start and own.stop <= where.stop and name not in bundles:
+                value = self._value(name)
+                parts.append(value.reshape(len(value), -1))
+        n = max(map(len, parts))
+        return np.hstack([np.broadcast_to(part, (n, part.shape[1])) for part in parts])
+
     def scenes(self) -> Iterator[Scene]:
         """Yield the scene of each draw, as far as it says where surfaces are."""
-        task, solver = self._task, self._solver
-        scene = task.describe(solver.static, solver.state)
-        keys = {name: key for name, key in task.parameter_keys.items() if key[1] in SURFACES}
-        surfaces = {key: self._value(name) for name, key in keys.items()}
-        places = [
-            (where, self._value(name))
-            for name, where in task.places.items()
-            if name not in task.bundles
-        ]
+        task, scene = self._task, self._task.describe(self._solver.static, self._solver.state)
+        keys = {name: key for key, name in self._keys.items() if key[1] in SURFACES}
+        names = (*keys, *(name for name in task.places if name not in task.bundles))
+        values = {name: self._value(name) for name in names}
+        varying = self._varying.intersection(values)
+        vector, parameters = scene.state.vector.copy(), {**scene.parameters}
         for row in range(len(self.attempts)):
-            state = scene.state.copy()
-            for where, value in places:
-                state.vector[where] = value[min(row, len(value) - 1)].ravel()
-            found = {key: value[min(row, len(value) - 1)] for key, value in surfaces.items()}
-            yield Scene(scene.structure, {**scene.parameters, **found}, state)
+            for name in varying if row else values:
+                value = values[name][row if name in varying else 0]
+                if name in keys:
+                    parameters[keys[name]] = value
+                else:
+                    vector[task.places[name]] = value.ravel()
+            yield Scene(scene.structure, parameters, scene.state.with_vector(vector))
 
     def _value(self, name: str) -> Value:
         if name not in self._found:
@@ -206,12 +227,19 @@ def promising(
         The number of a draw, and its structure.
     """
     before = overlaps_before(base)
-    here = next(iter(made))
-    for begin in range(0, len(draws) - 1, CHUNK):
-        attempts = list(draws[:-1][begin : begin + CHUNK])
+    here, plan = next(iter(made.items()))
+    # What is asked of a body is refused where the body is not there.
+    asked = {name.partition(".")[0] for name in (*plan.asked, *plan.removals)}
+    alike_everywhere = asked.isdisjoint(plan.compiled.entity_names)
+    left = list(draws[:-1])
+    while left:
+        size = FIRST if left[0] == draws[0] else CHUNK
+        attempts, left = left[:size], left[size:]
         if structure is None:
             places: dict[int, Plan | None] = dict.fromkeys(attempts, here)
         else:
+            if alike_everywhere:
+                attempts = _thinned(plan, before, key, attempts, whole=False)
             places = {attempt: structure(replace(key, attempt=attempt)) for attempt in attempts}
         thinned: dict[Plan | None, frozenset[int]] = {}
         for attempt, where in places.items():
@@ -229,6 +257,8 @@ def _thinned(
     before: Iterable[Overlap],
     key: NoiseKey,
     attempts: list[int],
+    *,
+    whole: bool = True,
 ) -> list[int]:
     """List the draws that may be feasible.
 
@@ -237,14 +267,21 @@ def _thinned(
         before: The bodies that lie in one another already.
         key: Where to draw.
         attempts: Numbers of draws.
+        whole: Whether all of them have the bodies of the plan.
     """
     if plan.solver is None:
         return attempts
+    enough = max((overlap.depth for overlap in before), default=0.0) + ROUNDING
     composition = plan.compiled.composition
     candidates = Candidates(plan.solver, replace(key, attempt=1), np.array(attempts))
     try:
         with np.errstate(all="ignore"):
-            found = [composition.overlaps(s, asked=plan.asked) for s in candidates.scenes()]
+            composition.thin(candidates, enough)
+            if whole and len(candidates.attempts):
+                scenes = candidates.scenes()
+                found = (composition.overlaps(scene, None, plan.asked, enough) for scene in scenes)
+                candidates.keep(np.array([not deeper(overlaps, before) for overlaps in found]))
     except Exception:  # planning says what is wrong
         return attempts
-    return [n for n, overlaps in zip(attempts, found, strict=True) if not deeper(overlaps, before)]
+    left: list[int] = candidates.attempts.tolist()
+    return left

@@ -7,14 +7,14 @@ compared: pairs that the file excludes, parents and their children, and fixed bo
 from __future__ import annotations
 
 import threading
-from collections.abc import Container, Mapping
+from collections.abc import Set
 from functools import lru_cache
 from typing import Any, final
 
 import mujoco
 import numpy as np
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Integers
 from scm_world.backends.mujoco.backend import realize
 from scm_world.models.scene import SURFACES, Overlap, ParameterKey, Scene
 
@@ -34,15 +34,15 @@ class _Scratch:
         self._now = realize(structure, self._written)
         model, self.owners = self._now.model, self._now.owners
         kinds = np.ones(model.ngeom + model.nflex, dtype=np.int64)
-        roots = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+        roots = model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)]
         kinds[: model.ngeom][np.isin(model.body_rootid[model.geom_bodyid], roots)] = 0
         kinds[: model.ngeom][model.body_weldid[model.geom_bodyid] == 0] = 2
         self.ranks: dict[str, tuple[int, int]] = {}
         for shape, (owner, kind) in enumerate(zip(self.owners, kinds.tolist(), strict=True)):
             self.ranks.setdefault(owner, (kind, shape))
 
-    def touching(self, scene: Scene, tolerance: float) -> dict[Shapes, float]:
-        """Find the shapes that lie deeper in one another than a tolerance [m]."""
+    def contacts(self, scene: Scene) -> tuple[Integers, Floats]:
+        """Find the shapes that touch, shape (n, 2), and their depths, shape (n,) [m]."""
         now, written, parameters = self._now, self._written, scene.parameters
         changed = {k: parameters[k] for k, old in written.items() if parameters[k] is not old}
         if changed:
@@ -54,20 +54,11 @@ class _Scratch:
         if model.nflex:
             mujoco.mj_flex(model, data)
         mujoco.mj_collision(model, data)
-        found: dict[Shapes, float] = {}
-        if not data.ncon:
-            return found
         contact = data.contact
-        deep = np.flatnonzero(contact.dist < -tolerance)
-        if len(deep):
-            shapes = contact.geom[deep]
-            if model.nflex:
-                shapes = np.where(shapes < 0, model.ngeom + contact.flex[deep], shapes)
-            for (one, other), distance in zip(
-                shapes.tolist(), contact.dist[deep].tolist(), strict=True
-            ):
-                found[one, other] = max(found.get((one, other), 0.0), -distance)
-        return found
+        shapes = contact.geom
+        if model.nflex:
+            shapes = np.where(shapes < 0, model.ngeom + contact.flex, shapes)
+        return shapes, -contact.dist
 
 
 @lru_cache(maxsize=32)
@@ -76,13 +67,17 @@ def _scratch(structure: Any, thread: int) -> _Scratch:
     return _Scratch(structure)
 
 
-def touching(scene: Scene, tolerance: float) -> Mapping[Shapes, float]:
-    """Find the shapes that lie deeper in one another than a tolerance [m], with their depths."""
-    return _scratch(scene.structure, threading.get_ident()).touching(scene, tolerance)
+def touching(scene: Scene, tolerance: float) -> frozenset[Shapes]:
+    """Return the shapes that lie deeper in one another than a tolerance [m]."""
+    shapes, depths = _scratch(scene.structure, threading.get_ident()).contacts(scene)
+    return frozenset((one, other) for one, other in shapes[depths > tolerance].tolist())
 
 
 def overlaps(
-    scene: Scene, tolerance: float, besides: Container[Shapes] = ()
+    scene: Scene,
+    tolerance: float,
+    besides: Set[Shapes] = frozenset(),
+    enough: float = np.inf,
 ) -> tuple[Overlap, ...]:
     """List all pairs of bodies that lie deeper in one another than a tolerance.
 
@@ -90,6 +85,7 @@ def overlaps(
         scene: With complete parameters.
         tolerance: How deep is too deep [m].
         besides: Pairs of shapes that may lie in one another.
+        enough: Where some lie deeper than this in one another, the deepest alone are listed [m].
 
     Returns:
         One entry for each pair of names, with its greatest depth. First come bodies that move
@@ -105,11 +101,19 @@ def overlaps(
         'tool_block' lies 2.5 mm deep in 'floor'
     """
     scratch = _scratch(scene.structure, threading.get_ident())
+    shapes, depths = scratch.contacts(scene)
+    if not len(depths):
+        return ()
+    found: dict[tuple[str, ...], Overlap] = {}
+    deepest = int(depths.argmax())
+    listed = [deepest] if depths[deepest] > enough and not besides else depths > tolerance
     owners, ranks = scratch.owners, scratch.ranks
-    deepest: dict[tuple[str, ...], float] = {}
-    for shapes, depth in scratch.touching(scene, tolerance).items():
-        names = tuple(sorted({owners[shape] for shape in shapes}, key=ranks.__getitem__))
-        if len(names) == 2 and shapes not in besides:
-            deepest[names] = max(depth, deepest.get(names, 0.0))
-    found = (Overlap((one, other), depth) for (one, other), depth in deepest.items())
-    return tuple(sorted(found, key=lambda overlap: [*map(ranks.__getitem__, overlap.bodies)]))
+    for (one, other), depth in zip(shapes[listed].tolist(), depths[listed].tolist(), strict=True):
+        names = owners[one], owners[other]
+        if names[0] == names[1] or (one, other) in besides:
+            continue
+        names = names if ranks[names[0]] < ranks[names[1]] else names[::-1]
+        if names not in found or found[names].depth < depth:
+            found[names] = Overlap(names, depth)
+    ordered = sorted(found, key=lambda names: [ranks[name] for name in names])
+    return tuple(map(found.__getitem__, ordered))

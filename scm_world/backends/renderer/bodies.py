@@ -10,7 +10,7 @@ from numba import njit
 
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.geometry.hulls import Hull, solid
+from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import rotation_kernel
 from scm_world.models.camera import Camera
 from scm_world.models.model import Model
@@ -120,9 +120,8 @@ def turn_kernel(quaternions: Floats, rotations: Floats) -> None:
 @lru_cache(maxsize=128)
 def _hull_parts(hull: Hull) -> tuple[Floats, Floats]:
     """Give the planes (p, 4) of a hull and half the edges (3,) of a box that holds it [m]."""
-    parts = solid(hull)
-    halves: Floats = np.abs(parts.vertices).max(axis=0)
-    return parts.planes, halves
+    halves: Floats = np.abs(hull.vertices).max(axis=0)
+    return np.array(hull.planes), halves
 
 
 def empty_bodies(n: int, hulls: list[Hull | None]) -> Bodies:

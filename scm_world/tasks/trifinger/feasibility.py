@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container
+from typing import Any
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
-from scm_world._types import ArrayLike
+from scm_world._types import ArrayLike, Floats
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models.scene import TOLERANCE, GoalRegion, Overlap, Scene
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.kinematics import forward
+from scm_world.tasks.trifinger.grasping.hand import deepest_kernel
+from scm_world.tasks.trifinger.kinematics import forward, forward_kernel
 from scm_world.tasks.trifinger.structure import (
     WALL_HEIGHT,
     WALL_RADIUS,
@@ -18,8 +23,10 @@ from scm_world.tasks.trifinger.structure import (
     default_scene,
 )
 
+BALLS_MARGIN = 1e-3  # [m] by which balls of two legs may be deeper in one another than capsules
 
-def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
+
+def overlaps(scene: Scene, *, tolerance: float, enough: float = math.inf) -> tuple[Overlap, ...]:
     """List all pairs of bodies that lie deeper in one another than a tolerance.
 
     Compared are blocks with everything; the middle and lower links of different fingers with one
@@ -30,6 +37,7 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
     Args:
         scene: With complete parameters.
         tolerance: How deep is too deep [m].
+        enough: Where some lie deeper than this in one another, those alone may be listed [m].
 
     Returns:
         One entry for each pair of names, blocks first.
@@ -44,12 +52,13 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
     """
     from scm_world.backends.mujoco import overlaps as engine
 
-    state = scene.state
+    found, state = engine.overlaps(scene, tolerance, enough=enough), scene.state
+    if any(overlap.depth > enough for overlap in found):
+        return found
     tips = forward(state.joint_positions, float(scene.parameters["robot", "height"])).reshape(3, 3)
     centers = np.vstack([state.positions, tips])
     beyond = np.hypot(centers[:, 0], centers[:, 1]) - WALL_RADIUS
     beyond[len(state.positions) :][tips[:, 2] > WALL_HEIGHT] = 0.0
-    found = engine.overlaps(scene, tolerance)
     if beyond.max() <= tolerance:
         return found
     names = *scene.structure.blocks, *(hardware.link_name(f, 3) for f in hardware.FINGERS)
@@ -58,6 +67,38 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
         if depth > tolerance:
             deepest[name, "stage"] = max(depth, deepest.get((name, "stage"), 0.0))
     return tuple(Overlap(bodies, depth) for bodies, depth in deepest.items())
+
+
+def thin(candidates: Any, limit: float) -> None:
+    """Leave out candidates whose fingers lie deep in one another, or beyond the ring.
+
+    Most draws of the joints are of this kind. What is left has to be looked at with ``overlaps``.
+
+    Args:
+        candidates: Draws of an intervention.
+        limit: How deep is too deep where a link takes part [m].
+    """
+    joints = candidates.state(slice(0, hardware.N_JOINTS))
+    if len(joints) > 1:
+        height = candidates.parameter(("robot", "height"))
+        heights = np.broadcast_to(height, len(joints))
+        candidates.keep(_clear(joints, np.ascontiguousarray(heights), limit))
+
+
+@njit(cache=True)
+def _clear(joints: Floats, heights: Floats, limit: float) -> NDArray[np.bool_]:
+    """Tell of each row of joints whether fingers may be clear of one another and of the ring."""
+    found, tips, none = np.empty(len(joints), dtype=np.bool_), np.empty(9), np.empty((0, 3))
+    for row in range(len(joints)):
+        forward_kernel(joints[row], heights[row], tips)
+        apart = True
+        for x, y, z in tips.reshape(3, 3):
+            apart &= z > WALL_HEIGHT or math.hypot(x, y) - WALL_RADIUS <= limit
+        legs = np.empty((0, 3, 3))
+        found[row] = apart and (
+            deepest_kernel(joints[row], heights[row], none, none, legs) <= limit + BALLS_MARGIN
+        )
+    return found
 
 
 def buried_goals(scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
@@ -70,10 +111,8 @@ def buried_goals(scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
     found, obstacles = list[Overlap](), scene.structure.obstacles
     goals = [goal for goal in scene.goals if obstacles and goal.name in names]
     for goal in (goal for goal in goals if goal.shape == "sphere"):
-        depths = {name: _depth_in_box(goal, scene, name) for name in obstacles}
-        found += [
-            Overlap((goal.name, n), depth) for n, depth in depths.items() if depth > TOLERANCE
-        ]
+        inside = (Overlap((goal.name, o), _depth_in_box(goal, scene, o)) for o in obstacles)
+        found += [overlap for overlap in inside if overlap.depth > TOLERANCE]
     solid = [goal for goal in goals if goal.shape != "sphere"]
     if solid:  # blocks in the places of goals
         hulls = tuple((goal.name, goal.hull) for goal in solid if goal.hull is not None)

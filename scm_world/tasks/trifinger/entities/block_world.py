@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import final
+from typing import Any, final
 
 from scm_world._types import Floats, Values
 from scm_world.geometry.hulls import Hull
@@ -12,7 +13,7 @@ from scm_world.models import ControlMode, GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.scene import Overlap
 from scm_world.tasks.composition import Commands, Composition, Entity
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
-from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps
+from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
 from scm_world.tasks.trifinger.hardware import (
     FINGERS,
     LINK_NAMES,
@@ -85,19 +86,31 @@ class BlockWorld(Composition):
         return self._structures[name]
 
     def overlaps(
-        self, scene: Scene, tolerance: float | None = None, asked: Iterable[str] = ()
+        self,
+        scene: Scene,
+        tolerance: float | None = None,
+        asked: Iterable[str] = (),
+        enough: float = math.inf,
     ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance [m]."""
         if tolerance is not None:
             return overlaps(scene, tolerance=tolerance)
-        if any(name.partition(".")[0] in self.unchecked for name in asked):
+        if self.unchecked and any(name.partition(".")[0] in self.unchecked for name in asked):
             return ()
         robot, others = self.conventions.robot_tolerance, self.conventions.tolerance
         return tuple(
             overlap
-            for overlap in overlaps(scene, tolerance=min(robot, others))
+            for overlap in overlaps(
+                scene,
+                tolerance=min(robot, others),
+                enough=max(enough, robot, others),
+            )
             if overlap.depth > (others if set(LINK_NAMES).isdisjoint(overlap.bodies) else robot)
         )
+
+    def thin(self, candidates: Any, limit: float) -> None:
+        """Leave out candidates whose fingers cross one another."""
+        thin(candidates, max(limit, self.conventions.robot_tolerance))
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable, with the states coupled to all physical quantities."""
