@@ -61,7 +61,7 @@ def test_a_body_in_another_is_refused_with_the_depth_and_the_nearest_place(backe
         world.do({PLACE: [-0.5, 0.0, 0.08]})
     assert refused.value.variable == PLACE
     np.testing.assert_allclose(refused.value.nearest, [-0.5, 0.0, 0.099], atol=1e-6)
-    with pytest.raises(Infeasible, match="'ball' lies .* deep in 'hand'"):
+    with pytest.raises(Infeasible, match=r"'ball' lies .* deep in 'hand'"):
         world.do({PLACE: [0.3, 0.0, 0.6]})
     assert all(np.array_equal(world[name], value) for name, value in before.items())
     world.do({PLACE: refused.value.nearest})
@@ -74,7 +74,7 @@ def test_a_shape_that_grows_into_another_is_refused() -> None:
     with pytest.raises(Infeasible, match="'ball' lies 50 mm deep in 'world'"):
         world.do({"ball.size": 0.15})
     world.do({PLACE: [0.25, 0.0, 0.25]})
-    with pytest.raises(Infeasible, match="'ball' lies .* deep in 'hand'"):
+    with pytest.raises(Infeasible, match=r"'ball' lies .* deep in 'hand'"):
         world.do({"hinge.position": 0.6})
 
 
