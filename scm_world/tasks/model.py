@@ -80,7 +80,7 @@ class ModelComposition(Composition):
     ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance [m].
 
-        Not listed are shapes that do so in the pose of the file. All is listed of a model that
+        Not listed are shapes that do so in the pose of the file. Nothing is listed of a model that
         describes no bodies.
         """
         if self._model.describe is None:
