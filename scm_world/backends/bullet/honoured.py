@@ -108,7 +108,8 @@ def _multiplied(mj: mujoco.MjModel) -> NDArray[np.bool_]:
     """Tell which pairs have the product of the frictions of their shapes, shape (npair,)."""
     factors = mj.geom_friction[:, 0]
     products = factors[mj.pair_geom1] * factors[mj.pair_geom2]
-    found: NDArray[np.bool_] = np.equal(mj.pair_friction[:, :2], products[:, None]).all(axis=1)
+    same: Any = mj.pair_friction[:, :2] == products[:, None]
+    found: NDArray[np.bool_] = same.all(axis=1)
     return found
 
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from importlib import import_module
 from typing import Any, final
@@ -99,8 +99,8 @@ class TriFinger(Model):
             and fingertips collide with them.
         hulls: The movable blocks that are no boxes, each with its convex shape.
         torques: Whether joint torques are commanded [N m], and not joint positions [rad].
-        published: What Bullet realises in place of it: the bodies of the predecessor; see
-            ``published``. None where that is the same.
+        published: Whether Bullet realises the bodies of the predecessor; see ``published``.
+        instead: What Bullet realises then.
     """
 
     blocks: tuple[str, ...] = ()
@@ -109,6 +109,7 @@ class TriFinger(Model):
     hulls: tuple[tuple[str, Hull], ...] = ()
     torques: bool = False
     published: bool = False
+    instead: Model | None = field(default=None, repr=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how it is made, so that pickling costs little."""
@@ -140,7 +141,7 @@ class TriFinger(Model):
     def realization(self, backend: str) -> Any:
         """Return what Bullet realises, or how the robot is realised without physics, or drawn."""
         if backend == "bullet":
-            return self.published
+            return self.instead
         if backend not in _REALIZATIONS:
             return None
         module, what = _REALIZATIONS[backend]
@@ -205,7 +206,7 @@ def trifinger(
     described = {name: getattr(read, name) for name in read.__dataclass_fields__}
     described["digest"] += f" {published}"
     instead = _read(replace(parts, published=True), resolution) if published else None
-    return TriFinger(**described, **{**vars(parts), "published": instead})
+    return TriFinger(**described, **{**vars(parts), "published": published}, instead=instead)
 
 
 def _read(parts: _Parts, resolution: str) -> Model:
@@ -297,9 +298,9 @@ def _compiled(parts: _Parts) -> mujoco.MjModel:
     spec.add_key(name=START, qpos=start)
     model, defaults = spec.compile(), _defaults(parts)
     scratch = mujoco.MjData(model)
-    for field in _bindings(model, Couplings(model), parts=parts):
-        slot = field.slot(model, scratch)
-        slot.write(np.asarray(defaults[field.name], dtype=np.float64))
+    for bound in _bindings(model, Couplings(model), parts=parts):
+        slot = bound.slot(model, scratch)  # type: ignore[misc] # every binding has one
+        slot.write(np.asarray(defaults[bound.name], dtype=np.float64))
     couple(model)
     mujoco.mj_setConst(model, scratch)
     return model
