@@ -96,7 +96,7 @@ def _of_contacts(
             yield f"the {mujoco.mjtGeom(kind).name.removeprefix('mjGEOM_').lower()} {name!r}"
         if mj.geom_adhesion[geom] or np.any(mj.geom_surfacevel[geom]):
             yield f"adhesion or moving surface of the geom {name!r}"
-    dynamic = trees.dynamic.any(axis=1)
+    dynamic: NDArray[np.bool_] = np.asarray(trees.dynamic.any(axis=1))
     for name, one, other, alike in zip(
         names["pair"], mj.pair_geom1, mj.pair_geom2, _multiplied(mj), strict=True
     ):
