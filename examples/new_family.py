@@ -12,7 +12,7 @@ from typing import ClassVar, Unpack
 import numpy as np
 
 from scm_world import World
-from scm_world.tasks import Building, Common
+from scm_world.tasks import Common, TriFingerTask
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.entities.blocks import ToolBlock, block_mass, block_size
@@ -35,7 +35,7 @@ def start(size: np.ndarray, orientation: np.ndarray, *, level: float, num: float
     return np.array([column * (size[0] + GAP), row * (size[1] + GAP), size[2] / 2])
 
 
-class Pyramid(Building):
+class Pyramid(TriFingerTask):
     """Blocks of one size, each level with one block less than the level below."""
 
     name = "pyramid"
@@ -52,19 +52,12 @@ class Pyramid(Building):
         """Turn the values of ``decided_by`` into a plan; all other methods read it."""
         return int(values[LEVELS])
 
-    def _bricks(self) -> Iterator[tuple[str, dict[str, float]]]:
+    def parts(self) -> Iterator[tuple[str, dict[str, float]]]:
+        """List the parts: a block ``tool_NAME`` each, and its place ``goal_NAME``."""
         plan = self.plan or self._levels  # the task alone, without a world, has no plan yet
         for level in range(plan):
             for num in range(plan - level):
                 yield f"{level}_{num}", {"level": float(level), "num": float(num)}
-
-    def tools(self) -> tuple[str, ...]:
-        """Name the blocks."""
-        return tuple(f"tool_{brick}" for brick, _ in self._bricks())
-
-    def targets(self) -> dict[str, str]:
-        """Name the goals, each with the block that the solution puts there."""
-        return {f"goal_{brick}": f"tool_{brick}" for brick, _ in self._bricks()}
 
     def shared(self) -> Iterable[Variable]:
         """Declare what several entities have in common, for every plan."""
@@ -81,7 +74,7 @@ class Pyramid(Building):
 
     def entities(self) -> Iterable[Entity]:
         """List blocks and goals."""
-        for brick, which in self._bricks():
+        for brick, which in self.parts():
             name = f"tool_{brick}"
             yield ToolBlock(
                 name,
@@ -90,7 +83,7 @@ class Pyramid(Building):
                 spawn=Function(start, constants=which),
                 spawn_again=True,  # another size puts the blocks there again
             )
-        for brick, which in self._bricks():
+        for brick, which in self.parts():
             name = f"goal_{brick}"
             where = Function(place, constants=which)
             position = goal_position(name, parents=(LEVELS, SIZE), mechanism=where)
@@ -104,10 +97,10 @@ def main(backend: str = "mujoco") -> None:
     world.reset(seed=0)
     world.do({SIZE: [0.05, 0.05, 0.06]})  # blocks, goals and starts follow
     world.do(world.task.solution(world.values()))
-    print(f"{len(world.task.tools())} blocks fill {float(world['fractional_success']):.2f}")
+    print(f"{len(world.task.tools)} blocks fill {float(world['fractional_success']):.2f}")
     world.step(np.array(world.task.start))
     print(world.do({LEVELS: 3}))  # in mid-episode: three blocks more
-    print(f"{len(world.task.tools())} blocks fill {float(world['fractional_success']):.2f}")
+    print(f"{len(world.task.tools)} blocks fill {float(world['fractional_success']):.2f}")
     world.reset(seed=1, do=world.task.sample_goal("A"))
 
 

@@ -42,10 +42,9 @@ def main(episodes: str = "4", length: str = "250") -> None:
         print(f"{engine}: joints moved by {moved:.2f} rad in a control step, towards 0.30 rad")
     if importlib.util.find_spec("pytest"):  # docs/extending.md has the whole suite
         from scm_world.testing.backend import BackendConformance
-        from scm_world.testing.scenes import busy_scene
 
         suite = type("Suite", (BackendConformance,), {"make": lambda self: SlowMotors()})()
-        suite.test_equal_scenes_continue_alike(busy_scene())
+        suite.test_equal_scenes_continue_alike(suite.busy())
         print("equal scenes continue bit for bit alike")
     how = {"backend": both, "env": {"max_episode_length": int(length)}}
     found = evaluate("feedback", "P0,P5", task="picking", n=int(episodes), **how)

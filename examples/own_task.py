@@ -4,13 +4,14 @@ Run it with ``python examples/own_task.py [N]``; a recipe takes its name, too.
 """
 
 import sys
+from collections.abc import Iterable
 from typing import ClassVar, Unpack
 
 import gymnasium
 import numpy as np
 
 from scm_world.evaluation import Protocol, evaluate
-from scm_world.tasks import register, term
+from scm_world.tasks import TriFingerTask, register, term
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger.entities.goals import goal_position
 from scm_world.tasks.trifinger.single import GOAL, TOOL, Alike, OneBlock
@@ -28,19 +29,27 @@ def nearer(now: np.ndarray, before: np.ndarray) -> float:
 
 
 @register  # at the top level, so that other processes know it, too
-class Centering(OneBlock):
+class Centering(TriFingerTask):
     """One block, and a goal in the middle of the floor."""
 
     name = "centering"
+    options = Alike  # those of one block, its shape and its mass among them
+    tools, targets = (TOOL,), {GOAL: TOOL}  # constants
     default_weights: ClassVar = {"reward.nearer": 100.0, "fractional_success": 1.0}
 
     def __init__(self, **options: Unpack[Alike]) -> None:
-        super().__init__(tool_block_position=(0.0, 0.1), **options)
+        self.block = OneBlock((0.0, 0.1), options)
+        super().__init__(**self.block.common)
+
+    def shared(self) -> Iterable[Variable]:
+        """Declare the size that both have."""
+        return self.block.shared()
 
     def entities(self) -> tuple[Entity, ...]:
         """List block and goal."""
         where = goal_position(GOAL, parents=(f"{GOAL}.size",), mechanism=Function(middle))
-        return self.tool(spaces=self.spaces(TOOL)), self.goal(where, spaces=self.spaces(GOAL))
+        block = self.block
+        return block.tool(spaces=block.spaces(TOOL)), block.goal(where, spaces=block.spaces(GOAL))
 
     def dense(self) -> tuple[Variable, ...]:
         """Declare what is rewarded besides filling the goal."""

@@ -152,7 +152,7 @@ def load_task(name: str, option: Sequence[str] | None = None) -> Task:
         BadParameter: An argument cannot be read.
 
     Example:
-        >>> load_task("towers", ["number_of_blocks_in_tower=1,1,2"]).tools()
+        >>> load_task("towers", ["number_of_blocks_in_tower=1,1,2"]).tools
         ('tool_level_0_col_0_row_0', 'tool_level_1_col_0_row_0')
     """
     from scm_world.tasks import make_task

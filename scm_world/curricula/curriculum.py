@@ -129,7 +129,7 @@ class Curriculum(Frozen):
 
     def _may_restructure(self, world: Simulation) -> bool:
         head = tuple(world.structures.head)
-        goals = world.task.goal_causes
+        goals = world.task.goal.causes
         return any(
             any(fnmatchcase(name, pattern) for name in head)
             or pattern in ("@everything", "@published")

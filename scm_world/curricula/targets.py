@@ -119,7 +119,7 @@ def grouped(declaration: CompiledTask, group: str) -> list[str]:
         for v in spaced
         if v.name.partition(".")[0] in blocks and v.name.partition(".")[2] in POSE
     ]
-    goals = [name for name in task.goal_causes if name in model]
+    goals = [name for name in task.goal.causes if name in model]
     match group:
         case "everything":
             return [v.name for v in spaced]

@@ -322,7 +322,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         """Observe the structure that there is."""
         found = self._observers.get(declaration)
         if found is None:
-            goals = Goals(declaration) if any(declaration.task.goal_names()) else None
+            goals = Goals(declaration) if declaration.task.goal.achieved else None
             largest = self._largest or declaration
             made = observer(self.world, declaration, self._how, goals, largest)
             counted = [n for n in (FRACTION, SUCCESS, TERMINATED) if n in declaration.model]
@@ -373,8 +373,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         begin(self.world, seed, request, self._attempts, number)
         self._done = [(0, request)] if request else []
         now = self._look()
-        for own in self.world.task.terms:
-            one_number(now, own.name, (own.name,))
+        for name in self._terms:
+            one_number(now, name, (name,))
         if self._window is not None:
             self._window.show(self.world.scene())
         return self._observer.observe(now), self._info(now)

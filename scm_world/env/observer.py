@@ -26,9 +26,8 @@ from scm_world.env.vector import (
 )
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.models.camera import Camera
-from scm_world.tasks import TIME, Observed, Task
-from scm_world.tasks.base import numbers_of
-from scm_world.tasks.rewards import FRACTION, SUCCESS
+from scm_world.tasks import Observed
+from scm_world.tasks.base import finite_numbers
 from scm_world.variables import Linear
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
@@ -39,13 +38,6 @@ BOUND = 10.0
 
 STACKS = ("cameras", "channels")
 """How the pictures of several cameras are put together."""
-
-TERMS: dict[str, Callable[[Task, Floats, Floats], Any]] = {
-    FRACTION: lambda task, have, want: task.fraction(have, want),
-    SUCCESS: lambda task, have, want: task.fulfilled(task.fraction(have, want)),
-    "reach_error": lambda task, have, want: np.abs(have - want).mean(axis=-1),
-}
-"""The reward terms that goals alone decide."""
 
 
 @final
@@ -64,12 +56,14 @@ class Goals:
     """
 
     def __init__(self, declaration: CompiledTask) -> None:
-        sides = declaration.task.goal_names()
-        self.names = (*sides[0], *sides[1])
+        goal = declaration.task.goal
+        self.names = (*goal.achieved, *goal.desired)
         where = declaration.mechanisms.where
-        self._sides = tuple(places(where[name] for name in side) for side in sides)
+        self._sides = tuple(
+            places(where[name] for name in side) for side in (goal.achieved, goal.desired)
+        )
         self.size = self._sides[0].size
-        self.bound = BOUND if declaration.task.saturates else WIDE
+        self.bound = BOUND if declaration.task.observation.saturates else WIDE
         self.spaces: dict[str, gymnasium.Space[Any]] = {
             name: gymnasium.spaces.Box(-self.bound, self.bound, (side.size,), np.float64)
             for name, side in zip(("achieved_goal", "desired_goal"), self._sides, strict=True)
@@ -123,7 +117,7 @@ def goal_reward(world: Simulation) -> Callable[[ArrayLike, ArrayLike, Any], Any]
         size = Goals(world.compiled).size
 
         def read(name: str, given: ArrayLike) -> Floats:
-            goal = numbers_of(given)
+            goal = finite_numbers(given)
             if goal is None or goal.shape[-1:] != (size,):
                 raise UnknownOption(name, given, (f"finite numbers of shape (..., {size})",))
             return goal
@@ -136,10 +130,10 @@ def goal_reward(world: Simulation) -> Callable[[ArrayLike, ArrayLike, Any], Any]
             raise UnknownOption("shape of desired goals", want.shape, allowed) from None
         node: Any = world.model.declared("reward")
         weights = zip((parent.name for parent in node.parents), node.mechanism.weights, strict=True)
-        total = np.zeros(shape)
+        total, measures = np.zeros(shape), world.task.goal.measures
         for name, weight in weights:
-            if name in TERMS:
-                total = total + weight * TERMS[name](world.task, have, want)
+            if name in measures:
+                total = total + weight * measures[name](have, want)
             elif not warned:
                 warned = True
                 gymnasium.logger.warn(
@@ -304,12 +298,12 @@ def context(declaration: CompiledTask) -> tuple[str, ...]:
 
 def published(world: Simulation, declaration: CompiledTask) -> dict[str, Observed]:
     """List the parts of the structured observation, by variable."""
-    parts = list(declaration.task.observed())
-    if declaration.task.head:
-        length = world.max_episode_length * world.control_period
-        end = length if world.given_length is None else float(world.given_length)
-        parts = [Observed(TIME, (0.0, end)), *declaration.task.head, *parts]
-    return {part.variable: part for part in parts}
+    length = world.max_episode_length * world.control_period
+    end = length if world.given_length is None else float(world.given_length)
+    return {
+        part.variable: replace(part, published=part.published or (0.0, end))
+        for part in declaration.task.observation.rows
+    }
 
 
 def _names(world: Simulation, declaration: CompiledTask, how: Observing) -> list[str]:
@@ -350,7 +344,7 @@ def _parts(
     """
     known = published(world, declaration)
     soft = frozenset[str]()
-    if not declaration.task.saturates:
+    if not declaration.task.observation.saturates:
         soft = frozenset(declaration.slices)
     as_published = world.conventions.published_observation
     parts = []
@@ -359,7 +353,7 @@ def _parts(
         observed, shape = known.get(name), declaration.model.declared(name).shape
         saturates = name not in soft or (observed is not None and observed.low is not None)
         if observed is not None and as_published:
-            low, high = (spread(side, shape) for side in observed.published)
+            low, high = (spread(side, shape) for side in observed.published or ())
         elif observed is not None and observed.low is not None:
             low, high = spread(observed.low, shape), spread(observed.high, shape)
         parts.append(ObservedPart(name, low, high, saturates=saturates))
@@ -371,9 +365,10 @@ def _quiet(parts: Iterable[ObservedPart]) -> list[ObservedPart]:
 
 
 def _keypoints(declaration: CompiledTask, asked: bool | str) -> View:
-    task = declaration.task
-    view = keypoints((*task.tools(), *task.targets())) if asked is True else task.view()
-    if not task.tools() or view is None:
+    goal, view = declaration.task.goal, declaration.task.observation.view
+    if asked is True:
+        view = keypoints((*goal.tools, *goal.targets))
+    if not goal.tools or view is None:
         raise UnknownOption("keypoints", asked, ("False: the task has no blocks, or no boxes",))
     return view
 

@@ -16,6 +16,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption, UnknownVariable
 from scm_world.evaluation.players import Player
 from scm_world.evaluation.protocols import Protocol
+from scm_world.tasks.base import OVERLAP
 from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED
 from scm_world.variables import Null, Subset
 from scm_world.variables.reserved import SENSOR_NOISE
@@ -189,9 +190,10 @@ class EpisodeRunner:
             if watch is not None:
                 watch(env)
         scores = scored(fractions, success=info.get(SUCCESS), total=float(total))
-        overlap = env.world.task.published_overlap(env.world.evaluate(()))
-        if overlap is not None:
-            scores["published_overlap"] = overlap
+        goal = env.world.task.goal
+        if OVERLAP in goal.measures:
+            vectors = goal.vectors(env.world.evaluate(()))
+            scores[OVERLAP] = float(goal.measures[OVERLAP](*vectors))
         return EpisodeRow(
             *who, engine, protocol.name, seed, episode, steps, scores, drawn, str(mark)
         )

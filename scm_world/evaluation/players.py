@@ -30,7 +30,7 @@ from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries.episode_files import load_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.twins import Twins
-from scm_world.tasks.base import Blind
+from scm_world.tasks.base import OpenLoopPolicy
 from scm_world.variables import Function
 from scm_world.world import Simulation
 
@@ -558,7 +558,7 @@ def _of_network(policy: MlpPolicy | OnnxPolicy, about: About) -> Player:
 
 
 def _of_object(policy: Any, about: About) -> Player:
-    if isinstance(policy, WorldPolicy) or policy is still or isinstance(policy, Blind):
+    if isinstance(policy, WorldPolicy) or policy is still or isinstance(policy, OpenLoopPolicy):
         inside = policy.policy if isinstance(policy, WorldPolicy) else policy
         make = inside if isinstance(inside, type) else partial(_itself, inside)
         start = partial(_of_world, make, about["name"])

@@ -112,6 +112,8 @@ ParameterKey = tuple[str, str]
 Parameters = Mapping[ParameterKey, Floats]
 """Physical parameters: scalars have shape (), sizes, colors and gravity shape (3,)."""
 
+SURFACES = frozenset({"size", "height", "position", "orientation", "axis", "anchor", "ref"})
+"""Properties that decide where the surfaces of bodies are."""
 RANGES = frozenset({"range", "springlength", "ctrlrange", "forcerange", "actuatorfrcrange"})
 """Properties that are a lower and an upper end."""
 REVERSED = "the upper end comes first; give the lower end first"
@@ -229,7 +231,7 @@ class Overlap:
 
     Attributes:
         bodies: Their names: those that can be moved first.
-        depth: How deep they lie in one another [m]; see ``scm_world.geometry.penetration``.
+        depth: How far they would have to be moved to come apart [m].
     """
 
     bodies: tuple[str, str]

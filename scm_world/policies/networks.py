@@ -87,7 +87,7 @@ class MlpPolicy:
 
     def __post_init__(self) -> None:
         kind = tasks().get(self.about.task)
-        wanted = len(kind.rest) or None if kind is not None else None
+        wanted = None if kind is None else kind.n_actions
         memory = self.about.memory
         problems = [*_misfits("layers", self.layers, None, wanted and wanted + memory)]
         if memory and not problems and min(self.n_observed, self.n_actions) < 1:

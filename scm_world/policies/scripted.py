@@ -14,7 +14,7 @@ from scm_world._types import Floats
 from scm_world.errors import ActionError
 from scm_world.policies.planning import CrossEntropy
 from scm_world.tasks import TASKS
-from scm_world.tasks.base import Blind, action_range, kept_rows
+from scm_world.tasks.base import OpenLoopPolicy, action_range, kept_rows
 from scm_world.world import Simulation
 
 Policy = Callable[[Any], Any]
@@ -23,7 +23,7 @@ Policy = Callable[[Any], Any]
 
 @final
 @dataclass(frozen=True)
-class Random(Blind):
+class Random(OpenLoopPolicy):
     """Actions drawn uniformly, from the noise of the episode.
 
     Two worlds with the same noise get the same actions, even if everything else differs.
@@ -54,7 +54,7 @@ class Random(Blind):
 
 
 @final
-class Sequence(Blind):
+class Sequence(OpenLoopPolicy):
     """Actions that are given: one for all steps, or one for each.
 
     Args:
@@ -120,7 +120,7 @@ def as_policy(given: Any, world: Any = None) -> Policy:
     return given if callable(given) else Sequence(given)
 
 
-class _Idle(Blind):
+class _Idle(OpenLoopPolicy):
     """The idle policy: the same action as in its first call."""
 
     def __init__(self) -> None:

@@ -31,7 +31,7 @@ from scm_world.queries.rollouts import (
 )
 from scm_world.queries.timed import On
 from scm_world.queries.twins import AnyTwins, EquationTwins, Twins, threaded
-from scm_world.tasks.base import Blind
+from scm_world.tasks.base import OpenLoopPolicy
 from scm_world.work.executors import Executor
 from scm_world.work.processes import cores
 from scm_world.world import Simulation
@@ -168,7 +168,7 @@ def _solved_together(twins: EquationTwins, units: Sequence[Unit]) -> tuple[Float
         not twins.layout.is_vectorised
         or any(unit.first or unit.number != i for unit, i in zip(units, numbers, strict=True))
         or any((unit.seed, unit.steps) != (first.seed, first.steps) for unit in units)
-        or not all(isinstance(policy, Blind) for policy in policies)
+        or not all(isinstance(policy, OpenLoopPolicy) for policy in policies)
     ):
         return None
     keys = [tuple((at, id(plan)) for at, plan in unit.layers) for unit in units]
@@ -181,7 +181,7 @@ def _solved_together(twins: EquationTwins, units: Sequence[Unit]) -> tuple[Float
     actions = np.empty((len(units), first.steps, twins.layout.n_actions))
     for row, policy in enumerate(policies):
         one.reset(seed=first.seed, episode=numbers[row])
-        actions[row] = policy.ahead(one, 0, first.steps)  # type: ignore[attr-defined] # Blind
+        actions[row] = policy.ahead(one, 0, first.steps)  # type: ignore[attr-defined] # OpenLoopPolicy
     together = Equations(twins.layout, groups)
     unit = replace(first, policy=lambda system: actions[:, system.index], names=())
     running = Running(unit, together)
@@ -193,7 +193,7 @@ def _solved_together(twins: EquationTwins, units: Sequence[Unit]) -> tuple[Float
 
 def is_known(unit: Unit) -> bool:
     """Tell whether all actions of a unit are known beforehand, so that it can be in a batch."""
-    return isinstance(as_policy(unit.policy), Blind) and ALL not in unit.names
+    return isinstance(as_policy(unit.policy), OpenLoopPolicy) and ALL not in unit.names
 
 
 def run_together(batch: Batch, units: Sequence[Unit]) -> list[Result]:

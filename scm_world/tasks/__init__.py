@@ -7,13 +7,12 @@ from collections.abc import Iterable
 from typing import Any, TypeVar
 
 from scm_world._arguments import enter
-from scm_world.tasks.base import TIME, Observed, Task, Timing
-from scm_world.tasks.conventions import CONVENTIONS, Conventions, conventions
+from scm_world.tasks.base import TIME, Conventions, Goal, Observation, Observed, Task, Timing
 from scm_world.tasks.model import ModelTask, model_task
 from scm_world.tasks.rewards import Common, term
 from scm_world.tasks.step import StepTask
 from scm_world.tasks.trifinger.base import HEAD, TriFingerTask
-from scm_world.tasks.trifinger.building import Building
+from scm_world.tasks.trifinger.conventions import CONVENTIONS
 from scm_world.tasks.trifinger.general import General
 from scm_world.tasks.trifinger.pick_and_place import PickAndPlace
 from scm_world.tasks.trifinger.picking import Picking
@@ -101,12 +100,13 @@ __all__ = [
     "HEAD",
     "TASKS",
     "TIME",
-    "Building",
     "Common",
     "Conventions",
     "CreativeStackedBlocks",
     "General",
+    "Goal",
     "ModelTask",
+    "Observation",
     "Observed",
     "PickAndPlace",
     "Picking",
@@ -119,7 +119,6 @@ __all__ = [
     "Timing",
     "Towers",
     "TriFingerTask",
-    "conventions",
     "make_task",
     "register",
     "tasks",

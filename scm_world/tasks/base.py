@@ -1,25 +1,27 @@
-"""What a task is: what there is, what is observed, what counts, and how it is experimented with."""
+"""Tasks: a system, its goal, its observation, and how it is experimented with."""
 
 from __future__ import annotations
 
 import copy
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
-from scm_world._types import ArrayLike, Floats, Value, Values
+from scm_world._types import Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
 from scm_world.tasks.composition import Composition
-from scm_world.tasks.conventions import CONVENTIONS, Conventions
-from scm_world.variables import Box, Draw, Integers, Measured, Noise, Variable
+from scm_world.variables import Box, Draw, Integers, Noise, Variable
 from scm_world.variables.kinds import SpaceName
 
 TIME = "time_left_for_task"
+OVERLAP = "published_overlap"
+
+Score = tuple[tuple[str, ...], Callable[..., Any]]
+"""Names of variables, and a function of their values, shapes (..., *shape), with values (...)."""
 
 
 @final
@@ -28,20 +30,104 @@ class Observed:
     """A part of the structured observation.
 
     Attributes:
-        variable: What is observed.
+        variable: Its name.
+        published: Lower and upper bound of the predecessor's normalisation; None for the time that
+            is left, which ends with the episode.
         low: Lower bound of each component; the declared one if None.
         high: Upper bound.
-        published: Lower and upper bound of the predecessor's normalisation.
     """
 
     variable: str
-    published: tuple[Any, Any]
+    published: tuple[Any, Any] | None = None
     low: Any = None
     high: Any = None
 
 
-def numbers_of(value: Any) -> Floats | None:
-    """Read finite real numbers; None if these are none."""
+@final
+@dataclass(frozen=True)
+class Observation:
+    """What is observed and measured of a task, in one of its structures.
+
+    Attributes:
+        rows: The parts of the structured observation, in order.
+        saturates: Whether observed states and goals are clipped to the bounds they declare.
+        view: The scene in a frame of its own: names of variables, the number of components, and a
+            function of the values; None if the task has no such readout.
+        symmetries: A function of values and of the names that are wanted. It lists the scenes in
+            which the same behaviour is right: the values of these variables, and for each number of
+            an action there its number in the present scene.
+        measured: Outcomes of experiments by default; all states, reward and success if None.
+        moving: Further outcomes where every instant is measured.
+    """
+
+    rows: tuple[Observed, ...] = ()
+    saturates: bool = False
+    view: tuple[tuple[str, ...], int, Callable[[Values], Floats]] | None = None
+    symmetries: Callable[[Values, Iterable[str]], Iterable[tuple[Values, Sequence[int]]]] | None = (
+        None
+    )
+    measured: tuple[str, ...] | None = None
+    moving: tuple[str, ...] = ()
+
+
+@final
+@dataclass(frozen=True)
+class Goal:
+    """What a task asks for, in one of its structures.
+
+    Attributes:
+        achieved: Variables that say what is achieved.
+        desired: Variables that say what is desired, as many numbers together.
+        causes: The variables that a new goal is drawn for.
+        measures: Functions of the two vectors, shapes (..., n), with values of shape (...): the
+            reward terms that they decide, such as ``success``, and ``published_overlap``, the
+            fractional success of CausalWorld 1.2.
+        closeness: The score that planners maximise; minus the distance of the vectors if None.
+        tools: Boxes that should be moved.
+        targets: Goals, each with the box that its solution puts there.
+    """
+
+    achieved: tuple[str, ...] = ()
+    desired: tuple[str, ...] = ()
+    causes: tuple[str, ...] = ()
+    measures: Mapping[str, Callable[[Floats, Floats], Any]] = field(default_factory=dict)
+    closeness: Score | None = None
+    tools: tuple[str, ...] = ()
+    targets: Mapping[str, str] = field(default_factory=dict)
+
+    def vectors(self, values: Values) -> tuple[Floats, Floats]:
+        """Return what is achieved and what is desired, two vectors of one shape."""
+        achieved, desired = (
+            np.concatenate([np.empty(0), *(np.ravel(values[name]) for name in names)])
+            for names in (self.achieved, self.desired)
+        )
+        return achieved, desired
+
+
+@dataclass(frozen=True)
+class Conventions:
+    """Choices of an environment that go together.
+
+    Attributes:
+        name: ``"scm_world"`` or ``"causal_world"``.
+        reward_times_dt: Rewards multiplied by the control period.
+        extra_step: Episodes one step longer than their length.
+        published_observation: The published normalisation of observations, which values may
+            leave, and a time feature in seconds minus steps where a length is given.
+    """
+
+    name: str = "scm_world"
+    reward_times_dt: bool = False
+    extra_step: bool = False
+    published_observation: bool = False
+
+    def adapt(self, variables: Iterable[Variable]) -> Iterable[Variable]:
+        """Return the variables with the spaces of these conventions."""
+        return variables
+
+
+def finite_numbers(value: Any) -> Floats | None:
+    """Return finite real numbers as an array; None for anything else."""
     try:
         found = np.asarray(value)
     except ValueError:  # a ragged list
@@ -53,50 +139,32 @@ def numbers_of(value: Any) -> Floats | None:
 def checked(
     option: str, value: Any, allowed: Box | Integers, *, shape: tuple[int, ...] = ()
 ) -> Any:
-    """Check an argument of a task against the bounds of the variable that it is the default of.
+    """Return an argument that lies within the bounds of the variable whose default it is.
 
     Args:
         option: Its name.
-        value: What was given.
+        value: The argument.
         allowed: The bounds.
-        shape: Of the variable.
-
-    Returns:
-        What was given.
+        shape: Shape of the variable.
 
     Raises:
-        UnknownOption: It is no number, of another shape, or out of bounds.
+        UnknownOption: It is not a number, of another shape, or out of bounds.
     """
-    number = numbers_of(value)
+    number = finite_numbers(value)
     if number is None or number.shape != shape or not allowed.contains(number):
         many = f"{shape[0]} numbers in " if shape else "a number in "
         raise UnknownOption(option, value, (many + allowed.describe(shape, {}),))
     return value
 
 
-def checked_weight(name: str, weight: Any) -> float:
-    """Check the weight of a reward term.
-
-    Raises:
-        UnknownOption: It is no finite number.
-    """
-    try:
-        number = float(weight)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not math.isfinite(number):
-        raise UnknownOption(f"weight of {name}", weight, ("any finite number",))
-    return number
-
-
 _DRAWS = 96
 
 
 @final
-class Dice:
+class ProbeGenerator:
     """The random numbers of one probe state.
 
-    They depend on seed, probe and attempt only, not on what was drawn before.
+    They depend on seed, probe and attempt only, not on earlier draws.
 
     Args:
         noise: The seed's noise.
@@ -106,10 +174,10 @@ class Dice:
 
     def __init__(self, noise: Noise, probe: int, attempt: int = 0) -> None:
         self._noise, self._probe, self._attempt = noise, probe, attempt
-        self._numbers = self.of("probe", _DRAWS)
+        self._numbers = self.random("probe", _DRAWS)
         self._used = 0
 
-    def between(self, low: float, high: float, n: int | None = None) -> Any:
+    def uniform(self, low: float, high: float, n: int | None = None) -> Any:
         """Draw one number, or an array of ``n``; at most 96 in all."""
         count = 1 if n is None else n
         drawn = self._numbers[self._used : self._used + count]
@@ -117,8 +185,8 @@ class Dice:
         scaled = low + (high - low) * drawn
         return float(scaled[0]) if n is None else scaled
 
-    def of(self, stream: str, n: int) -> Floats:
-        """Draw numbers in [0, 1) that belong to a name, shape (n,)."""
+    def random(self, stream: str, n: int) -> Floats:
+        """Draw numbers in [0, 1) of a named stream, shape (n,)."""
         drawn = self._noise.uniforms(stream, n=n, episode=self._probe, step=self._attempt)
         found: Floats = drawn[0]
         return found
@@ -130,46 +198,43 @@ class Scenario:
     """A kind of probe state.
 
     Attributes:
-        name: How the state comes about.
-        prepare: Chooses what to set in a world that has just been reset. It may let the world run
-            on before. What else it gives is handed to ``act``.
-        act: Gives an action, shape (n_actions,).
-        steps: How many control steps are taken before the experiments; drawn from 0 to 2 if None.
-        fresh: Whether what was set counts as what was there: experiments then do not add up with
-            it to one intervention, and are faster.
+        name: Its name.
+        prepare: Chooses the values to set in a world that has just been reset. It may step the
+            world before. The second value it returns is passed to ``act``.
+        act: Returns an action, shape (n_actions,).
+        steps: Number of control steps before the experiments; drawn from 0 to 2 if None.
+        fresh: Whether the values that were set count as the natural ones: experiments then do not
+            add up with them to one intervention, and are faster.
     """
 
     name: str
-    prepare: Callable[[Any, Dice], tuple[dict[str, Value], Any]]
-    act: Callable[[Any, Any, Dice], Floats]
+    prepare: Callable[[Any, ProbeGenerator], tuple[dict[str, Value], Any]]
+    act: Callable[[Any, Any, ProbeGenerator], Floats]
     steps: int | None = None
     fresh: bool = False
 
 
-class Blind(ABC):
+class OpenLoopPolicy(ABC):
     """A policy that ignores the state: all its actions are known beforehand."""
 
     @abstractmethod
     def ahead(self, world: Any, first: int, count: int) -> Floats:
-        """Give the actions of some control steps.
+        """Return the actions of some control steps, shape (count, n_actions).
 
         Args:
-            world: As it is now. A policy asked for the first time may look at it.
+            world: The present world. A policy asked for the first time may read it.
             first: The first control step.
-            count: How many.
-
-        Returns:
-            Shape (count, n_actions).
+            count: Number of control steps.
         """
 
     def __call__(self, world: Any) -> Floats:
-        """Give the action of the present step."""
+        """Return the action of the present step."""
         action: Floats = self.ahead(world, world.index, 1)[0]
         return action
 
 
 def kept_rows(actions: Floats, first: int, count: int) -> Floats:
-    """Take rows of actions; after the last one it is kept."""
+    """Return rows of actions; the last one is repeated."""
     found: Floats = actions[np.minimum(np.arange(first, first + count), len(actions) - 1)]
     return found
 
@@ -206,39 +271,39 @@ class Timing:
 
 
 class Task(ABC):
-    """A system, and what counts in it.
+    """A system and its goal.
 
-    An instance describes one structure. Where variables decide what there is (levels, counts),
-    they are declared in ``shared`` and named in ``decided_by``; ``arrange`` turns their values
-    into a ``plan``, and every other method reads ``self.plan``. ``TriFingerTask`` is the base of
-    goal families of the block-building robot, ``ModelTask`` that of any other model.
+    An instance describes one structure. Where variables decide which entities there are (levels,
+    counts), they are declared in ``shared`` and named in ``decided_by``; ``arrange`` turns their
+    values into a ``plan``, and everything else follows from ``self.plan``. ``TriFingerTask`` is the
+    base of goal families of the block-building robot, ``ModelTask`` that of any other model.
 
     Attributes:
-        name: Of the task.
+        name: Name of the task.
         action_modes: How the system can be commanded; the first is the default.
         presets: Numerical settings to choose from; the first is the default.
         resolutions: How finely its variables can be cut; the first is the default.
-        time_unit: What ``frame_skip`` counts [s].
-        frame_skip: Length of a control step, if none is asked for.
+        conventions: The conventions that hold.
+        choices: All conventions that the task knows, by name.
+        time_unit: The unit of ``frame_skip`` [s].
+        frame_skip: Default length of a control step.
         seconds: Length of an episode [s].
         weights: Weight of each reward term, by the name of its variable.
-        terms: Reward terms that were asked for.
-        decided_by: The shared variables that decide what there is.
-        goal_causes: The variables that a new goal is drawn for.
-        head: What a structured observation begins with, after the time that is left.
-        saturates: Whether observed states and goals are clipped to the bounds they declare.
-        rest: Joint positions at the start of an episode, where the task has a robot.
-        raised: Joint positions in which the robot is out of the way.
-        policies: Scripted policies of its own, by name.
-        training: Fields of a recipe with which it is learned, such as ``{"steps": 200_000}``;
-            those of an algorithm under its name. The others are the usual ones.
-        plan: What there is, as ``arrange`` has it; None where that is always the same.
+        goal: What is achieved, what is desired, and what follows from that.
+        observation: What is observed and measured.
+        decided_by: The shared variables that decide which entities there are.
+        plan: The structure, from ``arrange``; None where that is always the same.
         absent: Entities that an intervention took away.
-        checks_functions: Whether what functions of users give is checked when a world begins.
-        backend: Name of the backend that realises it, where none is asked for.
+        refused: Names that are not variables, each with the reason.
+        n_actions: Number of components of an action, where it is the same in every mode.
+        policies: Scripted policies of the task, by name.
+        training: Fields of its learning recipe, such as ``{"steps": 200_000}``; those of an
+            algorithm under its name. The others have their usual values.
+        checks_functions: Whether results of user functions are checked when a world begins.
+        backend: Default backend.
         generated_graph: Whether edges follow from structure, so that some may never show.
-        conventions: Ours or the predecessor's.
-        given: What it was made with.
+        given: The arguments of the task.
+        is_named: Whether every argument was given by name, so that a file can hold them.
     """
 
     given: dict[str, Any]
@@ -248,60 +313,66 @@ class Task(ABC):
     action_modes: tuple[str, ...]
     presets: tuple[str, ...]
     resolutions: tuple[str, ...] = ("declared",)
+    conventions: Conventions = Conventions()
+    choices: ClassVar[Mapping[str, Conventions]] = {
+        "scm_world": conventions,
+        "causal_world": Conventions("causal_world", True, True, True),
+    }
     time_unit: float
     frame_skip: int
     seconds: Any
     weights: Mapping[str, float] = {}  # a constant
-    terms: tuple[Measured, ...] = ()
     decided_by: ClassVar[tuple[str, ...]] = ()
-    goal_causes: ClassVar[tuple[str, ...]] = ()
-    head: ClassVar[tuple[Observed, ...]] = ()
-    saturates: ClassVar[bool] = False
-    rest: ClassVar[tuple[float, ...]] = ()
-    raised: ClassVar[tuple[float, ...]] = ()
+    plan: Hashable = None
+    absent: frozenset[str] = frozenset()
+    refused: Mapping[str, str] = {}  # a constant
+    n_actions: ClassVar[int | None] = None
     policies: ClassVar[Mapping[str, Callable[[], Any]]] = {}
     training: ClassVar[Mapping[str, Any]] = {}
-    plan: Hashable = None
     checks_functions: ClassVar[bool] = False
-    absent: frozenset[str] = frozenset()
     backend: ClassVar[str] = "mujoco"
     generated_graph: bool = False
-    conventions: Conventions = CONVENTIONS["scm_world"]
 
     def __new__(cls, *args: Any, **given: Any) -> Self:
-        """Keep the arguments of the task, so that it can be made again from a file."""
+        """Keep the arguments of the task, so that a file can hold them."""
         task = super().__new__(cls)
         task.given = dict(given)
-        task.is_named = not args  # every argument has its name
+        task.is_named = not args
         return task
 
     def __fingerprint__(self) -> dict[str, Any]:
-        """Return what decides the task: its class, its arguments, and what an engine compiles."""
+        """Return what decides the task: its class, its arguments and the compiled model."""
         given = {f"argument {n!r}": v for n, v in sorted(self.given.items()) if n != "model"}
         system = getattr(self, "system", None)
         physics = {} if system is None else {"physics": system}
         return {"class of the task": type(self), **given, **physics}
 
+    @property
+    def goal(self) -> Goal:
+        """The goal; an empty one where the reward alone counts."""
+        return Goal()
+
+    @property
+    def observation(self) -> Observation:
+        """What is observed and measured."""
+        return Observation()
+
     @abstractmethod
     def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
-        """Declare all variables, and say what they mean to an engine."""
+        """Declare all variables, and what they mean to a backend."""
 
     def on(self, backend: Backend) -> Self:
-        """Give the same task as far as a backend can realise it."""
+        """Return the same task as far as a backend can realise it."""
         return self
 
-    def refusal(self, name: str) -> str | None:
-        """Say why something of this name is no variable, where there is a reason."""
-        return None
-
     def arrange(self, values: Values) -> Hashable:
-        """Say what there is, given the variables of ``decided_by``."""
+        """Return the plan that follows from the variables of ``decided_by``."""
         return None
 
     def at(
         self, plan: Hashable, conventions: Conventions, absent: frozenset[str] = frozenset()
     ) -> Self:
-        """Give the same task with another structure, or under other conventions."""
+        """Return the same task with another structure, or under other conventions."""
         other = copy.copy(self)
         other.plan, other.conventions, other.absent = plan, conventions, absent
         return other
@@ -310,122 +381,31 @@ class Task(ABC):
         """Declare causes that several entities have in common; the same for every plan."""
         return ()
 
-    def observed(self) -> Iterable[Observed]:
-        """List what is observed, in order."""
-        return ()
-
-    def tools(self) -> tuple[str, ...]:
-        """Name the boxes that should be moved."""
-        return ()
-
-    def targets(self) -> dict[str, str]:
-        """Name the goals, each with the box that its solution puts there."""
-        return {}
-
-    def measured(self, *, every_step: bool = False) -> tuple[str, ...] | None:
-        """Name what experiments measure by default; None for all states, reward and success.
-
-        Args:
-            every_step: Whether it is measured at every instant.
-        """
-        return None
-
-    def closeness(self) -> tuple[tuple[str, ...], Callable[..., Any]] | None:
-        """Return what planners maximise by default; None for the distance to the goal.
-
-        Returns:
-            Names of variables, and a function of their values, shapes (..., *shape), that gives
-            numbers of shape (...). It can be pickled.
-        """
-        return None
-
-    def goal_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Name the variables that say what is achieved, and those that say what is desired."""
-        return (), ()
-
-    def goals(self, values: Values) -> tuple[Floats, Floats]:
-        """Give what is achieved and what is desired, two vectors of one shape."""
-        achieved, desired = (
-            np.concatenate([np.empty(0), *(np.ravel(values[name]) for name in names)])
-            for names in self.goal_names()
-        )
-        return achieved, desired
-
-    def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
-        """Compute the fractional success of vectors as ``goals`` gives them.
-
-        Args:
-            achieved: Shape (..., n).
-            desired: Shape (..., n).
-
-        Returns:
-            Shape (...).
-
-        Raises:
-            UnknownOption: The task has no goals.
-        """
-        raise UnknownOption("goals of", self.name, ("a task with goals",))
-
-    def view(self) -> tuple[tuple[str, ...], int, Callable[[Values], Floats]] | None:
-        """Describe what a hand sees of the system, if the task knows such a thing.
-
-        Returns:
-            Names of variables, how many numbers it is, and a function of their values that gives
-            these numbers.
-        """
-        return None
-
-    def symmetries(
-        self, values: Values, names: Iterable[str]
-    ) -> Iterable[tuple[Values, Sequence[int]]]:
-        """List scenes in which the same is right as in this one, but for the order of actions.
-
-        Args:
-            values: Of the variables.
-            names: Of those that are wanted.
-
-        Returns:
-            For each such scene the values of these variables, and which number of an action in
-            the present scene each number of the action there is; none where there is no symmetry.
-        """
-        return ()
-
-    def published_overlap(self, values: Values) -> float | None:
-        """Compute the fractional success as CausalWorld 1.2 does; None if it has no such task."""
-        return None
-
-    def fulfilled(self, fraction: ArrayLike) -> Any:
-        """Tell whether a fractional success counts as success, shape (...)."""
-        return np.asarray(fraction) >= 1.0
-
     def solution(self, values: Values) -> dict[str, Value]:
-        """Give an intervention after which the goal is fulfilled; none where there is no goal."""
+        """Return an intervention that fulfils the goal; an empty one without a goal."""
         return {}
+
+    def sample_goal(self, space: SpaceName = "A") -> dict[str, Any]:
+        """Return the intervention that draws a new goal, for ``reset(do=…)`` or ``do``.
+
+        Args:
+            space: ``"A"``, ``"B"`` or ``"A|B"``.
+        """
+        return {name: Draw(space) for name in self.goal.causes}
 
     def idle(self, world: Any) -> Floats:
-        """Return the idle action: zero, or what is nearest to it.
-
-        Args:
-            world: In this task.
-
-        Returns:
-            Shape (n_actions,).
-        """
+        """Return the idle action, shape (n_actions,): zero, or the nearest one in the range."""
         low, high = world.action_low, world.action_high
         return np.asarray(np.clip(np.zeros(len(low)), low, high))
 
     def scenarios(self, world: Any) -> Sequence[Scenario]:
-        """List kinds of state in which experiments tell something; none: those of any system.
-
-        Args:
-            world: In this task, where an episode begins.
-        """
+        """List informative kinds of state at the start of an episode; none: those of any system."""
         return ()
 
     def nearby(self, values: Values) -> Iterable[dict[str, Value]]:
-        """List interventions that change what stands in the world a little: one more, one fewer.
+        """List interventions that change the structure a little: one entity more, one fewer.
 
-        Experiments use them. Here each whole number of ``decided_by`` is changed by one.
+        By default each whole number of ``decided_by`` is changed by one.
         """
         declared = {variable.name: variable for variable in self.shared()}
         for name in self.decided_by:
@@ -436,11 +416,3 @@ class Task(ABC):
                     other.reshape(-1)[index] += step
                     if bounds.contains(other):  # type: ignore[union-attr] # whole numbers
                         yield {name: other}
-
-    def sample_goal(self, space: SpaceName = "A") -> dict[str, Any]:
-        """Give the intervention that draws a new goal, for ``reset(do=…)`` or ``do``.
-
-        Args:
-            space: Where from: ``"A"``, ``"B"`` or ``"A|B"``.
-        """
-        return {name: Draw(space) for name in self.goal_causes}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
@@ -188,7 +189,7 @@ class Composition(ABC):
         blocks: Names of the movable blocks.
         obstacles: Names of the obstacles.
         hulls: The blocks that are no boxes.
-        solid: Whether ``overlaps`` tells which bodies are in one place.
+        solid: Whether no episode may begin with two bodies in one place.
         commands: What turns an action into a command; None where they are the same.
     """
 
@@ -220,23 +221,28 @@ class Composition(ABC):
         return float(self.structure(values).timestep)
 
     def overlaps(
-        self, scene: Scene, tolerance: float | None = None, asked: Iterable[str] = ()
+        self,
+        scene: Scene,
+        tolerance: float | None = None,
+        asked: Iterable[str] = (),
+        enough: float = math.inf,
     ) -> tuple[Overlap, ...]:
-        """List the bodies that lie deeper in one another than a tolerance [m].
+        """List the bodies that lie deeper in one another than a tolerance.
 
-        None stands for what the task allows after an intervention on the variables asked for.
+        Args:
+            scene: With complete parameters.
+            tolerance: How deep is too deep [m]; what the task allows if None.
+            asked: The variables that an intervention is on.
+            enough: Where some lie deeper than this in one another, those alone may be listed [m].
         """
         return ()
 
-    def thin(  # noqa: B027 # a composition that knows nothing of bodies leaves all
-        self, candidates: Any, before: Iterable[Overlap], *, whole: bool = True
-    ) -> None:
-        """Leave out candidates that put two bodies in one place; it may leave in such.
+    def thin(self, candidates: Any, limit: float) -> None:  # noqa: B027 # may leave all
+        """Leave out candidates of which it is seen at once that they put bodies in one place.
 
         Args:
             candidates: Draws of an intervention, with ``parameter``, ``state`` and ``keep``.
-            before: The bodies that lie in one another already, and may continue to.
-            whole: Whether all candidates have the blocks and obstacles of this structure.
+            limit: How deep bodies lie in one another already [m].
         """
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:

@@ -6,6 +6,7 @@ import dataclasses
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property
 from typing import Any, Self, final
 
 import numpy as np
@@ -17,7 +18,8 @@ from scm_world.errors import UnknownOption, blamed
 from scm_world.geometry import chains
 from scm_world.graph import SCM
 from scm_world.models import Model, ParameterKey, Readout, Row, State
-from scm_world.tasks.base import Observed, Task, Timing
+from scm_world.models.scene import TOLERANCE, Overlap, Scene
+from scm_world.tasks.base import Goal, Observation, Observed, Task, Timing
 from scm_world.tasks.composition import Clock, Composition
 from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
 from scm_world.variables import (
@@ -61,6 +63,32 @@ class ModelComposition(Composition):
 
     def __init__(self, model: Model) -> None:
         self._model = model
+
+    @cached_property
+    def _meant(self) -> frozenset[tuple[int, int]]:
+        """The shapes that lie in one another in the pose of the file: they are meant to."""
+        from scm_world.backends.mujoco.overlaps import touching
+
+        return touching(self._model.default_scene(), TOLERANCE)
+
+    def overlaps(
+        self,
+        scene: Scene,
+        tolerance: float | None = None,
+        asked: Iterable[str] = (),
+        enough: float = math.inf,
+    ) -> tuple[Overlap, ...]:
+        """List the bodies that lie deeper in one another than a tolerance [m].
+
+        Not listed are shapes that do so in the pose of the file. All is listed of a model that
+        describes no bodies.
+        """
+        if self._model.describe is None:
+            return ()
+        from scm_world.backends.mujoco.overlaps import overlaps
+
+        tolerance = TOLERANCE if tolerance is None else tolerance
+        return overlaps(scene, tolerance, self._meant, max(enough, tolerance))
 
     def structure(self, values: Mapping[str, Any]) -> Model:
         """Give the model: it is compiled once."""
@@ -113,6 +141,7 @@ class DeclaredTask(Task):
     terminated: Any = None
     start: Mapping[str, Any] = {}  # a constant
     observe: Iterable[str] | None = None
+    goal: Goal = Goal()
 
     def __init__(self, kind: type[DeclaredTask], settings: Mapping[str, Any]) -> None:
         allowed = kind.options()
@@ -135,10 +164,11 @@ class DeclaredTask(Task):
         given = {name: getattr(self, name) for name in (REWARD, SUCCESS, TERMINATED)}
         return [declared(name, one) for name, one in given.items() if one is not None]
 
-    def observed(self) -> Iterable[Observed]:
-        """List what a policy observes."""
+    @property
+    def observation(self) -> Observation:
+        """The states, or the variables of ``observe``."""
         names = self.system.layout.names if self.observe is None else tuple(self.observe)
-        return [Observed(name, (-np.inf, np.inf)) for name in names]
+        return Observation(tuple(Observed(name, (-np.inf, np.inf)) for name in names))
 
 
 class ModelTask(DeclaredTask):
@@ -175,7 +205,9 @@ class ModelTask(DeclaredTask):
         success: The same for ``"success"``, 0 or 1.
         terminated: The same for ``"terminated"``: whether the episode ends here.
         start: Where episodes begin: for states a value, or a space or distribution to draw from.
-        observe: Names of what a policy observes; all states if None.
+        observe: Names of the observed variables; all states if None.
+        goal: What is achieved, what is desired, and what follows from that: for ``goal_env``,
+            planners and ``sample_goal``.
         seconds: Length of an episode [s].
         control_dt: Length of a control step [s], a multiple of the physics step.
         frame_skip: The same in physics steps.
@@ -309,9 +341,10 @@ class ModelTask(DeclaredTask):
         other.spaces = {name: given for name, given in self.spaces.items() if name not in gone}
         return other
 
-    def refusal(self, name: str) -> str | None:
-        """Say why something of this name cannot be set, if the model has it."""
-        return dict(self.system.refused).get(name)
+    @property
+    def refused(self) -> Mapping[str, str]:  # type: ignore[override] # it follows from the model
+        """Fields of the model that cannot be set, each with the reason."""
+        return dict(self.system.refused)
 
     def idle(self, world: Any) -> Floats:
         """Return the controls of the keyframe; zero, or what is nearest to it, if there is none."""

@@ -12,7 +12,6 @@ from numba import njit
 from scm_world._types import Value, Values
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.scalars import scalar
-from scm_world.tasks.base import checked_weight
 from scm_world.variables import Box, Derived, Function, Integers, Linear, Measured, Parent, Variable
 
 FRACTION = "fractional_success"
@@ -86,7 +85,7 @@ def resolve(
         unknown = set(asked) - {*weights, SUCCESS}
         if unknown:
             raise UnknownOption("reward term", min(unknown), (*weights, SUCCESS))
-        weights.update({name: checked_weight(name, weight) for name, weight in asked.items()})
+        weights.update({name: _weight(name, weight) for name, weight in asked.items()})
     else:
         raise UnknownOption("weights", asked, (*PRESETS, "a dictionary of terms and numbers"))
     sparse = asked == "sparse" or options.get("activate_sparse_reward", False)
@@ -97,14 +96,29 @@ def resolve(
         dense = [name for name in default if name != FRACTION]
         if np.shape(given) != (len(dense),):
             raise UnknownOption("dense_reward_weights", given, (f"{len(dense)} numbers", *dense))
-        own_weights = {n: checked_weight(n, w) for n, w in zip(dense, given, strict=True)}
+        own_weights = {n: _weight(n, w) for n, w in zip(dense, given, strict=True)}
     if (fraction := options.get("fractional_reward_weight")) is not None:
-        own_weights[FRACTION] = checked_weight("fractional_reward_weight", fraction)
+        own_weights[FRACTION] = _weight("fractional_reward_weight", fraction)
     if sparse and any(own_weights.values()):
         named = {name: weight for name, weight in own_weights.items() if weight}
         raise UnknownOption("weights of a sparse reward", named, ("none: it is 1 for success",))
     weights.update(own_weights)
     return {**weights, SUCCESS: 1.0} if sparse else weights
+
+
+def _weight(name: str, weight: Any) -> float:
+    """Return a weight as a number.
+
+    Raises:
+        UnknownOption: It is not a finite number.
+    """
+    try:
+        number = float(weight)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise UnknownOption(f"weight of {name}", weight, ("any finite number",))
+    return number
 
 
 def further_terms(

@@ -1,7 +1,8 @@
-"""What holds for a world of any model: run it on a model of your own.
+"""Checks of the promises of any world: run them on a model or a task of your own.
 
-Each check takes a world and raises ``AssertionError`` where the promise is broken. ``check_model``
-runs them all and gives the figures; ``benchmarks.models`` writes its tables with it.
+Each check takes a world and raises ``AssertionError`` where a promise is broken. ``check_model``
+runs them all and returns the figures; ``benchmarks.models`` writes its tables with it, and
+``scm_world.testing.task`` makes tests of them.
 
 Example::
 
@@ -12,15 +13,17 @@ Example::
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import hashlib
+import importlib
+import os
 import pickle
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -28,59 +31,77 @@ import numpy as np
 from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, InterventionError
 from scm_world.queries import World
-from scm_world.variables import Box, Categories, Integers, Noise, Rotations, Variable
-from scm_world.world import Batch
+from scm_world.tasks.base import action_range
+from scm_world.variables import Box, Categories, Draw, Integers, Noise, Rotations, Scale
+from scm_world.variables.reserved import CONTROL_INDEX
+from scm_world.world import Audit, Batch, Simulation
 
-SHARE = 0.1
-"""How far a value is moved, as a fraction of its range or of itself."""
-
-
-def another(variable: Variable, present: Value, uniforms: Floats) -> Value | None:
-    """Choose another value near the present one, within constant bounds; None if there is none.
-
-    Args:
-        variable: Its declaration.
-        present: Its value.
-        uniforms: In [0, 1), one for each component.
-    """
-    shift = SHARE * (2.0 * uniforms.reshape(variable.shape) - 1.0)
-    match variable.bounds:
-        case Box():
-            low, high = variable.bounds.bounds(variable.shape, {})
-            span = np.where(np.isfinite(high - low), high - low, np.abs(present) + 0.1)
-            return np.clip(present + shift * span, low, high)
-        case Rotations():
-            return np.asarray(variable.bounds.nearest(present + 4.0 * shift))
-        case Integers():
-            return np.asarray(present + np.where(present >= variable.bounds.high, -1, 1))
-        case Categories(members=members):
-            others = [member for member in members if member != present]
-            return np.asarray(others[0]) if others else None
-        case None:
-            return np.asarray(present + shift * (np.abs(present) + 0.1))
-    return None
+SEED = 20_26
+_LINE = "digest "
 
 
-def settable(world: World) -> tuple[str, ...]:
-    """Name the parameters and states that ``do`` can set by themselves."""
+def quantities(world: Simulation) -> tuple[str, ...]:
+    """Return the parameters and states that ``do`` can set, each in its own coordinates."""
     model = world.model
     return tuple(
         v.name
         for v in model.variables
-        if v.settable and v.role != "action" and model.target(v.name) == v.name
+        if v.settable
+        and v.role != "action"
+        and v.name != CONTROL_INDEX
+        and model.target(v.name) == v.name
     )
 
 
-def actions(world: World, n: int, seed: int = 0) -> Floats:
+def nearby(world: Simulation, name: str) -> Iterator[Value]:
+    """List other possible values of a variable, near the present one; none of a single category."""
+    variable, value = world.model.declared(name), world[name]
+    match variable.bounds:
+        case Box() | None:
+            box = variable.bounds or Box(-np.inf, np.inf)
+            low, high = box.bounds(variable.shape, world.values())
+            low = np.where(np.isfinite(low), low, np.minimum(value, high) - np.abs(value) - 0.1)
+            high = np.where(np.isfinite(high), high, np.maximum(value, low) + np.abs(value) + 0.1)
+            inwards = 0.02 * (low + 0.37 * (high - low) - value)
+            first = np.zeros(variable.shape)
+            first.flat[0] = inwards.flat[0]
+            for shift in (inwards, 0.02 * (low - value), first, -first):
+                if shift.any():
+                    yield value + shift
+        case Integers(high=most):
+            yield np.where(value < most, value + 1, value - 1)
+        case Categories(members=members):
+            yield from (np.asarray(member) for member in members if member != value)
+        case Rotations():
+            for angle in (0.1, 0.02):  # [rad]
+                turned = value + 0.5 * angle * np.array([0.0, 0.0, 1.0, 0.0])
+                yield np.asarray(variable.bounds.nearest(turned))
+        case _:
+            raise ValueError(f"{name} has no bounds to choose from")
+
+
+def moved(world: Simulation, name: str) -> tuple[Value, Audit] | None:
+    """Set a variable to the first nearby value that is feasible.
+
+    Returns:
+        The value and the report; None if there is none.
+    """
+    for value in nearby(world, name):
+        with contextlib.suppress(InterventionError):
+            return value, world.do({name: value})
+    return None
+
+
+def actions(world: Simulation, n: int, seed: int = 0) -> Floats:
     """Draw actions, shape (n, n_actions)."""
-    low, high = world.action_low, world.action_high
+    low, high = action_range(world)
     drawn = Noise(seed).uniforms("actions", n=n * low.size)[0].reshape(n, low.size)
     found: Floats = low + (high - low) * drawn
     return found
 
 
-def trajectory(world: World, taken: Floats) -> Floats:
-    """Step a world, and give its states, shape (n + 1, k)."""
+def trajectory(world: Simulation, taken: Floats) -> Floats:
+    """Step a world, and return its states, shape (n + 1, k)."""
     found = [world.current()[1].vector.copy()]
     for action in taken:
         world.step(action)
@@ -88,7 +109,63 @@ def trajectory(world: World, taken: Floats) -> Floats:
     return np.stack(found)
 
 
-def check_variables(world: World) -> int:
+def story(world: Simulation) -> bytes:
+    """Run two episodes with all kinds of interventions; return every number there was."""
+    seen = []
+    for episode in range(2):
+        world.reset(seed=SEED + episode)
+        names = quantities(world)
+        spaced = [name for name in names if world.model.declared(name).a is not None]
+        real = [name for name in names if world.model.declared(name).dtype == "real"]
+        for request in (
+            world.task.sample_goal("A"),
+            {name: Draw("A") for name in spaced[:: max(len(spaced) // 3, 1)]},
+            {name: Scale(0.95) for name in real[:: max(len(real) // 3, 1)]},
+        ):
+            with contextlib.suppress(InterventionError):  # refused here, refused everywhere
+                world.do(request)
+            states = trajectory(world, actions(world, 4, seed=episode))
+            seen.append(states.tobytes())
+        values = world.values()
+        seen += [name.encode() + np.asarray(values[name]).tobytes() for name in sorted(values)]
+    return b"".join(seen)
+
+
+def _digests(world: Simulation, snapshot: Any) -> str:
+    """Hash the future of a snapshot, and the story of the world."""
+    world.restore(snapshot)
+    parts = (trajectory(world, actions(world, 20, 7)).tobytes(), story(world))
+    return " ".join(hashlib.sha256(part).hexdigest() for part in parts)
+
+
+def serve() -> None:
+    """Answer with digests, in another process, until there are no more questions."""
+    with contextlib.suppress(EOFError):
+        while True:
+            module, question = pickle.load(sys.stdin.buffer)  # noqa: S301 # from our parent
+            importlib.import_module(module)
+            world, snapshot = pickle.loads(question)  # noqa: S301 # likewise
+            print(f"\n{_LINE}{_digests(world, snapshot)}", flush=True)  # noqa: T201 # the answer
+            world.close()
+
+
+@cache
+def _elsewhere() -> subprocess.Popen[bytes]:
+    """Start the other process, which lives as long as this one."""
+    child = subprocess.Popen(  # our own interpreter, our own code
+        [sys.executable, "-c", "from scm_world.testing.model import serve; serve()"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([os.getcwd(), *sys.path])},
+    )
+    atexit.register(child.communicate)
+    return child
+
+
+# --- checks -----------------------------------------------------------------------------------
+
+
+def check_variables(world: Simulation) -> int:
     """Check that every variable has a unit, a sentence and a default within its bounds."""
     world.reset(seed=0)
     values = world.values()
@@ -101,23 +178,11 @@ def check_variables(world: World) -> int:
     return len(world.model)
 
 
-def requests(world: World, seed: int = 0) -> Iterator[tuple[str, Value]]:
-    """Give an intervention on each settable variable, from its present value."""
-    noise = Noise(seed)
-    for name in settable(world):
-        variable = world.model.declared(name)
-        present = world[name]
-        n = int(np.prod(variable.shape))
-        value = another(variable, present, noise.uniforms(name, n=n)[0])
-        if value is not None:
-            yield name, value
-
-
-def check_undo(world: World, horizons: tuple[int, ...] = (1, 50)) -> tuple[int, float]:
-    """Check that what is done and undone leaves exactly 0.0, for every settable variable.
+def check_undo(world: Simulation, horizons: tuple[int, ...] = (1, 50)) -> tuple[int, float]:
+    """Check that an intervention that is undone leaves exactly 0.0, for every quantity.
 
     Returns:
-        How many variables were set, and the largest difference at any horizon.
+        How many quantities were set, and the largest difference at any horizon.
     """
     world.reset(seed=0)
     taken = actions(world, max(horizons) + 3)
@@ -126,93 +191,87 @@ def check_undo(world: World, horizons: tuple[int, ...] = (1, 50)) -> tuple[int, 
     expected = trajectory(world, taken[3:])
     world.restore(start)
     found, worst = 0, 0.0
-    for name, value in list(requests(world)):
+    for name in quantities(world):
         old = world[name]
-        try:
-            world.do({name: value})
-        except InterventionError:
-            world.restore(start)
-            continue
-        world.do({name: old})
-        found += 1
-        here = trajectory(world, taken[3:])
-        worst = max(worst, *(float(np.abs(here[h] - expected[h]).max()) for h in horizons))
-        assert worst == 0.0, f"{name}: {worst:g} is left after do and undo"
+        if moved(world, name) is not None:
+            world.do({name: old})
+            found += 1
+            here = trajectory(world, taken[3:])
+            worst = max(worst, *(float(np.abs(here[h] - expected[h]).max()) for h in horizons))
+            assert worst == 0.0, f"{name}: {worst:g} is left after do and undo"
         world.restore(start)
     return found, worst
 
 
-def check_refusal(world: World) -> int:
-    """Check that a refused intervention leaves the world bit-identical."""
+def check_refusal(world: Simulation) -> int:
+    """Check that a request of which one part is wrong leaves the world bit-identical."""
     world.reset(seed=0)
     taken = actions(world, 6)
     trajectory(world, taken[:2])
     start = world.snapshot()
     expected = trajectory(world, taken[2:])
     world.restore(start)
-    refused = 0
-    for name in settable(world):
-        good = world[name]
-        for bad in (np.full(good.shape, np.nan), np.full((*good.shape, 2), 1.0), "much"):
-            try:
-                world.do({name: bad})
-            except InterventionError:
-                refused += 1
-            else:
-                raise AssertionError(f"do({name}={bad!r}) was not refused")
+    names = quantities(world)
+    requests: list[dict[str, Any]] = [{names[0]: Draw("A"), "no_such_variable": 1.0}]
+    for other, name in zip((names[-1], *names), names, strict=False):
+        shape, present = np.shape(world[name]), {other: world[other]} if other != name else {}
+        bad = (np.full(shape, np.nan), np.full((*shape, 2), 1.0), "much")
+        requests += [{**present, name: value} for value in bad]
+    for request in requests:
+        try:
+            world.do(request)
+        except InterventionError:
+            continue
+        raise AssertionError(f"do({request!r}) was not refused")
     assert np.array_equal(trajectory(world, taken[2:]), expected), "a refusal left a trace"
-    return refused
+    return len(requests)
 
 
 def check_counterfactual(world: World, steps: int = 20) -> None:
-    """Check that a counterfactual of nothing is the episode, bit for bit."""
+    """Check that a counterfactual without an intervention is the episode, bit for bit."""
     episode = world.rollout("random", seed=1, steps=steps)
     assert episode.counterfactual({}) == episode
     assert episode.counterfactual({}, at=steps // 2) == episode
 
 
-_ELSEWHERE = """
-import hashlib, pickle, sys
-from scm_world.testing.model import actions, trajectory
-world, snapshot = pickle.load(open(sys.argv[1], "rb"))
-world.restore(snapshot)
-print(hashlib.sha256(trajectory(world, actions(world, 20, 7)).tobytes()).hexdigest())
-"""
+def check_future(world: Simulation, module: str = __name__) -> None:
+    """Check that a seed and a snapshot have one future each, here and in another process.
 
-
-def check_snapshot_elsewhere(world: World) -> None:
-    """Check that a snapshot continues bit-identically in another process."""
+    Args:
+        world: The world.
+        module: A module that the other process has to import first.
+    """
     world.reset(seed=2)
     trajectory(world, actions(world, 5, 3))
     snapshot = world.snapshot()
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "world.pickle"
-        path.write_bytes(pickle.dumps((world, snapshot)))
-        command = [sys.executable, "-c", _ELSEWHERE, str(path)]
-        said = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
-    assert said.returncode == 0, said.stderr
-    here = trajectory(world, actions(world, 20, 7))
-    assert said.stdout.split()[-1] == hashlib.sha256(here.tobytes()).hexdigest()
+    here = _digests(world, snapshot)
+    assert _digests(world, pickle.loads(pickle.dumps(snapshot))) == here  # noqa: S301 # our own
+    child: Any = _elsewhere()
+    pickle.dump((module, pickle.dumps((world, snapshot))), child.stdin)
+    child.stdin.flush()
+    lines = iter(child.stdout.readline, b"")
+    found = next((line.decode() for line in lines if line.startswith(_LINE.encode())), _LINE)
+    assert found.removeprefix(_LINE).strip() == here, "another process has another future"
 
 
-def check_batch(make: Any, n: int = 16, steps: int = 10, threads: int = 2) -> None:
-    """Check that worlds stepped together equal single ones, each with a parameter of its own.
+def check_batch(
+    make: Callable[[], Simulation], n: int = 16, steps: int = 10, threads: int = 2
+) -> None:
+    """Check that worlds stepped together equal single ones, each with a change of its own.
 
     Args:
         make: Makes a world.
         n: How many.
         steps: How many control steps.
-        threads: Of the engine.
+        threads: Threads of the engine.
     """
 
-    def begun(index: int, *, changed: bool) -> World:
-        world: World = make()
+    def begun(index: int, *, changed: bool) -> Simulation:
+        world = make()
         world.reset(seed=index)
-        found = list(requests(world, seed=index))
-        name, value = found[index % len(found)]
+        names = quantities(world)
         if changed:
-            with contextlib.suppress(InterventionError):
-                world.do({name: value})
+            moved(world, names[index % len(names)])
         return world
 
     first = begun(0, changed=False)
@@ -239,23 +298,17 @@ def check_batch(make: Any, n: int = 16, steps: int = 10, threads: int = 2) -> No
     batch.close()
 
 
-def check_endurance(world: World, steps: int = 2000, every: int = 20) -> tuple[int, str]:
+def check_endurance(world: Simulation, steps: int = 2000, every: int = 20) -> tuple[int, str]:
     """Step with random actions and interventions: no NaN, or a typed error that says which.
 
     Returns:
-        How many control steps were taken, and what ended it, if anything did.
+        How many control steps were taken, and the error that ended it, if any.
     """
     world.reset(seed=5)
-    names, taken = settable(world), actions(world, steps, 11)
-    noise = Noise(13)
+    names, taken = quantities(world), actions(world, steps, 11)
     for step in range(steps):
         if step % every == 0:
-            name = names[(step // every) % len(names)]
-            variable = world.model.declared(name)
-            n = int(np.prod(variable.shape))
-            value = another(variable, world[name], noise.uniforms(name, n=n, step=step)[0])
-            with contextlib.suppress(InterventionError):
-                world.do({name: value} if value is not None else {})
+            moved(world, names[(step // every) % len(names)])
         try:
             world.step(taken[step])
         except EngineFailure as error:
@@ -270,10 +323,10 @@ def check_model(
     """Run all checks on a model.
 
     Args:
-        source: What ``World`` takes: a path, XML text, a task.
-        backend: Name of the engine.
-        steps: With random actions and interventions.
-        options: Of ``World.from_mjcf``.
+        source: Anything that ``World`` takes: a path, XML text, a task.
+        backend: Name of the backend.
+        steps: Control steps with random actions and interventions.
+        options: Options of ``World.from_mjcf``.
 
     Returns:
         The figures, by name.
@@ -291,7 +344,7 @@ def check_model(
     found["set and undone"], found["left over"] = check_undo(world)
     found["refused"] = check_refusal(world)
     check_counterfactual(world)
-    check_snapshot_elsewhere(world)
+    check_future(world)
     check_batch(make)
     found["steps"], found["ended by"] = check_endurance(world, steps)
     world.close()

@@ -379,11 +379,11 @@ def _episode(
         pairs.append((observation, right, before, said))
         if lesson.symmetric:
             names = env.observed or ()
-            scenes = list(env.world.task.symmetries(env.world.evaluate(names), names))
-            if not scenes:
+            symmetries = env.world.task.observation.symmetries
+            if symmetries is None:
                 allowed = (f"False: {lesson.task} has no symmetries",)
                 raise UnknownOption("symmetric of a lesson", True, allowed)
-            for scene, order in scenes:
+            for scene, order in symmetries(env.world.evaluate(names), names):
                 pairs.append((env.observe_values(scene), right[list(order)], before, said))
         if learner is not None and random.uniform() < 1.0 / lesson.stretch:
             learns = random.uniform() < share

@@ -10,8 +10,8 @@ import numpy as np
 
 from scm_world._types import Integers, Value
 from scm_world.graph import NoiseKey
-from scm_world.models import ParameterKey
-from scm_world.models.scene import Overlap
+from scm_world.models import ParameterKey, Scene
+from scm_world.models.scene import SURFACES, Overlap
 from scm_world.variables import Draw, Hard, Natural, Rotations, Variable, whole_of
 from scm_world.variables.noise import word_of
 from scm_world.world.compiled_task import Plan, StepBase
@@ -19,8 +19,10 @@ from scm_world.world.philox import philox
 from scm_world.world.plan import InterventionPlan
 from scm_world.world.solver import Solver, same
 
-CHUNK = 64
-"""How many draws are looked at together."""
+ROUNDING = 1e-6
+"""How much deeper than before is no deeper [m]."""
+FIRST, CHUNK = 8, 64
+"""How many draws are looked at together: at first, and later."""
 
 
 class Unknown(Exception):  # no error: such draws are planned one after another
@@ -36,10 +38,7 @@ class Candidates:
     Args:
         solver: Of an earlier draw.
         key: Where to draw.
-        attempts: Numbers of the draws.
-
-    Attributes:
-        attempts: Those that are left, shape (n,).
+        attempts: Numbers of the draws, shape (n,).
     """
 
     def __init__(self, solver: Solver, key: NoiseKey, attempts: Integers) -> None:
@@ -58,17 +57,11 @@ class Candidates:
             self._found[name] = self._found[name][which]
 
     def parameter(self, key: ParameterKey) -> Value:
-        """Give a physical parameter, shape (n or 1, *shape).
-
-        Raises:
-            Unknown: It is no variable.
-        """
-        if key not in self._keys:
-            raise Unknown
+        """Compute a physical parameter, shape (n or 1, *shape); it must be a variable."""
         return self._value(self._keys[key])
 
     def state(self, where: slice) -> Value:
-        """Give some numbers of the state vector, shape (n or 1, size)."""
+        """Compute some numbers of the state vector, shape (n or 1, size)."""
         bundles, parts = self._task.bundles, []
         for name, own in self._task.slices.items():
             if where.start <= own.start and own.stop <= where.stop and name not in bundles:
@@ -76,6 +69,23 @@ class Candidates:
                 parts.append(value.reshape(len(value), -1))
         n = max(map(len, parts))
         return np.hstack([np.broadcast_to(part, (n, part.shape[1])) for part in parts])
+
+    def scenes(self) -> Iterator[Scene]:
+        """Yield the scene of each draw, as far as it says where surfaces are."""
+        task, scene = self._task, self._task.describe(self._solver.static, self._solver.state)
+        keys = {name: key for key, name in self._keys.items() if key[1] in SURFACES}
+        names = (*keys, *(name for name in task.places if name not in task.bundles))
+        values = {name: self._value(name) for name in names}
+        varying = self._varying.intersection(values)
+        vector, parameters = scene.state.vector.copy(), {**scene.parameters}
+        for row in range(len(self.attempts)):
+            for name in varying if row else values:
+                value = values[name][row if name in varying else 0]
+                if name in keys:
+                    parameters[keys[name]] = value
+                else:
+                    vector[task.places[name]] = value.ravel()
+            yield Scene(scene.structure, parameters, scene.state.with_vector(vector))
 
     def _value(self, name: str) -> Value:
         if name not in self._found:
@@ -181,6 +191,18 @@ class Candidates:
         return found
 
 
+def overlaps_before(base: StepBase) -> tuple[Overlap, ...]:
+    """List what lies in one another as physics left it, however little."""
+    scene = base.compiled.describe(base.static, base.state)
+    return base.compiled.composition.overlaps(scene, 0.0)
+
+
+def deeper(found: Iterable[Overlap], before: Iterable[Overlap]) -> list[Overlap]:
+    """List those that are deeper than before."""
+    depths = {overlap.bodies: overlap.depth for overlap in before}
+    return [one for one in found if one.depth > depths.get(one.bodies, 0.0) + ROUNDING]
+
+
 def promising(
     base: StepBase,
     made: Mapping[Plan | None, InterventionPlan],
@@ -204,15 +226,15 @@ def promising(
     Yields:
         The number of a draw, and its structure.
     """
-    before = base.compiled.composition.overlaps(
-        base.compiled.describe(base.static, base.state), 0.0
-    )
+    before = overlaps_before(base)
     here, plan = next(iter(made.items()))
     # What is asked of a body is refused where the body is not there.
     asked = {name.partition(".")[0] for name in (*plan.asked, *plan.removals)}
     alike_everywhere = asked.isdisjoint(plan.compiled.entity_names)
-    for begin in range(0, len(draws) - 1, CHUNK):
-        attempts = list(draws[:-1][begin : begin + CHUNK])
+    left = list(draws[:-1])
+    while left:
+        size = FIRST if left[0] == draws[0] else CHUNK
+        attempts, left = left[:size], left[size:]
         if structure is None:
             places: dict[int, Plan | None] = dict.fromkeys(attempts, here)
         else:
@@ -249,10 +271,16 @@ def _thinned(
     """
     if plan.solver is None:
         return attempts
+    enough = max((overlap.depth for overlap in before), default=0.0) + ROUNDING
+    composition = plan.compiled.composition
     candidates = Candidates(plan.solver, replace(key, attempt=1), np.array(attempts))
     try:
         with np.errstate(all="ignore"):
-            plan.compiled.composition.thin(candidates, before, whole=whole)
+            composition.thin(candidates, enough)
+            if whole and len(candidates.attempts):
+                scenes = candidates.scenes()
+                found = (composition.overlaps(scene, None, plan.asked, enough) for scene in scenes)
+                candidates.keep(np.array([not deeper(overlaps, before) for overlaps in found]))
     except Exception:  # planning says what is wrong
         return attempts
     left: list[int] = candidates.attempts.tolist()

@@ -10,6 +10,7 @@ from math import prod
 from typing import Any, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._arguments import real_numbers, whole_number
 from scm_world._types import ArrayLike, Floats, Value, Values
@@ -17,7 +18,7 @@ from scm_world.errors import ActionError, InterventionError, ModelError, Unknown
 from scm_world.geometry.clipping import clip_kernel
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
-from scm_world.tasks import Conventions, Task, Timing, conventions
+from scm_world.tasks import Conventions, Task, Timing
 from scm_world.variables import Action, Derived, Exogenous, Intervention, Measured
 from scm_world.variables.checks import check_bounds, coerce
 from scm_world.world.mechanisms import Mechanisms, wrong_value
@@ -147,7 +148,9 @@ class Options:
         fine = task.resolutions[0] if resolution is None else resolution
         if fine not in task.resolutions:
             raise UnknownOption("resolution", fine, task.resolutions)
-        kept = conventions(conventions_name)
+        if conventions_name not in task.choices:
+            raise UnknownOption("conventions", conventions_name, task.choices)
+        kept = task.choices[conventions_name]
         return cls(name, mode, fine, skip, task.time_unit, max_episode_length, kept)
 
     @property
@@ -241,6 +244,20 @@ class CompiledTask(ActionVector):
         static = frozenset(self.static_names)
         where = (self.slices, self.commanded)
         return Mechanisms(self.model, self.computed, static, *where, sizes)
+
+    @cached_property
+    def places(self) -> Mapping[str, slice]:
+        """Where those states stand that say where bodies are: not their velocities."""
+        units = ("m", "rad", "1")
+        return {n: at for n, at in self.slices.items() if self.model.declared(n).unit in units}
+
+    @cached_property
+    def placed(self) -> NDArray[np.bool_]:
+        """Which numbers of the state say where bodies are, shape (size,)."""
+        found = np.zeros(self._start.vector.shape, dtype=np.bool_)
+        for name, where in self.places.items():
+            found[where] |= name not in self.bundles
+        return found
 
     @cached_property
     def entity_names(self) -> frozenset[str]:

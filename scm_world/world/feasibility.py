@@ -13,20 +13,16 @@ from scm_world._types import Value
 from scm_world.errors import Infeasible, InterventionError
 from scm_world.graph import NoiseKey
 from scm_world.models import Difference, State, Structure
-from scm_world.models.scene import Overlap
+from scm_world.models.scene import SURFACES, Overlap
 from scm_world.variables import SOFT, Draw, Hard, Mechanism
 from scm_world.variables.checks import coerce
 from scm_world.variables.subsets import AnyRegion
-from scm_world.world.candidates import promising
+from scm_world.world.candidates import deeper, overlaps_before, promising
 from scm_world.world.compiled_task import CompiledTask, Plan, StepBase
 from scm_world.world.plan import InterventionPlan, draws_bodies, plan_intervention
 from scm_world.world.solver import same
 from scm_world.world.structures import StructureCache, asked_structure
 
-_SURFACES = ("size", "height", "position", "orientation")
-"""Parameters that change where the surfaces of bodies are."""
-_PLACES = ("m", "rad", "1")
-"""Units of states that do so: positions, angles and quaternions, not velocities."""
 ATTEMPTS = 1000
 """How often is drawn; one in sixty draws of the joints from A leaves all fingers apart."""
 NONE = f"none of {ATTEMPTS:,} draws was feasible; in the last one "
@@ -85,24 +81,15 @@ class Present:
             return []
         then = plan.compiled.describe(plan.static, plan.state)
         found = plan.compiled.composition.overlaps(then, asked=plan.asked)
-        if not found:
-            return []
-        now = base.compiled
-        before = now.composition.overlaps(now.describe(base.static, base.state), 0.0)
-        depth = {overlap.bodies: overlap.depth for overlap in before}
-        return [o for o in found if o.depth > depth.get(o.bodies, 0.0) + 1e-6]
+        return deeper(found, overlaps_before(base)) if found else []
 
     def _moves_surfaces(self, change: Difference) -> bool:
-        if not self.compiled.composition.solid:
-            return False
-        if change.structure is not None or any(what in _SURFACES for _, what in change.parameters):
+        if change.structure is not None or any(what in SURFACES for _, what in change.parameters):
             return True
         if change.state is None:
             return False
-        now: Any = self.state
-        then: Any = change.state
-        joints = same(now.joint_positions, then.joint_positions)
-        return not (joints and same(now.blocks[:, :7], then.blocks[:, :7]))
+        moved = self.state.vector != change.state.vector
+        return bool(moved[self.compiled.placed].any())
 
 
 @final
@@ -266,8 +253,8 @@ def _immaterial(
             followers = (*targets, *compiled.static_order(targets))
             is_state = compiled.model.declared(targets[0]).role == "state"
             keys = (compiled.parameter_keys.get(follower) for follower in followers)
-            moves = any(key and key[1] in _SURFACES for key in keys)
-            hides = buries and any(follower.endswith(_SURFACES) for follower in followers)
+            moves = any(key and key[1] in SURFACES for key in keys)
+            hides = buries and any(name.endswith(tuple(SURFACES)) for name in followers)
             if not (is_state or moves or hides):
                 found.add(name)
     return frozenset(found)
@@ -332,8 +319,8 @@ def refusal(
 def _culprit(compiled: CompiledTask, names: Iterable[str], bodies: Iterable[str]) -> str:
     """Name the target that is most likely to have moved one of the bodies."""
     model = compiled.model
-    surfaces = {name for name in compiled.slices if model.declared(name).unit in _PLACES}
-    surfaces |= {name for name, key in compiled.parameter_keys.items() if key[1] in _SURFACES}
+    surfaces = {*compiled.places}
+    surfaces |= {name for name, key in compiled.parameter_keys.items() if key[1] in SURFACES}
 
     def blame(name: str) -> tuple[bool, bool]:
         targets = model.targets(name)

@@ -545,7 +545,7 @@ class Simulation(WorldAttributes):
             raise
 
     def _inertia(self, change: Difference) -> dict[str, Value]:
-        if change.structure is not None or not self.composition.solid:
+        if change.structure is not None or not self.composition.movers():
             return {}
         bodies = {body for body, what in change.parameters if what in ("mass", "size")}
         bodies -= {*self.composition.obstacles}

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from robot_scenes import busy_scene, changed_states, other_value, play
 
 from scm_world._types import Floats
 from scm_world.backends.base import Backend
@@ -22,7 +23,6 @@ from scm_world.models import Difference, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import inverse
 from scm_world.tasks.trifinger.system import trifinger
-from scm_world.testing.backend import busy_scene, changed_states, other_value, play
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="needs pybullet"

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 import pytest
+from robot_scenes import busy_scene, named, octahedron, other_value, play
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import Backend
@@ -21,7 +22,6 @@ from scm_world.models.scene import ParameterKey
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.tasks.trifinger.system import trifinger
-from scm_world.testing.scenes import busy_scene, named, octahedron, other_value, play
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="needs pybullet"

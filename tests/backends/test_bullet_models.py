@@ -15,6 +15,8 @@ import mujoco
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from robot_scenes import busy_scene
+from robot_scenes import play as play_robot
 
 from scm_world import World
 from scm_world.backends import Backend, make_backend, read_model
@@ -27,8 +29,6 @@ from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
 from scm_world.models import Difference, Model, Parameter
 from scm_world.tasks.trifinger.system import trifinger
-from scm_world.testing.backend import busy_scene
-from scm_world.testing.backend import play as play_robot
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="needs pybullet"

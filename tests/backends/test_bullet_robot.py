@@ -6,10 +6,13 @@ import importlib.util
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import robot_scenes
+from robot_scenes import busy_scene
 
 from scm_world.backends.bullet import BulletBackend
 from scm_world.backends.mujoco.reading import body_names, compiled
@@ -19,7 +22,6 @@ from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import SPINNING_FRICTION
 from scm_world.tasks.trifinger.kinematics import link_frames
 from scm_world.tasks.trifinger.system import trifinger
-from scm_world.testing.backend import busy_scene
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="needs pybullet"
@@ -129,9 +131,10 @@ def test_a_driven_joint_reaches_its_final_speed(backend: BulletBackend) -> None:
 def test_nothing_is_printed() -> None:
     """Importing us imports no engine; neither importing nor using it writes a word."""
     code = (
-        "import sys; from scm_world.backends.bullet import BulletBackend;"
+        f"import sys; sys.path.append({str(Path(robot_scenes.__file__).parent)!r});"
+        "from scm_world.backends.bullet import BulletBackend;"
         "assert 'pybullet' not in sys.modules;"
-        "from scm_world.testing.backend import busy_scene, play;"
+        "from robot_scenes import busy_scene, play;"
         "b = BulletBackend(); b.build(busy_scene()); play(b, 2); b.close()"
     )
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)  # noqa: S603 # our own code

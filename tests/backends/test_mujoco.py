@@ -7,6 +7,7 @@ from importlib import metadata
 import mujoco
 import numpy as np
 import pytest
+from robot_scenes import busy_scene, other_value, play
 
 from scm_world.backends import BACKENDS, EngineSnapshot, make_backend
 from scm_world.backends.mujoco import MujocoBackend, check_installation
@@ -17,7 +18,6 @@ from scm_world.models import Difference
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import forward
 from scm_world.tasks.trifinger.system import trifinger
-from scm_world.testing.backend import busy_scene, other_value, play
 
 REST = np.array(hardware.REST)
 

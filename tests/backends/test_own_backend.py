@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 import pytest
+from robot_scenes import busy_scene, play
 
 import scm_world  # noqa: F401 # registers the environments
 from scm_world.backends import (
@@ -23,8 +24,7 @@ from scm_world.backends import (
 )
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation import evaluate
-from scm_world.testing.scenes import busy_scene, play, same
-from scm_world.testing.states import StateConformance
+from scm_world.testing.backend import BackendConformance, same
 
 EXAMPLE = Path(__file__).parent.parent.parent / "examples" / "own_backend.py"
 
@@ -57,7 +57,7 @@ class Twin(BackendWrapper):
         super().__init__(make_backend("fake"))
 
 
-class TestWrapper(StateConformance):
+class TestWrapper(BackendConformance):
     """An engine in an engine keeps what the one inside promises."""
 
     def make(self) -> Backend:

@@ -35,9 +35,9 @@ def test_d03_tips_go_where_they_are_sent(backend: str) -> None:
 def test_d03_a_solution_moves_no_goal(backend: str) -> None:
     """Inverse kinematics brings the tips to their goals, and leaves the goals alone."""
     world = begin("reaching", backend)
-    before = world.task.goals(world.values())[1].copy()
+    before = world.task.goal.vectors(world.values())[1].copy()
     world.do(world.task.solution(world.values()))
-    achieved, desired = world.task.goals(world.values())
+    achieved, desired = world.task.goal.vectors(world.values())
     np.testing.assert_array_equal(desired, before)
     np.testing.assert_allclose(achieved, desired, atol=1e-9)
     world.close()
@@ -126,12 +126,12 @@ def test_d28_names_that_do_not_exist_are_errors() -> None:
 def test_d29_a_reset_restores_what_generates_the_scene(backend: str) -> None:
     """Numbers, dimensions and blocks agree before and after a reset."""
     world = begin("towers", backend)
-    first, tools = world.values(), world.task.tools()
+    first, tools = world.values(), world.task.tools
     world.do({"number_of_blocks_in_tower": [2, 2, 2], "tower_dims": [0.1, 0.1, 0.1]})
-    assert len(world.task.tools()) == world["number_of_blocks_in_tower"].prod() == 8
-    np.testing.assert_allclose(world[f"{world.task.tools()[0]}.size"], [0.05] * 3)
+    assert len(world.task.tools) == world["number_of_blocks_in_tower"].prod() == 8
+    np.testing.assert_allclose(world[f"{world.task.tools[0]}.size"], [0.05] * 3)
     world.reset(seed=0)
-    assert world.task.tools() == tools == world.structure.blocks
+    assert world.task.tools == tools == world.structure.blocks
     now = world.values()
     assert all(np.array_equal(now[name], first[name]) for name in first)
     world.close()
@@ -157,7 +157,7 @@ def test_d31_random_scenes_can_be_replayed(task: Any, backend: str) -> None:
 
 def future(world: Simulation) -> list[Any]:
     """Take three steps, and give the goal and all states."""
-    taken = [world.task.goals(world.values())[1].tolist()]
+    taken = [world.task.goal.vectors(world.values())[1].tolist()]
     for _ in range(3):
         world.step(np.array(world.task.start))
         taken.append(world.current()[1].vector.tolist())

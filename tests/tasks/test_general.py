@@ -37,7 +37,7 @@ def dropped(places: Any, gravity: Floats = GRAVITY) -> Floats:
 def test_goals_are_where_blocks_came_to_lie() -> None:
     """A block that falls flat on the free floor lies below where it was let go."""
     world = general()
-    assert world.task.tools() == tuple(f"tool_{index}" for index in range(5))
+    assert world.task.tools == tuple(f"tool_{index}" for index in range(5))
     lone = world["goal_4.cartesian_position"]
     np.testing.assert_allclose(lone, [-0.12, -0.12, 0.025], atol=1e-3)
     assert all(0.02 < world[f"goal_{i}.cartesian_position"][2] < 0.1 for i in range(5))
@@ -107,7 +107,7 @@ def test_all_blocks_are_observed_before_all_goals() -> None:
     observed = [part.variable for part in world.task.observed()]
     assert 28 + sum(world[name].size for name in observed) == 168
     entities = list(dict.fromkeys(name.partition(".")[0] for name in observed))
-    assert entities == [*world.task.tools(), *world.task.targets()]
+    assert entities == [*world.task.tools, *world.task.targets]
 
 
 @pytest.mark.parametrize("size", [0.02, 0.05, 0.07, 0.1])
@@ -129,7 +129,7 @@ def test_new_goals_are_drawn(space: Any) -> None:
         piles.append(world["pile"])
         for name in world.task.goal_causes:
             assert world.model.declared(name).in_space(world[name], space, world.values())
-        assert len(world.task.tools()) == world["nums_objects"]
+        assert len(world.task.tools) == world["nums_objects"]
         world.do(world.task.solution(world.values()))
         assert world["success"] == 1
     assert not np.array_equal(piles[0], piles[1])

@@ -10,7 +10,7 @@ from scm_world._fingerprint import differing
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.evaluation import evaluate, protocols_of
 from scm_world.evaluation.checking import check
-from scm_world.tasks import TASKS, Building, Reaching, Task, register, tasks
+from scm_world.tasks import TASKS, Reaching, Task, TriFingerTask, register, tasks
 from scm_world.training.loop import identity_of
 from scm_world.training.recipe import Recipe, recipe
 from scm_world.world import Simulation
@@ -98,8 +98,8 @@ class Needy(Mine):  # type: ignore[misc] # likewise
         (Mine(), "is no class derived from"),
         (int, "is no class derived from"),
         (type("Nameless", (Task,), {}), "has no name"),
-        (type("Weightless", (Building,), {}), "has no default_weights"),
-        (type("Half", (Building,), {"name": "half"}), "does not define 'entities'"),
+        (type("Weightless", (TriFingerTask,), {}), "has no default_weights"),
+        (type("Half", (TriFingerTask,), {"name": "half"}), "does not define 'entities'"),
         (Needy, "no default for 'height'"),
     ],
     ids=["instance", "int", "nameless", "weightless", "half", "needy"],

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scm_world.errors import UnknownOption
-from scm_world.tasks import CONVENTIONS, Pushing, Reaching, conventions, make_task
+from scm_world.tasks import CONVENTIONS, Pushing, Reaching, make_task
 from scm_world.tasks.trifinger import hardware, kernels
 from scm_world.tasks.trifinger.kinematics import forward
 from scm_world.variables import Shift
@@ -155,7 +155,8 @@ def test_the_predecessor_measured_the_hull() -> None:
     for world, expected in ((ours, 2.0 * (np.sqrt(2.0) - 1.0)), (theirs, 1.0)):
         place(world, (0.0, 0.0, 0.0), yaw=np.pi / 4)
         assert world["fractional_success"] == pytest.approx(expected, abs=1e-9)
-        assert world.task.published_overlap(world.evaluate(())) == pytest.approx(1.0, abs=1e-9)
+        overlap = world.task.goal.measures["published_overlap"]
+        assert overlap(*world.task.goal.vectors(world.evaluate(()))) == pytest.approx(1.0, abs=1e-9)
 
 
 def test_reaching_rewards_tips_that_come_nearer() -> None:
@@ -230,11 +231,11 @@ def test_velocities_that_change_cost_smoothness() -> None:
 
 def test_conventions_are_chosen_by_name() -> None:
     """Ours differ from the predecessor's in everything that is listed."""
-    assert conventions("scm_world") is CONVENTIONS["scm_world"]
+    assert pushing().conventions is CONVENTIONS["scm_world"]
     ours, theirs = (vars(CONVENTIONS[name]) for name in ("scm_world", "causal_world"))
     assert not [name for name in ours if ours[name] == theirs[name]]
     with pytest.raises(UnknownOption, match="did you mean 'causal_world'"):
-        conventions("causalworld")
+        pushing("causalworld")
 
 
 def test_a_task_is_made_with_its_options() -> None:

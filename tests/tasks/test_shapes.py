@@ -56,7 +56,9 @@ def test_a_box_can_be_given_as_a_shape(task: Any) -> None:
             world.do(pose)
         wanted = float(box["fractional_success"])
         assert float(hull["fractional_success"]) == pytest.approx(wanted, abs=1e-9)
-        assert float(hull.task.fraction(*hull.task.goals(hull.values()))) == pytest.approx(wanted)
+        assert float(
+            hull.task.goal.measures["fractional_success"](*hull.task.goal.vectors(hull.values()))
+        ) == pytest.approx(wanted)
         assert hull["reward.tips_to_block"] == pytest.approx(box["reward.tips_to_block"])
 
 
@@ -101,8 +103,10 @@ def test_the_predecessor_measures_the_boxes_around() -> None:
         world.reset(seed=0)
         world.do({BLOCK: world[GOAL] + offset, "tool_block.orientation": [1.0, 0.0, 0.0, 0.0]})
         fractions[name] = float(world["fractional_success"])
-        achieved, desired = world.task.goals(world.values())
-        both = world.task.fraction(np.stack([achieved, desired]), desired)
+        achieved, desired = world.task.goal.vectors(world.values())
+        both = world.task.goal.measures["fractional_success"](
+            np.stack([achieved, desired]), desired
+        )
         np.testing.assert_allclose(both, [fractions[name], 1.0])
     assert fractions["causal_world"] == pytest.approx(1.0)
     assert 0.3 < fractions["scm_world"] < 0.9

@@ -37,13 +37,13 @@ def centers(world: Simulation, names: Iterable[str]) -> Floats:
 def test_the_published_tower() -> None:
     """Five cubes in a column, and five on the diagonal of the floor, four centimeters apart."""
     world = tower()
-    assert world.task.tools()[:2] == ("tool_level_0_col_0_row_0", "tool_level_1_col_0_row_0")
+    assert world.task.tools[:2] == ("tool_level_0_col_0_row_0", "tool_level_1_col_0_row_0")
     height = 0.035 * (np.arange(5) + 0.5)
-    goals = centers(world, world.task.targets())
+    goals = centers(world, world.task.targets)
     np.testing.assert_allclose(goals, np.stack([0 * height, 0 * height, height], axis=-1))
     along = -0.12 + 0.04 * np.arange(5)
     expected = np.stack([along, along, np.full(5, 0.0175)], axis=-1)
-    np.testing.assert_allclose(centers(world, world.task.tools()), expected)
+    np.testing.assert_allclose(centers(world, world.task.tools), expected)
     assert world.max_episode_length == 1250
     assert world["tool_level_4_col_0_row_0.mass"] == 0.08
 
@@ -51,9 +51,9 @@ def test_the_published_tower() -> None:
 def test_blocks_are_named_by_level_column_and_row() -> None:
     """Levels go up, columns along y and rows along x, the rows fastest."""
     world = tower((3, 2, 1), (0.12, 0.08, 0.04))
-    goals = centers(world, world.task.targets())
-    assert next(iter(world.task.targets())) == "goal_level_0_col_0_row_0"
-    assert list(world.task.targets())[1] == "goal_level_0_col_0_row_1"
+    goals = centers(world, world.task.targets)
+    assert next(iter(world.task.targets)) == "goal_level_0_col_0_row_0"
+    assert list(world.task.targets)[1] == "goal_level_0_col_0_row_1"
     np.testing.assert_allclose(goals[:3, 0], [-0.04, 0.0, 0.04], atol=1e-12)
     np.testing.assert_allclose(goals[:, 1], [-0.02] * 3 + [0.02] * 3)
     assert (world["tool_level_0_col_1_row_2.size"] == [0.04, 0.04, 0.04]).all()
@@ -103,9 +103,9 @@ def test_another_tower_begins_again(backend: str) -> None:
     audit = world.do({"number_of_blocks_in_tower": [2, 2, 2], "tower_dims": [0.1, 0.1, 0.1]})
     assert (len(audit.came), len(audit.went)) == (6, 3)
     fresh = tower((2, 2, 2), (0.1, 0.1, 0.1))
-    assert world.task.tools() == fresh.task.tools()
+    assert world.task.tools == fresh.task.tools
     np.testing.assert_allclose(
-        centers(world, world.task.tools()), centers(fresh, fresh.task.tools()), atol=1e-6
+        centers(world, world.task.tools), centers(fresh, fresh.task.tools), atol=1e-6
     )
     world.step(np.array(world.task.start))
     world.do(world.task.solution(world.values()))
@@ -115,10 +115,10 @@ def test_another_tower_begins_again(backend: str) -> None:
 def test_the_middle_can_be_moved_alone() -> None:
     """The goals follow the center; the blocks stay where they are."""
     world = tower()
-    tools, goals = (centers(world, names) for names in (world.task.tools(), world.task.targets()))
+    tools, goals = (centers(world, names) for names in (world.task.tools, world.task.targets))
     world.do({"tower_center": [0.04, -0.06]})
-    np.testing.assert_array_equal(centers(world, world.task.tools()), tools)
-    moved = centers(world, world.task.targets()) - goals
+    np.testing.assert_array_equal(centers(world, world.task.tools), tools)
+    moved = centers(world, world.task.targets) - goals
     np.testing.assert_allclose(moved, np.tile([0.04, -0.06, 0.0], (5, 1)))
 
 
@@ -127,7 +127,7 @@ def test_masses_have_one_cause() -> None:
     world = tower()
     world.do({"tool_level_2_col_0_row_0.mass": 0.03})
     world.do({"blocks_mass": 0.05})
-    masses = [float(world[f"{name}.mass"]) for name in world.task.tools()]
+    masses = [float(world[f"{name}.mass"]) for name in world.task.tools]
     assert masses == [0.05, 0.05, 0.03, 0.05, 0.05]
 
 
@@ -138,7 +138,7 @@ def test_a_new_goal_is_another_tower(seed: int) -> None:
     world.reset(seed=seed, do=world.task.sample_goal("A"))
     for name in world.task.goal_causes:
         assert world.model.declared(name).in_space(world[name], "A", world.values())
-    assert len(world.task.tools()) == np.prod(world["number_of_blocks_in_tower"])
+    assert len(world.task.tools) == np.prod(world["number_of_blocks_in_tower"])
     assert overlaps(world.scene(), tolerance=DEEP) == ()
 
 

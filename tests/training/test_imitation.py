@@ -15,6 +15,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import ActionError, MissingExtra, ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.recording import record
 from scm_world.policies import MlpPolicy, load_policy
+from scm_world.tasks import Observation
 from scm_world.training import imitation
 from scm_world.training.imitation import (
     Demonstrations,
@@ -220,7 +221,7 @@ def test_an_episode_ends_once_it_is_settled() -> None:
 
 def test_a_task_without_symmetries_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is silently left out of a lesson."""
-    monkeypatch.setattr("scm_world.tasks.Picking.symmetries", lambda *_: ())
+    monkeypatch.setattr("scm_world.tasks.Picking.observation", Observation())
     with pytest.raises(UnknownOption, match=r"symmetric.*False"):
         shown(1, symmetric=True)
 

@@ -46,7 +46,9 @@ def test_physics_has_the_symmetry_that_lessons_use(thirds: int, observations: st
         action: Any = random.uniform(-0.3, 0.3, 9)
         one.step(action)
         observation: Any = other.step(swapped(action, thirds))[0]
-        (first, order), (second, _) = one.world.task.symmetries(one.world.evaluate(names), names)
+        symmetries = one.world.task.observation.symmetries
+        assert symmetries is not None
+        (first, order), (second, _) = symmetries(one.world.evaluate(names), names)
         assert not np.allclose(one.observe(), observation, atol=1e-3)  # type: ignore[arg-type]
         seen = one.observe_values(first if thirds == 1 else second)
         np.testing.assert_allclose(seen, observation, atol=1e-6)
@@ -58,7 +60,7 @@ def test_physics_has_the_symmetry_that_lessons_use(thirds: int, observations: st
 def test_a_wall_stays_where_it_is() -> None:
     """Where one stands, no turned scene is shown."""
     env = ScmWorldEnv("pick_and_place", backend="fake")
-    assert not [*env.world.task.symmetries({}, ())]
+    assert env.world.task.observation.symmetries is None
     assert not lesson("pick_and_place").symmetric
 
 

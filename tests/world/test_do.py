@@ -47,7 +47,7 @@ REFUSED: list[tuple[dict[Any, Any], type[Exception]]] = [
     ({"joint_positions": [0.0] * 8}, WrongShape),
     ({"gravity": [0.0, 0.0, NAN]}, NotFinite),
     ({"floor_friction": Scale(NAN)}, NotFinite),
-    ({"joint_velocities": Scale(HUGE), "joint_positions": Shift(0.001)}, InterventionError),
+    ({"joint_velocities": Scale(HUGE), "joint_positions": Shift(0.05)}, InterventionError),
     ({"floor_friction": -0.1}, OutOfBounds),
     ({"floor_friction": Shift(5.0)}, OutOfBounds),
     ({"floor_friction": Draw(Normal(50.0, 0.1))}, OutOfBounds),

@@ -119,6 +119,7 @@ class Realization:
 
     Attributes:
         structure: What was compiled.
+        owners: Name of the body of each shape: the geoms, then the flexes.
         model: With the present parameters.
         data: With the present state.
         kept: The parameters in force; at first, none has been written.
@@ -140,7 +141,7 @@ class Realization:
         self._constant = frozenset(key for key, slot in self._slots.items() if slot.constant)
         self._follow_ups = {key: f for key, slot in self._slots.items() if (f := slot.follow_up)}
         self._bodies = reading.body_names(compiled)
-        self._owners = reading.contact_bodies(compiled)
+        self.owners = reading.contact_bodies(compiled)
         self.kept: dict[ParameterKey, Floats] = {}
         self.applied: Parameters | None = None
         self._numbers: bytes | None = None  # of what is kept, if nothing was written since
@@ -255,7 +256,7 @@ class Realization:
         """Copy the contacts of the last physics step; of Runge-Kutta, those of its last stage."""
         if self.replay is not None:
             return self._replayed(*self.replay)
-        return touches(self.model, self.data, self._owners)
+        return touches(self.model, self.data, self.owners)
 
     def _replayed(self, numbers: Floats, steps: int) -> Touches:
         """Take steps again on other data, and copy the contacts of the last one."""
@@ -265,7 +266,7 @@ class Realization:
             mujoco.mj_step(self.model, data, steps)
         except (mujoco.FatalError, mujoco.UnexpectedError):
             mujoco.mj_resetData(self.model, data)  # it failed then, too, and left no contacts
-        found = touches(self.model, data, self._owners)
+        found = touches(self.model, data, self.owners)
         mujoco.mj_resetData(self.model, data)
         data.warning.number[:] = 1
         return found

@@ -39,7 +39,7 @@ def default_causes(world: System | SCM) -> tuple[str, ...]:
     model = world if isinstance(world, SCM) else world.model
     colors, structure = set[str](), set[str]()
     if isinstance(world, Simulation):
-        colors = {f"{block}.color" for block in world.compiled.task.tools()}
+        colors = {f"{block}.color" for block in world.compiled.task.goal.tools}
         structure = set(world.structures.head)
     return tuple(
         variable.name
@@ -67,9 +67,12 @@ def default_outcomes(world: System, *, every_step: bool = False) -> tuple[Outcom
     """
     if isinstance(world, Equations):
         return tuple(map(Outcome, usual_outcomes(world)))
-    names = world.compiled.task.measured(every_step=every_step)
+    observation = world.compiled.task.observation
+    names = observation.measured
     if names is None:
         names = (*world.compiled.slices, REWARD, SUCCESS)
+    elif every_step:
+        names = (*observation.moving, *names)
     return tuple(Outcome(name) for name in names if name in world.model)
 
 

@@ -212,7 +212,8 @@ class ObservationReader:
         }
         self.is_partial = len(self._vectors) < len(parts)
         self._shows_goals = isinstance(seen, DictObserver) and seen._goals is not None
-        sides = env.world.task.goal_names() if goals is not None else ()
+        goal = env.world.task.goal
+        sides = (goal.achieved, goal.desired) if goals is not None else ()
         self._goals = {
             name: places(table.where[one] for one in side)
             for name, side in zip(GOALS, sides, strict=False)

@@ -240,14 +240,16 @@ def nearness(task: Task) -> Score:
     Raises:
         UnknownOption: It has neither goals nor a reward.
     """
-    have, want = task.goal_names()
+    goal = task.goal
+    have, want = goal.achieved, goal.desired
     if not have and not task.weights:
         allowed = ("the name of a variable", "weights by name", "a Score")
         raise UnknownOption(f"objective of {task.name!r}, without goals and reward", None, allowed)
     if not have:
         return as_score("reward")
-    custom = task.closeness()
-    return Score((*have, *want), partial(_apart, len(have))) if custom is None else Score(*custom)
+    if goal.closeness is not None:
+        return Score(*goal.closeness)
+    return Score((*have, *want), partial(_apart, len(have)))
 
 
 def _apart(count: int, *values: Floats) -> Floats:

@@ -21,7 +21,7 @@ from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
 from scm_world.queries.experiments.effects import RESOLUTION, Effects, ProbeSetting, gap
 from scm_world.queries.experiments.noise import shared_noise
 from scm_world.queries.experiments.probes import Probe, anywhere, drawn
-from scm_world.tasks.base import Dice, action_range
+from scm_world.tasks.base import ProbeGenerator, action_range
 from scm_world.variables import Measured, Noise, Rotations
 from scm_world.world import Simulation
 
@@ -97,7 +97,7 @@ class JointExperiments:
     def run(self, number: int, probe: Probe) -> None:
         """Do all experiments of one probe state."""
         self._number, self._probe = number, probe
-        world, dice = self._world, Dice(self._noise, number)
+        world, rng = self._world, ProbeGenerator(self._noise, number)
         world.restore(probe.snapshot)
         self._first, self._earlier = world.values(), world.previous()
         world.step(probe.action)
@@ -109,14 +109,14 @@ class JointExperiments:
             for k in range(min(MOST_GROUPS, len(self._groups)))
         ]
         for draw in range(DRAWS):
-            wish = self._wish(dice, draw)
+            wish = self._wish(rng, draw)
             self._see(wish, wish, 0, self._alone)
             for parents, children in groups:
                 context, base = self._context(wish, parents) if draw else ({}, self._later)
                 self._see(
                     wish, wish.keys() - parents, 1, partial(self._step, children, context, base)
                 )
-        self._see_memory(self._wish(dice, DRAWS), dice)
+        self._see_memory(self._wish(rng, DRAWS), rng)
         self._restored()
         world.step(probe.action)
         self._unlike(world.values(), self._later)
@@ -126,7 +126,7 @@ class JointExperiments:
             )
         self.effects.end_of_probe()
 
-    def _wish(self, dice: Dice, draw: int) -> dict[str, Value]:
+    def _wish(self, rng: ProbeGenerator, draw: int) -> dict[str, Value]:
         """Draw another value of everything that can be set, the action too."""
         world, now = self._world, self._first
         self._restored()
@@ -134,11 +134,11 @@ class JointExperiments:
         for name in self._targets:
             if draw and name in self._geometry:  # what is refused costs time
                 continue
-            value = drawn(world.model.declared(name), now[name], now, dice, f"together {draw}", FAR)
+            value = drawn(world.model.declared(name), now[name], now, rng, f"together {draw}", FAR)
             if value is not None and gap(value, now[name]) > 0.0:
                 wish[name] = value
         low, high = action_range(world)
-        action = low + dice.of(f"action {draw}", len(low)) * (high - low)
+        action = low + rng.random(f"action {draw}", len(low)) * (high - low)
         return wish | {name: action[where] for name, where in self._actions.items()}
 
     def _restored(self) -> None:
@@ -332,16 +332,16 @@ class JointExperiments:
 
     # --- memory ----------------------------------------------------------------------------------
 
-    def _see_memory(self, wish: dict[str, Value], dice: Dice) -> None:
+    def _see_memory(self, wish: dict[str, Value], rng: ProbeGenerator) -> None:
         """Change everything for a step, put both runs into one state, and let them go on."""
         low, high = action_range(self._world)
-        shares = dice.of("memory", LATER * len(low)).reshape(LATER, -1)
+        shares = rng.random("memory", LATER * len(low)).reshape(LATER, -1)
         actions = [low + share * (high - low) for share in shares]
         parameters = {n: self._first[n] for n in self._targets if n not in self._states}
         for place in range(PLACES):
             base: list[dict[str, Value]] | None = None
             self._restored()
-            states, _ = anywhere(self._world, Dice(self._noise, self._number, place))
+            states, _ = anywhere(self._world, ProbeGenerator(self._noise, self._number, place))
             try:
                 base = self._afterwards({}, states, parameters, actions)
             except (InterventionError, EngineFailure):

@@ -17,7 +17,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
-from scm_world.tasks.base import Dice, Scenario, action_range
+from scm_world.tasks.base import ProbeGenerator, Scenario, action_range
 from scm_world.variables import (
     Box,
     Categories,
@@ -103,23 +103,23 @@ def _prepared(
     for attempt in range(ATTEMPTS):
         world.reset(seed=number)
         try:
-            return _made(world, scenario, Dice(noise, number, attempt), settled)
+            return _made(world, scenario, ProbeGenerator(noise, number, attempt), settled)
         except (InterventionError, EngineFailure):
             continue
     world.reset(seed=number)
-    return _made(world, AT_REST, Dice(noise, number), settled)
+    return _made(world, AT_REST, ProbeGenerator(noise, number), settled)
 
 
-def _made(world: Simulation, scenario: Scenario, dice: Dice, settled: bool) -> Probe:
-    states, extra = scenario.prepare(world, dice)
+def _made(world: Simulation, scenario: Scenario, rng: ProbeGenerator, settled: bool) -> Probe:
+    states, extra = scenario.prepare(world, rng)
     if states:
         world.do(states)
-    action = scenario.act(world, extra, dice)
-    drawn = round(dice.between(0.0, 2.0))
+    action = scenario.act(world, extra, rng)
+    drawn = round(rng.uniform(0.0, 2.0))
     steps = drawn if scenario.steps is None else scenario.steps
     for _ in range(steps if settled else 0):
         world.step(action)
-    action = scenario.act(world, extra, dice)
+    action = scenario.act(world, extra, rng)
     snapshot = world.snapshot()
     if scenario.fresh:
         snapshot = replace(snapshot, base=None)
@@ -132,43 +132,43 @@ def _made(world: Simulation, scenario: Scenario, dice: Dice, settled: bool) -> P
 # --- of any system ------------------------------------------------------------------------------
 
 
-def start(world: Simulation, dice: Dice) -> tuple[dict[str, Value], None]:
+def start(world: Simulation, rng: ProbeGenerator) -> tuple[dict[str, Value], None]:
     """Stay where the episode begins."""
     return {}, None
 
 
-def onward(world: Simulation, dice: Dice) -> tuple[dict[str, Value], None]:
+def onward(world: Simulation, rng: ProbeGenerator) -> tuple[dict[str, Value], None]:
     """Go where random actions lead, each kept for a while."""
-    steps = 1 + int(dice.between(0.0, LONGEST))
-    for action in _way(world, dice, steps):
+    steps = 1 + int(rng.uniform(0.0, LONGEST))
+    for action in _way(world, rng, steps):
         world.step(action)
     return {}, None
 
 
-def onward_touching(world: Simulation, dice: Dice) -> tuple[dict[str, Value], None]:
+def onward_touching(world: Simulation, rng: ProbeGenerator) -> tuple[dict[str, Value], None]:
     """Go where random actions lead, to where two bodies are about to touch that do on the way."""
     before: dict[Pair, WorldSnapshot] = {}
-    for action in _way(world, dice, LONGEST):
+    for action in _way(world, rng, LONGEST):
         here = world.snapshot()
         world.step(action)
         for pair in touching_pairs(world):
             before.setdefault(pair, here)
     if before:
-        world.restore(_one_of(before, dice))
+        world.restore(_one_of(before, rng))
     return {}, None
 
 
-def anywhere(world: Simulation, dice: Dice) -> tuple[dict[str, Value], None]:
+def anywhere(world: Simulation, rng: ProbeGenerator) -> tuple[dict[str, Value], None]:
     """Move everything to where it can be, with velocities of a few natural units."""
-    return _anywhere(world, dice, "moved"), None
+    return _anywhere(world, rng, "moved"), None
 
 
-def touching(world: Simulation, dice: Dice) -> tuple[dict[str, Value], None]:
+def touching(world: Simulation, rng: ProbeGenerator) -> tuple[dict[str, Value], None]:
     """Move everything to where two bodies touch, if some of the states that are tried have such."""
-    here, action = world.snapshot(), _at_random(world, None, dice)
+    here, action = world.snapshot(), _at_random(world, None, rng)
     found: dict[Pair, dict[str, Value]] = {}
     for number in range(TRIED):
-        states = _anywhere(world, dice, f"moved {number}")
+        states = _anywhere(world, rng, f"moved {number}")
         try:
             world.do(states)
             world.step(action)
@@ -179,13 +179,13 @@ def touching(world: Simulation, dice: Dice) -> tuple[dict[str, Value], None]:
                 found.setdefault(pair, states)
         finally:
             world.restore(here)
-    return (_one_of(found, dice) if found else _anywhere(world, dice, "moved")), None
+    return (_one_of(found, rng) if found else _anywhere(world, rng, "moved")), None
 
 
-def _way(world: Simulation, dice: Dice, steps: int) -> Iterator[Floats]:
+def _way(world: Simulation, rng: ProbeGenerator, steps: int) -> Iterator[Floats]:
     """Draw actions, each kept for a while."""
-    kept = 1 + int(dice.between(0.0, KEPT))
-    shares = dice.of("probe way", steps * world.compiled.n_actions).reshape(steps, -1)
+    kept = 1 + int(rng.uniform(0.0, KEPT))
+    shares = rng.random("probe way", steps * world.compiled.n_actions).reshape(steps, -1)
     for step in range(steps):
         yield _within(world, shares[step // kept])
 
@@ -196,20 +196,22 @@ def touching_pairs(world: Simulation) -> set[Pair]:
     return {(min(contact.bodies), max(contact.bodies)) for contact in pressing}
 
 
-def _one_of(found: dict[Pair, T], dice: Dice) -> T:
+def _one_of(found: dict[Pair, T], rng: ProbeGenerator) -> T:
     """Draw one of the pairs that were found, mostly one of two bodies that can move."""
     moving = [pair for pair in sorted(found) if WORLD not in pair]
-    which = dice.between(0.0, 1.0)
+    which = rng.uniform(0.0, 1.0)
     pairs = moving if moving and which < MOVING else sorted(found)
-    return found[pairs[int(dice.between(0.0, len(pairs)))]]
+    return found[pairs[int(rng.uniform(0.0, len(pairs)))]]
 
 
-def _anywhere(world: Simulation, dice: Dice, stream: str) -> dict[str, Value]:
+def _anywhere(world: Simulation, rng: ProbeGenerator, stream: str) -> dict[str, Value]:
     """Draw a value of every state."""
     model = world.model
     variables = (v for v in model.variables if isinstance(v, Measured) and v.settable)
     return {
-        v.name: _moved(v, world[v.name], dice.of(f"{v.name}|{stream}", 1 + int(np.prod(v.shape))))
+        v.name: _moved(
+            v, world[v.name], rng.random(f"{v.name}|{stream}", 1 + int(np.prod(v.shape)))
+        )
         for v in variables
         if v.dtype == "real" and model.target(v.name) == v.name
     }
@@ -218,15 +220,15 @@ def _anywhere(world: Simulation, dice: Dice, stream: str) -> dict[str, Value]:
 def _with_others(prepare: Any) -> Any:
     """Prepare a state under other parameters."""
 
-    def prepared(world: Simulation, dice: Dice) -> tuple[dict[str, Value], None]:
-        set_others(world, dice)
-        found: tuple[dict[str, Value], None] = prepare(world, dice)
+    def prepared(world: Simulation, rng: ProbeGenerator) -> tuple[dict[str, Value], None]:
+        set_others(world, rng)
+        found: tuple[dict[str, Value], None] = prepare(world, rng)
         return found
 
     return prepared
 
 
-def set_others(world: Simulation, dice: Dice) -> None:
+def set_others(world: Simulation, rng: ProbeGenerator) -> None:
     """Set about half of the parameters to values of their spaces, or near those that they have.
 
     What cannot be set together with the rest stays as it is. So does what decides which bodies
@@ -234,7 +236,7 @@ def set_others(world: Simulation, dice: Dice) -> None:
     """
     deciding = frozenset(world.task.decided_by)
     drawn = (
-        (v.name, _jittered(v, world, dice))
+        (v.name, _jittered(v, world, rng))
         for v in world.model.variables
         if isinstance(v, Exogenous) and v.settable and v.dtype == "real"
         if not deciding or deciding.isdisjoint(world.static_order((v.name,)))
@@ -254,16 +256,16 @@ def set_others(world: Simulation, dice: Dice) -> None:
             return
 
 
-def _jittered(variable: Exogenous, world: Simulation, dice: Dice) -> Value | None:
+def _jittered(variable: Exogenous, world: Simulation, rng: ProbeGenerator) -> Value | None:
     """Give another value of a parameter, or None where it keeps the one that it has."""
-    if dice.of(f"{variable.name}|other or not", 1)[0] >= SHARE:
+    if rng.random(f"{variable.name}|other or not", 1)[0] >= SHARE:
         return None
     now = world.current()[0]
-    return drawn(variable, world[variable.name], now, dice, "other", JITTER)
+    return drawn(variable, world[variable.name], now, rng, "other", JITTER)
 
 
 def drawn(
-    variable: Variable, present: Value, now: Values, dice: Dice, stream: str, share: float
+    variable: Variable, present: Value, now: Values, rng: ProbeGenerator, stream: str, share: float
 ) -> Value | None:
     """Draw another value of a variable: from its space A, its space B, or within its bounds.
 
@@ -274,12 +276,12 @@ def drawn(
         variable: It can be set.
         present: The value that it has.
         now: Values of what its spaces and bounds follow from.
-        dice: Random numbers.
+        rng: Random numbers.
         stream: Which of them.
         share: How far, as a fraction, what has no ends is moved.
     """
     n = int(np.prod(variable.shape))
-    unit = dice.of(f"{variable.name}|{stream}", n + 2)
+    unit = rng.random(f"{variable.name}|{stream}", n + 2)
     numbers = unit[2:].reshape(variable.shape)
     bounds = variable.bounds
     match bounds:
@@ -332,19 +334,19 @@ def _within(world: Simulation, share: Floats) -> Floats:
     return np.asarray(low + share * (high - low))
 
 
-def _at_random(world: Simulation, extra: None, dice: Dice) -> Floats:
+def _at_random(world: Simulation, extra: None, rng: ProbeGenerator) -> Floats:
     """Draw an action."""
-    return _within(world, dice.of("probe action", world.compiled.n_actions))
+    return _within(world, rng.random("probe action", world.compiled.n_actions))
 
 
-def _uncut(world: Simulation, extra: None, dice: Dice) -> Floats:
+def _uncut(world: Simulation, extra: None, rng: ProbeGenerator) -> Floats:
     """Draw an action each number of which acts: it is not cut to a limit of its actuator.
 
     A servo exerts its largest force for most commands: they have one and the same effect, bit for
     bit. So for each number, the range is halved between two commands with different effects, until
     there is one at which a tiny change of it makes a difference.
     """
-    action, (low, high) = _at_random(world, extra, dice), action_range(world)
+    action, (low, high) = _at_random(world, extra, rng), action_range(world)
     here = world.snapshot()
 
     def reached(place: int, number: float) -> bytes | None:
@@ -375,7 +377,7 @@ def _uncut(world: Simulation, extra: None, dice: Dice) -> Floats:
     return action
 
 
-def _at_rest(world: Simulation, extra: None, dice: Dice) -> Floats:
+def _at_rest(world: Simulation, extra: None, rng: ProbeGenerator) -> Floats:
     """Return the idle action."""
     return world.task.idle(world)
 

@@ -10,9 +10,20 @@ from typing import Any, ClassVar, Unpack
 
 import numpy as np
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Value, Values
 from scm_world.errors import UnknownOption
-from scm_world.tasks.base import Observed, Scenario, Task, Timing, numbers_of
+from scm_world.geometry.hulls import Hull
+from scm_world.tasks.base import (
+    TIME,
+    Conventions,
+    Goal,
+    Observation,
+    Observed,
+    Scenario,
+    Task,
+    Timing,
+    finite_numbers,
+)
 from scm_world.tasks.composition import Clock, Composition, Entity
 from scm_world.tasks.rewards import (
     FRACTION,
@@ -22,24 +33,28 @@ from scm_world.tasks.rewards import (
     declared,
     further_terms,
     resolve,
+    reward,
     succeeded,
 )
-from scm_world.tasks.trifinger import hardware, shaping
+from scm_world.tasks.trifinger import building, hardware, shaping
+from scm_world.tasks.trifinger.conventions import CONVENTIONS, TriFingerConventions
 from scm_world.tasks.trifinger.entities.block_world import BlockWorld
 from scm_world.tasks.trifinger.entities.robot import ACTIONS, Robot
 from scm_world.tasks.trifinger.entities.stage import LightAndCameras, Stage
 from scm_world.tasks.trifinger.hardware import PRESETS, RESOLUTIONS, TIMESTEP
 from scm_world.tasks.trifinger.scenarios import scenarios
+from scm_world.tasks.trifinger.symmetry import thirds
 from scm_world.variables import Linear, Measured, Variable
 
 HEAD = (
+    Observed(TIME),
     Observed("joint_positions", (hardware.JOINT_LOW, hardware.JOINT_HIGH), low=-3.3, high=3.3),
     Observed("joint_velocities", (-50.0, 50.0)),
     Observed(
         "end_effector_positions", ((-0.5, -0.5, 0.0) * 3, (0.5, 0.5, 0.5) * 3), low=-1.0, high=1.0
     ),
 )
-"""What every observation begins with, after the time that is left."""
+"""The first rows of every observation."""
 
 _CARTESIAN = ((-0.5, -0.5, 0.0), (0.5, 0.5, 0.5))
 _SPACE = {"low": -1.0, "high": 1.0}
@@ -76,6 +91,7 @@ def observe_position(name: str) -> Iterable[Observed]:
 
 
 REWARD = "reward"
+SECONDS_PER_BLOCK = 10.0
 
 MEASURES = ("cartesian_position", "orientation", "linear_velocity", "angular_velocity")
 """States of a block, in the order in which they are listed."""
@@ -89,19 +105,24 @@ def _scripted(name: str) -> Any:
 
 
 class TriFingerTask(Task):
-    """A goal family of the robot.
+    """A goal family of the robot: blocks that should fill goals, unless it says otherwise.
 
     Attributes:
+        interleaved: Whether block and goal alternate in the observation.
+        shape: Shape of block and goal, where that is not a box.
+        goal_causes: The variables that a new goal is drawn for.
         default_weights: Weight of every dense reward term, in order, and of
             ``fractional_success``.
-        paper_weights: Where the published training runs differ.
+        paper_weights: Weights of the published training runs, where they differ.
         ready_terms: Further reward terms, by name in the option ``terms``.
+        terms: The further reward terms that were asked for.
+        options: The options that every task of this kind has; ``Common``, or a subclass of it.
         unchecked: Prefixes of variables; an intervention that sets one may put bodies as deep in
             one another as it likes, under the conventions of the predecessor.
-        start: Where the robot begins, shape (9,) [rad].
-        success: What counts in place of the usual goal, if anything; see ``Common``.
-        terminated: What ends an episode before its time, if anything; see ``Common``.
-        training: See ``Task``.
+        rest: Joint positions at the start of an episode, shape (9,) [rad].
+        start: The same, if an option changed them.
+        success: Replaces the usual goal, if given; see ``Common``.
+        terminated: Ends an episode before its time, if given; see ``Common``.
     """
 
     action_modes = tuple(ACTIONS)
@@ -110,20 +131,25 @@ class TriFingerTask(Task):
     generated_graph = True
     time_unit = TIMESTEP
     frame_skip = 10
+    n_actions = hardware.N_JOINTS
+    conventions: TriFingerConventions = CONVENTIONS["scm_world"]
+    choices: ClassVar[Mapping[str, Conventions]] = CONVENTIONS
 
+    interleaved: ClassVar[bool] = False
+    shape: Hull | None = None
+    goal_causes: tuple[str, ...] = ()
     default_weights: ClassVar[Mapping[str, float]]
     paper_weights: ClassVar[Mapping[str, float]] = {}
-    head = HEAD
-    saturates = True
-    raised = hardware.RAISED
-    policies: ClassVar[Mapping[str, Callable[[], Any]]] = {
-        name: partial(_scripted, name) for name in ("sweep", "across", "feedback")
-    }
     ready_terms: ClassVar[tuple[Measured, ...]] = shaping.ROBOT
+    terms: tuple[Measured, ...] = ()
+    options: ClassVar[type] = Common
     unchecked: ClassVar[tuple[str, ...]] = ()
     rest: ClassVar[tuple[float, ...]] = hardware.REST
     success: Any = None
     terminated: Any = None
+    policies: ClassVar[Mapping[str, Callable[[], Any]]] = {
+        name: partial(_scripted, name) for name in ("sweep", "across", "feedback")
+    }
     training: ClassVar[Mapping[str, Any]] = {
         "env": {
             "action_mode": "delta_joint_positions",
@@ -143,26 +169,98 @@ class TriFingerTask(Task):
             if common.get(option) is not None:
                 setattr(self, option, common[option])  # type: ignore[literal-required]
         given = common.get("joint_positions")
-        joints = numbers_of(self.rest if given is None else given)
+        joints = finite_numbers(self.rest if given is None else given)
         if joints is None or joints.shape != (hardware.N_JOINTS,):
             raise UnknownOption("joint_positions", given, ("nine angles [rad]",))
         self.start = tuple(joints.tolist())
 
     @classmethod
     def arguments(cls) -> tuple[str, ...]:
-        """Name the arguments of the constructor, those of this family first."""
+        """Return the names of the constructor's arguments, those of this family first."""
         own = [vars(kind)["__init__"] for kind in cls.__mro__ if "__init__" in vars(kind)]
         given = [p for init in own[:-1] for p in inspect.signature(init).parameters.values()]
         names = [parameter.name for parameter in given if parameter.kind is parameter.KEYWORD_ONLY]
-        return tuple(dict.fromkeys((*names, *Common.__annotations__)))
+        return tuple(dict.fromkeys((*names, *cls.options.__annotations__)))
 
     @abstractmethod
     def entities(self) -> Iterable[Entity]:
         """List the entities of the scene other than the robot and the stage."""
 
-    @abstractmethod
+    def parts(self) -> Iterable[building.Part]:
+        """List the parts of a building, each a block with its place."""
+        return ()
+
+    @property
+    def tools(self) -> tuple[str, ...]:
+        """Names of the blocks that should be moved: one for each part."""
+        return tuple(f"tool_{name}" for name, _ in self.parts())
+
+    @property
+    def targets(self) -> Mapping[str, str]:
+        """Names of the goals, each with the block that its solution puts there."""
+        return {f"goal_{name}": f"tool_{name}" for name, _ in self.parts()}
+
+    @property
+    def obstacles(self) -> tuple[str, ...]:
+        """Names of the obstacles."""
+        return ()
+
+    def dense(self) -> Iterable[Variable]:
+        """Declare the dense reward terms."""
+        return ()
+
     def readouts(self) -> Iterable[Variable]:
         """Declare reward terms, fractional success and success."""
+        yield from self.dense()
+        published = self.conventions.aligned_boxes
+        yield building.fractional_success(self.tools, self.targets, self.shape, published=published)
+        yield succeeded()
+        yield from self.terms
+        yield reward(self.weights)
+
+    @property
+    def seconds(self) -> float:
+        """Ten seconds for each block [s]."""
+        still = len(self.obstacles) if self.conventions.static_counts else 0
+        return SECONDS_PER_BLOCK * (len(self.tools) + still)
+
+    @property
+    def goal(self) -> Goal:
+        """The blocks should fill the goals."""
+        return building.goal(
+            *(self.tools, self.targets, self.goal_causes, self.shape),
+            published=self.conventions.aligned_boxes,
+        )
+
+    def observed(self) -> Iterable[Observed]:
+        """List the rows of blocks, goals and obstacles."""
+        goals = {tool: goal for goal, tool in self.targets.items()}
+        for tool in self.tools:
+            yield from observe_tool(tool)
+            if self.interleaved and tool in goals:
+                yield from observe_goal(goals[tool])
+        for goal in () if self.interleaved else goals.values():
+            yield from observe_goal(goal)
+        for obstacle in self.obstacles:
+            yield from observe_obstacle(obstacle)
+
+    @property
+    def observation(self) -> Observation:
+        """The time that is left, the robot, and the rows of the family."""
+        boxes = self.targets if self.shape is None else {}
+        return Observation(
+            rows=(*HEAD, *self.observed()),
+            saturates=True,
+            view=building.view_of(boxes) if boxes else None,
+            # there are none with a wall, which always stands in the same place
+            symmetries=None if self.obstacles or not self.targets else thirds,
+            measured=(*(f"{tool}.{what}" for tool in self.tools for what in MEASURES), FRACTION),
+            moving=("joint_positions", "joint_velocities"),
+        )
+
+    def solution(self, values: Values) -> dict[str, Value]:
+        """Put each block where its goal is, and fingers that are in the way to the side."""
+        return building.solution(self.targets, values)
 
     def idle(self, world: Any) -> Floats:
         """Return the command that keeps the robot at rest (position, or no torque), shape (9,)."""
@@ -170,15 +268,6 @@ class TriFingerTask(Task):
             return super().idle(world)
         name = "end_effector_positions" if "effector" in world.action_mode else "joint_positions"
         return np.array(world[name])
-
-    def measured(self, *, every_step: bool = False) -> tuple[str, ...]:
-        """Name the states of blocks, and success; at every instant also those of the joints."""
-        joints = ("joint_positions", "joint_velocities") if every_step else ()
-        return (
-            *joints,
-            *(f"{tool}.{what}" for tool in self.tools() for what in MEASURES),
-            FRACTION,
-        )
 
     def scenarios(self, world: Any) -> Sequence[Scenario]:
         """List where fingers and blocks touch, and where blocks come and go."""

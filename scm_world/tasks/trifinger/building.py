@@ -1,11 +1,10 @@
-"""What all tasks have in common in which blocks should fill goals."""
+"""Blocks that should fill goals: success, goal, solution and the parts of a building."""
 
 from __future__ import annotations
 
 import itertools
-from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 
 import numpy as np
 from numba import njit
@@ -13,25 +12,18 @@ from numba import njit
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.geometry.arrays import compact
 from scm_world.geometry.filling import overlap_fraction_kernel
+from scm_world.geometry.hulls import Hull
 from scm_world.geometry.overlap import aabb_overlap_fraction
 from scm_world.geometry.rotations import rotation_matrix
-from scm_world.tasks.base import Observed
+from scm_world.tasks.base import OVERLAP, Goal
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, FULFILLED, UNIT, reward, succeeded
-from scm_world.tasks.trifinger import hardware, kernels
-from scm_world.tasks.trifinger.base import (
-    TriFingerTask,
-    observe_goal,
-    observe_obstacle,
-    observe_tool,
-)
+from scm_world.tasks.rewards import FRACTION, FULFILLED, SUCCESS, UNIT
+from scm_world.tasks.trifinger import hardware, kernels, shapes
 from scm_world.tasks.trifinger.feasibility import fingers_reach
-from scm_world.tasks.trifinger.symmetry import swapped, turned
 from scm_world.tasks.trifinger.views import SIZE, view
-from scm_world.variables import Function, Measured, Variable
+from scm_world.variables import Function, Measured
 from scm_world.variables.mechanisms import Stacked
 
-SECONDS_PER_BLOCK = 10.0
 BOX = 10  # numbers of a box in a goal vector: size (3), position (3), quaternion (4)
 TIPS = "end_effector_positions"
 
@@ -83,205 +75,153 @@ def aligned(*parents: Floats, tools: float) -> float:
     return aabb_overlap_fraction(*gathered(*parents, tools=tools))
 
 
-class Building(TriFingerTask):
-    """A task in which blocks should fill goals.
+def fractional_success(
+    tools: tuple[str, ...], targets: Mapping[str, str], shape: Hull | None, *, published: bool
+) -> Measured:
+    """Declare the fraction of the goals that is filled.
 
-    Attributes:
-        interleaved: Whether block and goal alternate in the observation.
+    Args:
+        tools: Names of the blocks.
+        targets: Names of the goals.
+        shape: Shape of block and goal, where that is not a box.
+        published: Whether the overlap is that of the axis-aligned hulls, as in the predecessor.
     """
-
-    interleaved: ClassVar[bool] = False
-
-    @abstractmethod
-    def tools(self) -> tuple[str, ...]:
-        """Name the blocks."""
-
-    @abstractmethod
-    def targets(self) -> dict[str, str]:
-        """Name the goals, each with the block that its solution puts there."""
-
-    def closeness(self) -> tuple[tuple[str, ...], Callable[..., Any]]:
-        """Return minus the distance of blocks from goals, and a little of fingers from blocks."""
-        have, want = self.goal_names()
-        return (TIPS, *have, *want), boxes_apart
-
-    def obstacles(self) -> tuple[str, ...]:
-        """Name the obstacles."""
-        return ()
-
-    @abstractmethod
-    def entities(self) -> Iterable[Entity]:
-        """List blocks, goals and obstacles."""
-
-    def dense(self) -> Iterable[Variable]:
-        """Declare the dense reward terms."""
-        return ()
-
-    @property
-    def seconds(self) -> float:
-        """Ten seconds for each block [s]."""
-        still = len(self.obstacles()) if self.conventions.static_counts else 0
-        return SECONDS_PER_BLOCK * (len(self.tools()) + still)
-
-    def readouts(self) -> Iterable[Variable]:
-        """Declare reward terms and success."""
-        yield from self.dense()
-        yield self.fractional_success()
-        yield succeeded()
-        yield from self.terms
-        yield reward(self.weights)
-
-    def fractional_success(self) -> Measured:
-        """Declare how much of the goals is filled."""
-        tools, goals = self.tools(), tuple(self.targets())
-        exact = not self.conventions.aligned_boxes
-        if exact and len(tools) == len(goals) == 1:
-            mechanism = Function(kernels.filled)
-        else:
-            constants = {"tools": float(len(tools))}
-            mechanism = Function(filled if exact else aligned, constants=constants)
-        return Measured(
-            name=FRACTION,
-            bounds=UNIT if exact else None,
-            parents=tuple(f"{body}.{part}" for body in (*tools, *goals) for part in _POSE),
-            mechanism=mechanism,
-            doc="Fraction of the volume of all goals that the blocks fill.",
-        )
-
-    def observed(self) -> Iterable[Observed]:
-        """Observe blocks, goals and obstacles."""
-        targets = {tool: goal for goal, tool in self.targets().items()}
-        for tool in self.tools():
-            yield from observe_tool(tool)
-            if self.interleaved and tool in targets:
-                yield from observe_goal(targets[tool])
-        for goal in () if self.interleaved else targets.values():
-            yield from observe_goal(goal)
-        for obstacle in self.obstacles():
-            yield from observe_obstacle(obstacle)
-
-    def goal_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Name size, position and quaternion of each goal's block and of each goal."""
-
-        def boxes(names: Iterable[str]) -> tuple[str, ...]:
-            return tuple(f"{name}.{part}" for name in names for part in _POSE)
-
-        targets = self.targets()
-        return boxes(targets.values()), boxes(targets)
-
-    def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
-        """Compute how much of the desired boxes the achieved ones fill, shape (...)."""
-        return self._fraction(achieved, desired, aligned=self.conventions.aligned_boxes)
-
-    def view(self) -> tuple[tuple[str, ...], int, Callable[[Values], Floats]] | None:
-        """Describe what a hand sees of the blocks that have goals, in their own frames."""
-        parts = [
-            (TIPS, *(f"{tool}.{part}" for part in _POSE), *(f"{goal}.{p}" for p in _POSE[1:]))
-            for goal, tool in self.targets().items()
-        ]
-
-        def seen(values: Values) -> Floats:
-            return np.concatenate([view(*(values[name] for name in names)) for names in parts])
-
-        return tuple(dict.fromkeys(itertools.chain(*parts))), SIZE * len(parts), seen
-
-    def symmetries(
-        self, values: Values, names: Iterable[str]
-    ) -> Iterable[tuple[Values, Sequence[int]]]:
-        """Turn the scene by one and by two thirds of a turn; actions are of joints.
-
-        There are none where there is a wall, which always stands in the same place.
-        """
-        for thirds in (1, 2) if not self.obstacles() else ():
-            order = swapped(np.arange(float(hardware.N_JOINTS)), thirds).astype(int).tolist()
-            yield turned(values, names, thirds), order
-
-    def published_overlap(self, values: Values) -> float | None:
-        """Compute the overlap of the axis-aligned boxes around blocks and around goals."""
-        return float(self._fraction(*self.goals(values), aligned=True))
-
-    def _fraction(self, achieved: ArrayLike, desired: ArrayLike, *, aligned: bool) -> Floats:
-        have, want = np.asarray(achieved, dtype=float), np.asarray(desired, dtype=float)
-        shape = np.broadcast_shapes(have.shape[:-1], want.shape[:-1])
-        overlap = aabb_overlap_fraction if aligned else _exact
-        rows = [
-            np.broadcast_to(boxes, (*shape, boxes.shape[-1])).reshape(
-                -1, boxes.shape[-1] // BOX, BOX
-            )
-            for boxes in (have, want)
-        ]
-        found = [overlap(*_split(mine), *_split(its)) for mine, its in zip(*rows, strict=True)]
-        return np.array(found, dtype=float).reshape(shape)
-
-    def fulfilled(self, fraction: ArrayLike) -> Value:
-        """Tell whether more than nine tenths are filled."""
-        return np.asarray(fraction) > FULFILLED
-
-    def solution(self, values: Values) -> dict[str, Value]:
-        """Put each block where its goal is, and fingers that are in the way to the side."""
-        found = {
-            f"{tool}.{part}": values[f"{goal}.{part}"]
-            for goal, tool in self.targets().items()
-            for part in _POSE[1:]
-        }
-        joints, height = values["joint_positions"], float(values["robot_height"])
-        boxes = [[values[f"{goal}.{part}"] for part in _POSE] for goal in self.targets()]
-        if any(fingers_reach(b[0], b[1], b[2], joints, height) for b in boxes):
-            found["joint_positions"] = np.array(hardware.ASIDE)
-        return found
+    parts = _POSE
+    if shape is not None:
+        mechanism = Function(shapes.hull_aligned if published else shapes.hull_filled)
+        parts = ("vertices", *_POSE[1:])
+    elif len(tools) == len(targets) == 1 and not published:
+        mechanism = Function(kernels.filled)
+    else:
+        constants = {"tools": float(len(tools))}
+        mechanism = Function(aligned if published else filled, constants=constants)
+    return Measured(
+        name=FRACTION,
+        bounds=None if published else UNIT,
+        parents=tuple(f"{body}.{part}" for body in (*tools, *targets) for part in parts),
+        mechanism=mechanism,
+        doc="Fraction of the volume of all goals that the blocks fill.",
+    )
 
 
-class Assembly(Building):
-    """A building of parts: blocks that begin on the floor, each with its place in it.
+def goal(
+    tools: tuple[str, ...],
+    targets: Mapping[str, str],
+    causes: tuple[str, ...],
+    shape: Hull | None,
+    *,
+    published: bool,
+) -> Goal:
+    """Return the goal of blocks that should fill others: size, position and quaternion of each.
 
-    The fingers begin raised, out of their way.
+    Args:
+        tools: Names of the blocks.
+        targets: Names of the goals, each with the block that its solution puts there.
+        causes: The variables that a new goal is drawn for.
+        shape: Shape of block and goal, where that is not a box.
+        published: Whether the overlap is that of the axis-aligned hulls, as in the predecessor.
     """
+    have, want = (
+        tuple(f"{name}.{part}" for name in names for part in _POSE)
+        for names in (targets.values(), targets)
+    )
+    fraction = partial(_fraction, shape=shape, published=published)
+    return Goal(
+        achieved=have,
+        desired=want,
+        causes=causes,
+        measures={
+            FRACTION: fraction,
+            SUCCESS: lambda mine, its: fraction(mine, its) > FULFILLED,
+            OVERLAP: partial(_fraction, shape=shape, published=True),
+        },
+        closeness=((TIPS, *have, *want), boxes_apart),
+        tools=tools,
+        targets=targets,
+    )
 
-    default_weights: ClassVar[Mapping[str, float]] = {FRACTION: 1.0}
-    rest = hardware.RAISED
 
-    @abstractmethod
-    def parts(self) -> Iterable[tuple[str, dict[str, float]]]:
-        """Name the parts, each with what says which it is."""
+def _fraction(
+    achieved: ArrayLike, desired: ArrayLike, *, shape: Hull | None, published: bool
+) -> Floats:
+    """Compute how much of the desired boxes, or of the desired hull, is filled, shape (...)."""
+    have, want = np.asarray(achieved, dtype=float), np.asarray(desired, dtype=float)
+    if shape is None:
+        boxes = aabb_overlap_fraction if published else overlap_fraction_kernel
 
-    @abstractmethod
-    def piece(self, name: str, which: Mapping[str, float]) -> tuple[Entity, Entity]:
-        """Describe the block of a part, and its goal."""
+        def filled(mine: Floats, its: Floats) -> float:
+            return float(boxes(*_split(mine), *_split(its)))
+    else:
+        overlap = shapes.hull_aligned if published else shapes.hull_filled
+        corners = np.array(shape.vertices)
 
-    def wanted(self, which: Mapping[str, float]) -> bool:
-        """Tell whether a part has a goal."""
-        return True
+        def filled(mine: Floats, its: Floats) -> float:
+            return overlap(corners, mine[3:6], mine[6:], corners, its[3:6], its[6:])
 
-    def tools(self) -> tuple[str, ...]:
-        """Name the blocks, part by part."""
-        return tuple(f"tool_{name}" for name, _ in self.parts())
+    vectorized = np.vectorize(filled, signature="(n),(n)->()", otypes=[float])
+    return np.asarray(vectorized(have, want))
 
-    def targets(self) -> dict[str, str]:
-        """Name the goals, part by part."""
-        return {
-            f"goal_{name}": f"tool_{name}" for name, which in self.parts() if self.wanted(which)
-        }
 
-    def causes(self) -> Iterable[Entity]:
-        """List what the places of the parts follow from, besides shared variables."""
-        return ()
+def view_of(
+    targets: Mapping[str, str],
+) -> tuple[tuple[str, ...], int, Callable[[Values], Floats]]:
+    """Describe the view of the boxes that have goals, in their own frames."""
+    parts = [
+        (TIPS, *(f"{tool}.{part}" for part in _POSE), *(f"{goal}.{p}" for p in _POSE[1:]))
+        for goal, tool in targets.items()
+    ]
 
-    def entities(self) -> Iterable[Entity]:
-        """A block, and perhaps a goal, for each part."""
-        pieces = [(self.piece(name, which), which) for name, which in self.parts()]
-        yield from (tool for (tool, _), _ in pieces)
-        yield from self.causes()
-        yield from (goal for (_, goal), which in pieces if self.wanted(which))
+    def seen(values: Values) -> Floats:
+        return np.concatenate([view(*(values[name] for name in names)) for names in parts])
+
+    return tuple(dict.fromkeys(itertools.chain(*parts))), SIZE * len(parts), seen
+
+
+def solution(targets: Mapping[str, str], values: Values) -> dict[str, Value]:
+    """Put each block where its goal is, and fingers that are in the way to the side."""
+    found = {
+        f"{tool}.{part}": values[f"{goal}.{part}"]
+        for goal, tool in targets.items()
+        for part in _POSE[1:]
+    }
+    joints, height = values["joint_positions"], float(values["robot_height"])
+    boxes = [[values[f"{goal}.{part}"] for part in _POSE] for goal in targets]
+    if any(fingers_reach(b[0], b[1], b[2], joints, height) for b in boxes):
+        found["joint_positions"] = np.array(hardware.ASIDE)
+    return found
+
+
+Part = tuple[str, dict[str, float]]
+"""The name of a part of a building, and the constants that say which one it is."""
+
+
+def assembled(
+    parts: Iterable[Part],
+    piece: Callable[..., tuple[Entity, Entity]],
+    targets: Mapping[str, str],
+    *causes: Entity,
+    airborne: bool,
+) -> Iterable[Entity]:
+    """List the block of each part, and its place in the building.
+
+    Args:
+        parts: The parts.
+        piece: Returns the block of a part and its goal.
+        targets: The goals that there are.
+        causes: Entities that the places of the parts follow from.
+        airborne: Whether the spaces of blocks reach into the air, as in the predecessor.
+    """
+    pieces = [piece(name, **which, airborne=airborne) for name, which in parts]
+    yield from (tool for tool, _ in pieces)
+    yield from causes
+    yield from (goal for _, goal in pieces if goal.name in targets)
 
 
 def _split(boxes: Floats) -> tuple[Floats, Floats, Floats]:
-    parts = (boxes[:, :3], boxes[:, 3:6], boxes[:, 6:])
+    rows = boxes.reshape(-1, BOX)
+    parts = (rows[:, :3], rows[:, 3:6], rows[:, 6:])
     size, position, orientation = (compact(part) for part in parts)
     return size, position, orientation
-
-
-def _exact(*boxes: Floats) -> float:
-    return float(overlap_fraction_kernel(*boxes))
 
 
 def boxes_apart(tips: Floats, *values: Floats) -> Floats:

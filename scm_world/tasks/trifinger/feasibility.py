@@ -2,70 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator
+import math
+from collections.abc import Container
 from typing import Any
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
-from scm_world._types import ArrayLike, Floats, Integers
-from scm_world.geometry.arrays import compact, rows
-from scm_world.geometry.hulls import Convex, box_hull, placed, sides_depth
-from scm_world.geometry.penetration import box_capsule
+from scm_world._types import ArrayLike, Floats
 from scm_world.geometry.rotations import rotation_matrix
-from scm_world.geometry.sweep import FLOOR, OTHERS, WALL, apart_in_rows, sweep
-from scm_world.models.scene import TOLERANCE, Overlap, Scene
+from scm_world.models.scene import TOLERANCE, GoalRegion, Overlap, Scene
 from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.grasping.hand import deepest_kernel
 from scm_world.tasks.trifinger.hardware import WALL_HEIGHT, WALL_RADIUS
-from scm_world.tasks.trifinger.kinematics import FRAMES_PER_FINGER, frames_of_rows, link_frames
-from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
+from scm_world.tasks.trifinger.kinematics import forward, forward_kernel
 
-_LINK = {"upper": 1, "middle": 2, "lower": 3, "tip": 3}
-"""The link that a collision shape belongs to: the tip is a part of the lower link."""
-
-_FRAME = {"upper": 1, "middle": 2, "lower": 3, "tip": 4}
-"""The frame of a finger in which a collision shape is given."""
-
-_FLAGS = {
-    "upper": 0,
-    "middle": OTHERS | FLOOR,
-    "lower": OTHERS | FLOOR,
-    "tip": OTHERS | FLOOR | WALL,
-}
+BALLS_MARGIN = 1e-3  # [m] by which balls of two legs may be deeper in one another than capsules
 
 
-def _capsules() -> tuple[Floats, Integers]:
-    """Gather the collision shapes of all fingers, as ``sweep`` wants them."""
-    capsules, members = [], []
-    for finger in range(len(hardware.FINGERS)):
-        for part, capsule in hardware.COLLISION.items():
-            capsules.append((*capsule.start, *capsule.end, capsule.radius))
-            frame = FRAMES_PER_FINGER * finger + _FRAME[part]
-            body = hardware.LINKS_PER_FINGER * finger + _LINK[part]
-            members.append((frame, body, finger, _FLAGS[part]))
-    return np.array(capsules), np.array(members, dtype=np.int64)
-
-
-_CAPSULES, _MEMBERS = _capsules()
-_WALL = (WALL_RADIUS, WALL_HEIGHT)
-_CENTER, _TURN = slice(0, 3), slice(3, 7)  # of a pose
-
-
-def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
+def overlaps(scene: Scene, *, tolerance: float, enough: float = math.inf) -> tuple[Overlap, ...]:
     """List all pairs of bodies that lie deeper in one another than a tolerance.
 
     Compared are blocks with everything; the middle and lower links of different fingers with one
-    another; both with the floor; the tips with the ring, as in the engines. A block whose center
-    is outside the arena lies in the stage (beyond the ring, at any height) or in the floor (below
-    it). Links of the same finger, and the upper links, cannot collide with anything but blocks.
-    Obstacles cannot move, so that they are not compared with one another, the floor or the ring.
-
-    A block that is a hull is judged by its corners, against the floor and the inner radius of the
-    ring, and by the sides of both bodies elsewhere (see ``sides_depth``): its depth is never
-    underestimated, and it may be reported where only two edges pass one another closely.
+    another; both with the floor and obstacles; the tips with the ring. What has its center beyond
+    the ring has left the arena, and lies in the stage: a block at any height, a tip below the
+    upper end.
 
     Args:
         scene: With complete parameters.
         tolerance: How deep is too deep [m].
+        enough: Where some lie deeper than this in one another, those alone may be listed [m].
 
     Returns:
         One entry for each pair of names, blocks first.
@@ -79,91 +46,54 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
         >>> print(*overlaps(scene, tolerance=1e-4))
         'tool_block' lies 2.5 mm deep in 'floor'
     """
-    structure = scene.structure
-    height = float(scene.parameters["robot", "height"])
-    found = sweep(
-        *_boxes(scene),
-        _CAPSULES,
-        _MEMBERS,
-        *link_frames(scene.state.joint_positions, height),
-        n_fixed=len(structure.obstacles),
-        wall=_WALL,
-        tolerance=float(tolerance),
-    )
-    if not len(found.depths):
-        return ()
-    names = (*structure.blocks, *hardware.LINK_NAMES, *structure.obstacles, "floor", "stage")
-    pairs = zip(found.pairs.tolist(), found.depths.tolist(), strict=True)
-    result = (Overlap((names[i], names[j]), depth) for (i, j), depth in pairs)
-    return tuple(_sharper(scene, result, tolerance) if structure.hulls else result)
+    from scm_world.backends.mujoco import overlaps as engine
+
+    found, state = engine.overlaps(scene, tolerance, enough=enough), scene.state
+    if any(overlap.depth > enough for overlap in found):
+        return found
+    tips = forward(state.joint_positions, float(scene.parameters["robot", "height"])).reshape(3, 3)
+    centers = np.vstack([state.positions, tips])
+    beyond = np.hypot(centers[:, 0], centers[:, 1]) - WALL_RADIUS
+    beyond[len(state.positions) :][tips[:, 2] > WALL_HEIGHT] = 0.0
+    if beyond.max() <= tolerance:
+        return found
+    names = *scene.structure.blocks, *(hardware.link_name(f, 3) for f in hardware.FINGERS)
+    deepest = {overlap.bodies: overlap.depth for overlap in found}
+    for name, depth in zip(names, beyond.tolist(), strict=True):
+        if depth > tolerance:
+            deepest[name, "stage"] = max(depth, deepest.get((name, "stage"), 0.0))
+    return tuple(Overlap(bodies, depth) for bodies, depth in deepest.items())
 
 
-def thin(
-    candidates: Any,
-    blocks: tuple[str, ...],
-    obstacles: tuple[str, ...],
-    before: Iterable[Overlap],
-    tolerances: tuple[float, float],
-) -> None:
-    """Leave out candidates with bodies that lie too deep in one another: first fingers, then all.
+def thin(candidates: Any, limit: float) -> None:
+    """Leave out candidates whose fingers lie deep in one another, or beyond the ring.
+
+    Most draws of the joints are of this kind. What is left has to be looked at with ``overlaps``.
 
     Args:
         candidates: Draws of an intervention.
-        blocks: Names of the blocks, all of them boxes.
-        obstacles: Names of the obstacles.
-        before: What lies in one another already may do so as deep as it does.
-        tolerances: How deep is too deep where a link takes part, and elsewhere [m].
+        limit: How deep is too deep where a link takes part [m].
     """
-    names = (*blocks, *hardware.LINK_NAMES, *obstacles, "floor", "stage")
-    links = slice(len(blocks), len(blocks) + len(hardware.LINK_NAMES))
-    allowed = np.full((len(names), len(names)), tolerances[1])
-    allowed[links] = allowed[:, links] = tolerances[0]
-    for overlap in before:
-        if not set(names).issuperset(overlap.bodies):
-            continue  # it is taken away
-        pair = names.index(overlap.bodies[0]), names.index(overlap.bodies[1])
-        allowed[pair] = max(allowed[pair], overlap.depth + 1e-6)
-    robot = [*range(*links.indices(len(names))), len(names) - 2, len(names) - 1]
-    stages = [((), (), allowed[np.ix_(robot, robot)]), (blocks, obstacles, allowed)]
-    if not blocks and not obstacles:
-        del stages[1:]
-    for some, fixed, depths in stages:
-        joints = candidates.state(slice(0, hardware.N_JOINTS))
-        heights = candidates.parameter(("robot", "height"))
-        n = len(candidates.attempts)
-        frames = np.empty((n, len(hardware.FINGERS) * FRAMES_PER_FINGER, 3))
-        turns = np.empty((*frames.shape[:2], 4))
-        frames_of_rows(np.ascontiguousarray(joints), np.ascontiguousarray(heights), frames, turns)
-        boxes = [*some, *fixed]
-        sizes = _together([candidates.parameter((name, "size")) for name in boxes], 3)
-        firsts = [ROBOT_SIZE + BLOCK_SIZE * index for index in range(len(some))]
-        poses = [candidates.state(slice(first, first + 7)) for first in firsts]
-        centers, orientations = ([pose[:, at] for pose in poses] for at in (_CENTER, _TURN))
-        centers += [candidates.parameter((name, "position")) for name in fixed]
-        orientations += [candidates.parameter((name, "orientation")) for name in fixed]
-        apart = apart_in_rows(
-            sizes,
-            _together(centers, 3),
-            _together(orientations, 4),
-            _CAPSULES,
-            _MEMBERS,
-            frames,
-            turns,
-            len(fixed),
-            _WALL,
-            depths,
+    joints = candidates.state(slice(0, hardware.N_JOINTS))
+    if len(joints) > 1:
+        height = candidates.parameter(("robot", "height"))
+        heights = np.broadcast_to(height, len(joints))
+        candidates.keep(_clear(joints, np.ascontiguousarray(heights), limit))
+
+
+@njit(cache=True)
+def _clear(joints: Floats, heights: Floats, limit: float) -> NDArray[np.bool_]:
+    """Tell of each row of joints whether fingers may be clear of one another and of the ring."""
+    found, tips, none = np.empty(len(joints), dtype=np.bool_), np.empty(9), np.empty((0, 3))
+    for row in range(len(joints)):
+        forward_kernel(joints[row], heights[row], tips)
+        apart = True
+        for x, y, z in tips.reshape(3, 3):
+            apart &= z > WALL_HEIGHT or math.hypot(x, y) - WALL_RADIUS <= limit
+        legs = np.empty((0, 3, 3))
+        found[row] = apart and (
+            deepest_kernel(joints[row], heights[row], none, none, legs) <= limit + BALLS_MARGIN
         )
-        candidates.keep(apart)
-        if not len(candidates.attempts):
-            return
-
-
-def _together(parts: list[Floats], size: int) -> Floats:
-    """Put values of bodies together, shape (n or 1, bodies, size)."""
-    n = max(map(len, parts), default=1)
-    found = np.empty((n, len(parts), size))
-    for index, part in enumerate(parts):
-        found[:, index] = part
     return found
 
 
@@ -174,22 +104,35 @@ def buried_goals(scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         scene: With complete parameters.
         names: Of the goals to look at.
     """
-    found = []
-    for goal in scene.goals:
-        for obstacle in scene.structure.obstacles if goal.name in names else ():
-            if goal.shape == "sphere":
-                size, place, turn = (
-                    scene.parameters[obstacle, what] for what in ("size", "position", "orientation")
-                )
-                center, radius = goal.position, 0.5 * float(goal.size[0])
-                depth = box_capsule(size, place, turn, center, center, radius)
-            else:
-                hull = goal.hull or box_hull(goal.size)
-                body = placed(hull, goal.position, goal.orientation)
-                depth = sides_depth(body, _solid(scene, obstacle))
-            if depth > TOLERANCE:
-                found.append(Overlap((goal.name, obstacle), depth))
+    found, obstacles = list[Overlap](), scene.structure.obstacles
+    goals = [goal for goal in scene.goals if obstacles and goal.name in names]
+    for goal in (goal for goal in goals if goal.shape == "sphere"):
+        inside = (Overlap((goal.name, o), _depth_in_box(goal, scene, o)) for o in obstacles)
+        found += [overlap for overlap in inside if overlap.depth > TOLERANCE]
+    solid = [goal for goal in goals if goal.shape != "sphere"]
+    if solid:  # blocks in the places of goals
+        from scm_world.tasks.trifinger.system import trifinger  # it loads an engine
+
+        hulls = tuple((goal.name, goal.hull) for goal in solid if goal.hull is not None)
+        blocks = tuple(goal.name for goal in solid)
+        there = trifinger(blocks, obstacles=obstacles, hulls=hulls).default_scene()
+        parameters = {**there.parameters, **scene.parameters}
+        parameters |= {(goal.name, "size"): goal.size for goal in solid if goal.hull is None}
+        for pose, goal in zip(there.state.blocks, solid, strict=True):
+            pose[:3], pose[3:7] = goal.position, goal.orientation
+        listed = overlaps(there.with_(parameters=parameters), tolerance=TOLERANCE)
+        found += [overlap for overlap in listed if overlap.bodies[1] in obstacles]
     return tuple(found)
+
+
+def _depth_in_box(goal: GoalRegion, scene: Scene, obstacle: str) -> float:
+    """Measure how far a sphere would have to be moved out of an obstacle [m]."""
+    size, place, turn = (
+        scene.parameters[obstacle, what] for what in ("size", "position", "orientation")
+    )
+    beyond = np.abs((goal.position - place) @ rotation_matrix(turn)) - 0.5 * size
+    distance = np.linalg.norm(np.maximum(beyond, 0.0)) + min(beyond.max(), 0.0)
+    return 0.5 * float(goal.size[0]) - float(distance)
 
 
 def fingers_reach(
@@ -204,73 +147,11 @@ def fingers_reach(
         joints: Of the robot, shape (9,) [rad].
         height: Of its base [m].
     """
-    capsules = [part for parts in _placed_links(joints, height).values() for part in parts]
-    return any(
-        box_capsule(size, position, orientation, p.corners[0], p.corners[1], p.radius) > TOLERANCE
-        for p in capsules
-    )
+    from scm_world.tasks.trifinger.system import trifinger  # it loads an engine
 
-
-def _boxes(scene: Scene) -> tuple[Floats, Floats, Floats]:
-    """Gather sizes, centers and orientations of the boxes: blocks first, then obstacles."""
-    structure, parameters = scene.structure, scene.parameters
-    centers, orientations = compact(scene.state.positions), compact(scene.state.orientations)
-    sizes = {
-        name: parameters[name, "size"] for name in structure.blocks if not structure.hull(name)
-    }
-    for name, hull in structure.hulls:
-        corners, index = np.array(hull.vertices), structure.blocks.index(name)
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        sizes[name] = high - low
-        centers[index] += 0.5 * rotation_matrix(orientations[index]) @ (low + high)
-    fixed = structure.obstacles
-    if fixed:
-        sizes |= {name: parameters[name, "size"] for name in fixed}
-        centers = np.vstack([centers, *(parameters[name, "position"] for name in fixed)])
-        turned = (parameters[name, "orientation"] for name in fixed)
-        orientations = np.vstack([orientations, *turned])
-    return rows([sizes[name] for name in (*structure.blocks, *fixed)], 3), centers, orientations
-
-
-def _sharper(scene: Scene, found: Iterable[Overlap], tolerance: float) -> Iterator[Overlap]:
-    """Judge hulls by their shapes, of which the boxes around them are only bounds."""
-    hulls = {name for name, _ in scene.structure.hulls}
-    links: dict[str, list[Convex]] = {}
-    for overlap in found:
-        first, second = overlap.bodies
-        depth = overlap.depth
-        if hulls & {first, second}:
-            if second in hardware.LINK_NAMES:
-                height = float(scene.parameters["robot", "height"])
-                links = links or _placed_links(scene.state.joint_positions, height)
-                deep = max(sides_depth(_solid(scene, first), part) for part in links[second])
-            elif second in ("floor", "stage"):
-                corners = _solid(scene, first).corners
-                beyond = np.hypot(corners[:, 0], corners[:, 1]) - WALL_RADIUS
-                deep = float((-corners[:, 2] if second == "floor" else beyond).max())
-            else:
-                deep = sides_depth(_solid(scene, first), _solid(scene, second))
-            depth = min(depth, deep)
-        if depth > tolerance:
-            yield Overlap(overlap.bodies, depth)
-
-
-def _solid(scene: Scene, name: str) -> Convex:
-    """Give a block or an obstacle its flat sides."""
-    structure, parameters = scene.structure, scene.parameters
-    hull = structure.hull(name) or box_hull(parameters[name, "size"])
-    if name in structure.obstacles:
-        return placed(hull, parameters[name, "position"], parameters[name, "orientation"])
-    pose = scene.state.blocks[structure.blocks.index(name)]
-    return placed(hull, pose[:3], pose[3:7])
-
-
-def _placed_links(joints: ArrayLike, height: float) -> dict[str, list[Convex]]:
-    """Put the capsules of all links into the world."""
-    origins, orientations = link_frames(joints, height)
-    links: dict[str, list[Convex]] = {}
-    for capsule, (frame, body, *_) in zip(_CAPSULES, _MEMBERS.tolist(), strict=True):
-        ends = origins[frame] + capsule[:6].reshape(2, 3) @ rotation_matrix(orientations[frame]).T
-        part = Convex(ends, np.empty((0, 3)), float(capsule[6]))
-        links.setdefault(hardware.LINK_NAMES[body], []).append(part)
-    return links
+    scene = trifinger(("box",)).default_scene()
+    scene.state.joint_positions[:] = joints
+    scene.state.positions[0], scene.state.orientations[0] = position, orientation
+    parameters = {**scene.parameters, ("box", "size"): size, ("robot", "height"): height}
+    found = overlaps(scene.with_(parameters=parameters), tolerance=TOLERANCE)
+    return any("box" in o.bodies and o.bodies[1] in hardware.LINK_NAMES for o in found)

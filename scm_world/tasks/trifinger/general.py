@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import cache
 from typing import Any, Unpack, final
 
@@ -12,10 +12,11 @@ import numpy as np
 from scm_world._types import Floats, Values
 from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import Common
+from scm_world.tasks.rewards import FRACTION, Common
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import piles
-from scm_world.tasks.trifinger.building import Assembly
+from scm_world.tasks.trifinger import hardware, piles
+from scm_world.tasks.trifinger.base import TriFingerTask
+from scm_world.tasks.trifinger.building import Part, assembled
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
 from scm_world.tasks.trifinger.entities.blocks import ToolBlock
 from scm_world.tasks.trifinger.entities.goals import GoalBlock
@@ -67,24 +68,25 @@ def start(size: Floats, orientation: Floats, *, index: float) -> Floats:
 
 
 @cache
-def block(index: int, *, airborne: bool) -> tuple[ToolBlock, GoalBlock]:
+def block(name: str, *, index: float, airborne: bool) -> tuple[ToolBlock, GoalBlock]:
     """Describe a block, and its place in the pile.
 
     Args:
-        index: Which block.
+        name: Name of the two, without what tells them apart.
+        index: Number of the block.
         airborne: Whether its spaces reach into the air, as in the predecessor.
     """
-    which = {"index": float(index)}
+    which = {"index": index}
     size = ((SIZE,), Function(cube))
     return (
         part_tool(
-            f"tool_{index}",
+            f"tool_{name}",
             size=size,
             spawn=((), Function(start, constants=which)),
             airborne=airborne,
         ),
         part_goal(
-            f"goal_{index}",
+            f"goal_{name}",
             size=size,
             position=((PILE,), Function(piles.part_of, constants=which)),
             orientation=((PILE,), Function(piles.turn_of, constants=which)),
@@ -121,7 +123,7 @@ class Pile(Entity):
 
 
 @final
-class General(Assembly):
+class General(TriFingerTask):
     """Blocks on the floor, and the places where such blocks came to lie that were dropped.
 
     From where they are dropped is a variable: draw it for another goal. What the blocks are like,
@@ -145,6 +147,8 @@ class General(Assembly):
     name = "general"
     decided_by = (COUNT,)
     goal_causes = (COUNT, MASS, SIZE, PLACES, TURNS)
+    default_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
+    rest = hardware.RAISED  # the fingers begin out of the way
 
     def __init__(
         self,
@@ -163,18 +167,15 @@ class General(Assembly):
         """Count the blocks."""
         return int(values[COUNT])
 
-    def parts(self) -> Iterable[tuple[str, dict[str, float]]]:
-        """Number the blocks."""
+    def parts(self) -> Iterable[Part]:
+        """List the blocks."""
         count = self.plan if isinstance(self.plan, int) else self._number
         return ((str(index), {"index": float(index)}) for index in range(count))
 
-    def piece(self, name: str, which: Mapping[str, float]) -> tuple[Entity, Entity]:
-        """Describe a block, and its place in the pile."""
-        return block(int(name), airborne=self.conventions.published_spaces)
-
-    def causes(self) -> Iterable[Entity]:
-        """The pile."""
-        yield Pile(len(self.tools()))
+    def entities(self) -> Iterable[Entity]:
+        """The blocks, the pile, and the places of the blocks in it."""
+        pile, airborne = Pile(len(self.tools)), self.conventions.published_spaces
+        return assembled(self.parts(), block, self.targets, pile, airborne=airborne)
 
     def shared(self) -> Iterable[Variable]:
         """Declare the blocks, and how they are dropped."""

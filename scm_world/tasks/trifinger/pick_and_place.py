@@ -10,10 +10,11 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.conventions import Conventions
 from scm_world.tasks.rewards import FRACTION, term
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import kernels, shapes
+from scm_world.tasks.trifinger import kernels, shapes, shaping
+from scm_world.tasks.trifinger.base import TriFingerTask
+from scm_world.tasks.trifinger.conventions import TriFingerConventions
 from scm_world.tasks.trifinger.entities.goals import goal_position, polar, turned_on_the_floor
 from scm_world.tasks.trifinger.entities.obstacles import Obstacle, obstacle_size, wall_on_the_floor
 from scm_world.tasks.trifinger.shapes import Place
@@ -77,7 +78,7 @@ def stand_across(size: Floats, orientation: Floats, *causes: Value, place: Float
 
 
 @final
-class PickAndPlace(OneBlock):
+class PickAndPlace(TriFingerTask):
     """A wall, a block on one side of it, and a goal of the same size on the other.
 
     The blocks share the parents ``block.size`` and ``wall_side``. Which side the block begins
@@ -110,7 +111,11 @@ class PickAndPlace(OneBlock):
         FRACTION: 0.0,
     }
     paper_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
-    goal_causes = (SIDE, f"{GOAL}.polar", f"{GOAL}.euler_orientation")
+    options = Alike
+    obstacles = (WALL,)
+    ready_terms = shaping.ONE_BLOCK
+    tools, targets = (TOOL,), {GOAL: TOOL}  # a constant
+    goal_causes: tuple[str, ...] = (SIDE, f"{GOAL}.polar", f"{GOAL}.euler_orientation")
 
     def __init__(
         self,
@@ -119,26 +124,24 @@ class PickAndPlace(OneBlock):
         goal_block_position: Place = (0.0, 0.09),
         **options: Unpack[Alike],
     ) -> None:
-        super().__init__(tool_block_position=tool_block_position, **options)
-        self._polar = self.floor_polar(goal_block_position)
-
-    def obstacles(self) -> tuple[str, ...]:
-        """One wall."""
-        return (WALL,)
+        self.block = OneBlock(tool_block_position, options)
+        super().__init__(**self.block.common)
+        self.shape, self.goal_causes = self.block.shape, self.block.causes(self.goal_causes)
+        self._polar = self.block.floor_polar(goal_block_position)
 
     def entities(self) -> Iterable[Entity]:
         """A block, its goal and the wall between them."""
-        yield self.tool(
+        yield self.block.tool(
             spaces=self._sector(TOOL, sign=-1.0),
-            start=Function(stand_across, constants={"place": self.place}),
+            start=Function(stand_across, constants={"place": self.block.place}),
             causes=(SIDE,),
         )
         a, b = (Box((near, ANGLES[0]), (far, ANGLES[1])) for near, far in (RADIUS_A, RADIUS_B))
-        yield self.goal(
+        yield self.block.goal(
             polar(GOAL, self._polar, a=a, b=b),
             goal_position(
                 GOAL,
-                parents=(SIDE, f"{GOAL}.polar", *self.form(GOAL)),
+                parents=(SIDE, f"{GOAL}.polar", *self.block.form(GOAL)),
                 mechanism=Function(goal_across if self.shape is None else hull_across),
             ),
             spaces=self._sector(GOAL, sign=1.0),
@@ -153,7 +156,7 @@ class PickAndPlace(OneBlock):
             name: Of block or goal.
             sign: Of y while the side is 0.
         """
-        height = self.level(name)
+        height = self.block.level(name)
         near, far = ANGLES if sign > 0.0 else (-ANGLES[1], -ANGLES[0])
         low = Switch(parent=SIDE, below=near, above=-far)
         high = Switch(parent=SIDE, below=far, above=-near)
@@ -165,7 +168,7 @@ class PickAndPlace(OneBlock):
 
     def shared(self) -> Iterable[Variable]:
         """One size for both, and on which side of the wall they are."""
-        yield from super().shared()
+        yield from self.block.shared()
         yield numbers.SIDES.root(
             SIDE,
             0,
@@ -192,7 +195,7 @@ class PickAndPlace(OneBlock):
         yield smoothness()
 
 
-def _wall_position(conventions: Conventions) -> Variable:
+def _wall_position(conventions: TriFingerConventions) -> Variable:
     """Stand the wall on the floor; the predecessor's keeps its center when its size changes."""
     name = f"{WALL}.cartesian_position"
     if conventions.published_spaces:

@@ -14,7 +14,8 @@ from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, term
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import kernels
+from scm_world.tasks.trifinger import kernels, shaping
+from scm_world.tasks.trifinger.base import TriFingerTask
 from scm_world.tasks.trifinger.entities.goals import goal_position
 from scm_world.tasks.trifinger.shapes import Place
 from scm_world.tasks.trifinger.single import GOAL, TOOL, Alike, OneBlock, smoothness, tips_to_block
@@ -58,7 +59,7 @@ def above_the_center(cylindrical: Floats) -> Floats:
 
 
 @final
-class Picking(OneBlock):
+class Picking(TriFingerTask):
     """A block on the floor, and a goal of the same size in the air above its place.
 
     The blocks share the parent ``block.size``. How high the goal is does not depend on it.
@@ -93,7 +94,10 @@ class Picking(OneBlock):
         "reward.smoothness": 0.005,
         FRACTION: 1.0,
     }
-    goal_causes = (HEIGHT,)
+    options = Alike
+    ready_terms = shaping.ONE_BLOCK
+    tools, targets = (TOOL,), {GOAL: TOOL}  # a constant
+    goal_causes: tuple[str, ...] = (HEIGHT,)
 
     def __init__(
         self,
@@ -102,18 +106,24 @@ class Picking(OneBlock):
         goal_height: float = 0.15,
         **options: Unpack[Alike],
     ) -> None:
-        super().__init__(tool_block_position=tool_block_position, **options)
+        self.block = OneBlock(tool_block_position, options)
+        super().__init__(**self.block.common)
+        self.shape, self.goal_causes = self.block.shape, self.block.causes(self.goal_causes)
         self._height = checked("goal_height", goal_height, HEIGHT_BOUNDS)
+
+    def shared(self) -> Iterable[Variable]:
+        """One size, or one shape, for both."""
+        return self.block.shared()
 
     def entities(self) -> Iterable[Entity]:
         """A block and its goal."""
         published = self.conventions.published_spaces
-        center = (*self.place[:2], self.place[2] + self._below(TOOL))
-        yield self.tool(
-            spaces=self.spaces(TOOL, airborne=published),
+        center = (*self.block.place[:2], self.block.place[2] + self.block.below(TOOL))
+        yield self.block.tool(
+            spaces=self.block.spaces(TOOL, airborne=published),
             start=Function(put, constants={"center": center}) if published else None,
         )
-        yield self.goal(
+        yield self.block.goal(
             Exogenous(
                 name=HEIGHT,
                 unit="m",
@@ -126,7 +136,7 @@ class Picking(OneBlock):
             goal_position(
                 GOAL,
                 parents=(HEIGHT,),
-                mechanism=Function(lifted, constants={"place": self.place[:2]}),
+                mechanism=Function(lifted, constants={"place": self.block.place[:2]}),
             ),
             spaces=self._above(),
             inverse=above_the_center if published else from_cylindrical,
@@ -143,7 +153,7 @@ class Picking(OneBlock):
                 numbers.cylindrical(numbers.RADIUS_A, *HEIGHT_A),
                 numbers.cylindrical(numbers.RADIUS_B, *HEIGHT_B),
             )
-        x, y, _ = self.place
+        x, y, _ = self.block.place
         radius, angle = math.hypot(x, y), math.atan2(y, x)
         low, high = (angle, angle) if radius > 0.0 else (-math.pi, math.pi)
         a, b = (

@@ -10,7 +10,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
-from scm_world.tasks.base import Blind, kept_rows
+from scm_world.tasks.base import OpenLoopPolicy, kept_rows
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping import Feedback
 from scm_world.tasks.trifinger.kinematics import forward, inverse
@@ -21,7 +21,7 @@ ACROSS = ((0.25, 0.12, 0.0), (1.0, -0.11, 0.0))
 
 
 @final
-class Sweep(Blind):
+class Sweep(OpenLoopPolicy):
     """The fingertips sweep over the floor to its middle, and stay there.
 
     What lies in their way is pushed. It depends on nothing but the control step, so that it adds

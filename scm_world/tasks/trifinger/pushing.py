@@ -8,7 +8,8 @@ from typing import Unpack, final
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import term
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import kernels, shapes
+from scm_world.tasks.trifinger import kernels, shapes, shaping
+from scm_world.tasks.trifinger.base import TriFingerTask
 from scm_world.tasks.trifinger.entities.goals import goal_position, polar, turned_on_the_floor
 from scm_world.tasks.trifinger.shapes import Place
 from scm_world.tasks.trifinger.single import GOAL, TOOL, Alike, OneBlock, tips_to_block, turned
@@ -16,7 +17,7 @@ from scm_world.variables import Function, Parent, Variable
 
 
 @final
-class Pushing(OneBlock):
+class Pushing(TriFingerTask):
     """One tool block and one goal block of the same size, both on the floor.
 
     The blocks share the parent ``block.size``. An intervention on it keeps them alike; one on
@@ -43,7 +44,10 @@ class Pushing(OneBlock):
         "fractional_success": 1.0,
     }
     paper_weights = {"reward.orientation": 0.0}  # noqa: RUF012 # a constant
-    goal_causes = ("goal_block.polar", "goal_block.euler_orientation")
+    options = Alike
+    ready_terms = shaping.ONE_BLOCK
+    tools, targets = (TOOL,), {GOAL: TOOL}  # a constant
+    goal_causes: tuple[str, ...] = ("goal_block.polar", "goal_block.euler_orientation")
 
     def __init__(
         self,
@@ -52,19 +56,25 @@ class Pushing(OneBlock):
         goal_block_position: Place = (0.0, 0.08),
         **options: Unpack[Alike],
     ) -> None:
-        super().__init__(tool_block_position=tool_block_position, **options)
-        self._polar = self.floor_polar(goal_block_position)
+        self.block = OneBlock(tool_block_position, options)
+        super().__init__(**self.block.common)
+        self.shape, self.goal_causes = self.block.shape, self.block.causes(self.goal_causes)
+        self._polar = self.block.floor_polar(goal_block_position)
+
+    def shared(self) -> Iterable[Variable]:
+        """One size, or one shape, for both."""
+        return self.block.shared()
 
     def entities(self) -> Iterable[Entity]:
         """A block and its goal."""
-        yield self.tool(spaces=self.spaces(TOOL))
+        yield self.block.tool(spaces=self.block.spaces(TOOL))
         rests = turned_on_the_floor if self.shape is None else shapes.hull_on_the_floor
-        yield self.goal(
+        yield self.block.goal(
             polar(GOAL, self._polar, a=numbers.POLAR_A, b=numbers.POLAR_B),
             goal_position(
-                GOAL, parents=(f"{GOAL}.polar", *self.form(GOAL)), mechanism=Function(rests)
+                GOAL, parents=(f"{GOAL}.polar", *self.block.form(GOAL)), mechanism=Function(rests)
             ),
-            spaces=self.spaces(GOAL),
+            spaces=self.block.spaces(GOAL),
         )
 
     def dense(self) -> Iterable[Variable]:

@@ -11,7 +11,7 @@ from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.geometry.scalars import fused, scalar
-from scm_world.tasks.base import Observed, checked
+from scm_world.tasks.base import Goal, Observed, checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, term
 from scm_world.tasks.trifinger import catalogue as numbers
@@ -77,8 +77,8 @@ class Reaching(TriFingerTask):
 
     Args:
         default_goal_60: Default goal of the first finger [m].
-        default_goal_120: Of the second.
-        default_goal_300: Of the third.
+        default_goal_120: Default goal of the second finger [m].
+        default_goal_300: Default goal of the third finger [m].
         number_of_obstacles: How many small boxes are in the way.
         common: Options of every task; see ``Common``.
     """
@@ -189,22 +189,23 @@ class Reaching(TriFingerTask):
         for name in obstacle_names(self._obstacles()):
             yield from observe_obstacle(name)
 
-    def goal_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Name the tips and their goals, nine numbers each [m]."""
-        return ("end_effector_positions",), _positions()
-
-    def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
-        """Compute how near tips are to their goals, shape (...)."""
-        error = np.abs(np.asarray(achieved) - np.asarray(desired)).mean(axis=-1)
-        return np.asarray(1.0 - (np.clip(error, REACHED, FAR) - REACHED) / (FAR - REACHED))
-
-    def fulfilled(self, fraction: ArrayLike) -> Value:
-        """Tell whether all tips are there."""
-        return np.asarray(fraction) >= 1.0
+    @property
+    def goal(self) -> Goal:
+        """The tips should be at their goals, nine numbers each [m]."""
+        return Goal(
+            achieved=("end_effector_positions",),
+            desired=_positions(),
+            causes=self.goal_causes,
+            measures={
+                "reach_error": error_of,
+                FRACTION: fraction_of,
+                SUCCESS: lambda tips, goals: fraction_of(tips, goals) >= 1.0,
+            },
+        )
 
     def solution(self, values: Values) -> dict[str, Value]:
         """Put the joints where the tips are at their goals, as far as they reach."""
-        desired = self.goals(values)[1]
+        desired = self.goal.vectors(values)[1]
         height = float(values["robot_height"])
         found = inverse(desired, height, np.asarray(values["joint_positions"]))
         return {"joint_positions": found.joint_positions}
@@ -221,6 +222,18 @@ class Reaching(TriFingerTask):
             )
             for name in GOALS
         }
+
+
+def error_of(tips: ArrayLike, goals: ArrayLike) -> Floats:
+    """Compute the mean absolute error of coordinates, shape (...) [m]."""
+    return np.asarray(np.abs(np.asarray(tips) - np.asarray(goals)).mean(axis=-1))
+
+
+def fraction_of(tips: ArrayLike, goals: ArrayLike) -> Floats:
+    """Compute how near tips are to their goals, in [0, 1], shape (...)."""
+    return np.asarray(
+        1.0 - (np.clip(error_of(tips, goals), REACHED, FAR) - REACHED) / (FAR - REACHED)
+    )
 
 
 def _positions() -> tuple[str, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import InterventionError
-from scm_world.tasks.base import Dice, Scenario
+from scm_world.tasks.base import ProbeGenerator, Scenario
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import WALL_RADIUS
@@ -46,7 +46,7 @@ def sizes(world: Any) -> Floats:
 
 def touched(
     world: Any,
-    dice: Dice,
+    rng: ProbeGenerator,
     middle: Floats,
     bottom: float,
     *,
@@ -57,7 +57,7 @@ def touched(
 
     Args:
         world: Where.
-        dice: Random numbers.
+        rng: Random numbers of the probe.
         middle: x and y of its center [m].
         bottom: Height of its lower face [m].
         heights: Between which parts of its height it is touched.
@@ -67,33 +67,35 @@ def touched(
         States to set, the direction in which each finger stands [rad], and their height [m].
     """
     name, size = world.composition.blocks[0], sizes(world)[0]
-    angles = facing(dice)
-    height = bottom + dice.between(*heights) * size[2]
+    angles = facing(rng)
+    height = bottom + rng.uniform(*heights) * size[2]
     states = {
         f"{name}.cartesian_position": np.array([*middle, bottom + size[2] / 2]),
-        f"{name}.euler_orientation": np.array([0.0, 0.0, dice.between(-yaw, yaw)]),
+        f"{name}.euler_orientation": np.array([0.0, 0.0, rng.uniform(-yaw, yaw)]),
         "joint_positions": gripping(world, middle, beyond_corners(size), angles, height),
     }
     return states, angles, height
 
 
-def pressed(world: Any, dice: Dice, middle: Floats, bottom: float, count: int = HIGHEST) -> Setting:
+def pressed(
+    world: Any, rng: ProbeGenerator, middle: Floats, bottom: float, count: int = HIGHEST
+) -> Setting:
     """Stack the first blocks and let the fingers press on one of them that they reach."""
     edges = sizes(world)[:HIGHEST][:count]
-    states = stacked(world, dice, middle, bottom, count=count)
+    states = stacked(world, rng, middle, bottom, count=count)
     middles = bottom + np.cumsum(edges[:, 2]) - edges[:, 2] / 2
     which = int(np.flatnonzero(middles >= min(REACH, middles[-1]))[0])
-    height = float(middles[which]) + dice.between(-0.2, 0.2) * edges[which, 2]
-    angles = facing(dice)
+    height = float(middles[which]) + rng.uniform(-0.2, 0.2) * edges[which, 2]
+    angles = facing(rng)
     reach = beyond_faces(edges[which], angles)
     states["joint_positions"] = gripping(world, middle, reach, angles, height)
     center = np.array([*middle, 0.0])
-    return states, around(center, dice.between(0.0, 0.01), angles + 0.4, height - 0.01)
+    return states, around(center, rng.uniform(0.0, 0.01), angles + 0.4, height - 0.01)
 
 
 def stacked(
     world: Any,
-    dice: Dice,
+    rng: ProbeGenerator,
     middle: Floats,
     bottom: float,
     yaw: float = 0.0,
@@ -103,28 +105,28 @@ def stacked(
     states: dict[str, Value] = {}
     names = world.composition.blocks[:HIGHEST][:count]
     for name, size in zip(names, sizes(world), strict=False):
-        place = middle + dice.between(-0.001, 0.001, 2)
-        turn = yaw + dice.between(-0.05, 0.05)
+        place = middle + rng.uniform(-0.001, 0.001, 2)
+        turn = yaw + rng.uniform(-0.05, 0.05)
         states[f"{name}.cartesian_position"] = np.array([*place, bottom + size[2] / 2])
         states[f"{name}.euler_orientation"] = np.array([0.0, 0.0, turn])
         bottom += size[2]
     return states
 
 
-def out_of_the_way(world: Any, dice: Dice) -> dict[str, Value]:
+def out_of_the_way(world: Any, rng: ProbeGenerator) -> dict[str, Value]:
     """Stack the blocks in the middle, unless an obstacle may stand there."""
     if world.composition.obstacles:
         return {}
-    return stacked(world, dice, np.zeros(2), 0.0)
+    return stacked(world, rng, np.zeros(2), 0.0)
 
 
 # --- where fingers are --------------------------------------------------------------------------
 
 
-def facing(dice: Dice) -> Floats:
+def facing(rng: ProbeGenerator) -> Floats:
     """Give the direction in which each finger stands, with a little spread [rad]."""
     tips = np.array([[-0.05945, 0.15864], [0.16711, -0.02783], [-0.10766, -0.13080]])
-    directions: Floats = np.arctan2(tips[:, 1], tips[:, 0]) + dice.between(-0.2, 0.2, 3)
+    directions: Floats = np.arctan2(tips[:, 1], tips[:, 0]) + rng.uniform(-0.2, 0.2, 3)
     return directions
 
 
@@ -194,151 +196,151 @@ PLACES = "obstacle_places"
 # --- one block, or none -------------------------------------------------------------------------
 
 
-def touch(world: Any, dice: Dice) -> Setting:
+def touch(world: Any, rng: ProbeGenerator) -> Setting:
     """Stand the first block amid the fingers and let all three press on it."""
-    middle = dice.between(-0.02, 0.02, 2)
-    states, angles, _ = touched(world, dice, middle, 0.0, heights=(0.3, 0.8), yaw=0.8)
+    middle = rng.uniform(-0.02, 0.02, 2)
+    states, angles, _ = touched(world, rng, middle, 0.0, heights=(0.3, 0.8), yaw=0.8)
     center = np.array([*middle, 0.0])
-    drive = around(center, dice.between(0.0, 0.02), angles + 0.4, dice.between(0.01, 0.06))
+    drive = around(center, rng.uniform(0.0, 0.02), angles + 0.4, rng.uniform(0.01, 0.06))
     return states, drive
 
 
-def on_obstacle(world: Any, dice: Dice) -> Setting:
+def on_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
     """Stand the blocks on the first obstacle and let all three fingers press on one."""
     obstacle = world.composition.obstacles[0]
     center = world[f"{obstacle}.cartesian_position"]
     bottom = float(center[2] + world[f"{obstacle}.size"][2] / 2)
-    middle = center[:2] + dice.between(-0.002, 0.002, 2)
+    middle = center[:2] + rng.uniform(-0.002, 0.002, 2)
     if len(world.composition.blocks) > 1:
-        return pressed(world, dice, middle, bottom)
-    states, angles, height = touched(world, dice, middle, bottom, heights=(0.4, 0.7), yaw=0.1)
+        return pressed(world, rng, middle, bottom)
+    states, angles, height = touched(world, rng, middle, bottom, heights=(0.4, 0.7), yaw=0.1)
     center = np.array([*middle, 0.0])
-    return states, around(center, dice.between(0.0, 0.02), angles + 0.4, height - 0.02)
+    return states, around(center, rng.uniform(0.0, 0.02), angles + 0.4, height - 0.02)
 
 
-def block_in_air(world: Any, dice: Dice) -> Setting:
+def block_in_air(world: Any, rng: ProbeGenerator) -> Setting:
     """Let the first block fall and tumble."""
     name = world.composition.blocks[0]
     states = {
-        f"{name}.cartesian_position": np.array([*dice.between(-0.03, 0.03, 2), 0.06]),
-        f"{name}.euler_orientation": dice.between(-0.7, 0.7, 3),
-        f"{name}.linear_velocity": dice.between(-0.3, 0.3, 3),
-        f"{name}.angular_velocity": dice.between(-8.0, 8.0, 3),
+        f"{name}.cartesian_position": np.array([*rng.uniform(-0.03, 0.03, 2), 0.06]),
+        f"{name}.euler_orientation": rng.uniform(-0.7, 0.7, 3),
+        f"{name}.linear_velocity": rng.uniform(-0.3, 0.3, 3),
+        f"{name}.angular_velocity": rng.uniform(-8.0, 8.0, 3),
     }
     return states, present_tips(world)
 
 
-def free(world: Any, dice: Dice) -> Setting:
+def free(world: Any, rng: ProbeGenerator) -> Setting:
     """Change nothing; the robot drives somewhere."""
-    return {}, present_tips(world) + dice.between(-0.05, 0.05, 9)
+    return {}, present_tips(world) + rng.uniform(-0.05, 0.05, 9)
 
 
-def finger_on_floor(world: Any, dice: Dice) -> Setting:
+def finger_on_floor(world: Any, rng: ProbeGenerator) -> Setting:
     """Put the fingertips on the floor and let them rub it."""
-    angles, center = facing(dice), np.zeros(3)
-    radius = dice.between(0.1, 0.13)
+    angles, center = facing(rng), np.zeros(3)
+    radius = rng.uniform(0.1, 0.13)
     states = {"joint_positions": joints_for(world, around(center, radius, angles, TIP + CLEARANCE))}
-    states.update(out_of_the_way(world, dice))
+    states.update(out_of_the_way(world, rng))
     return states, around(center, radius - 0.02, angles + 0.2, -0.02)
 
 
-def finger_at_wall(world: Any, dice: Dice) -> Setting:
+def finger_at_wall(world: Any, rng: ProbeGenerator) -> Setting:
     """Put the fingertips at the ring wall and let them rub it."""
-    angles, center = facing(dice), np.zeros(3)
+    angles, center = facing(rng), np.zeros(3)
     inside = WALL_RADIUS - TIP - 3e-3
-    height = dice.between(0.08, 0.14)
+    height = rng.uniform(0.08, 0.14)
     states = {"joint_positions": joints_for(world, around(center, inside, angles, height))}
-    states.update(out_of_the_way(world, dice))
+    states.update(out_of_the_way(world, rng))
     return states, around(center, WALL_RADIUS + 0.03, angles + 0.15, height + 0.02)
 
 
-def fingers_together(world: Any, dice: Dice) -> Setting:
+def fingers_together(world: Any, rng: ProbeGenerator) -> Setting:
     """Put the fingertips side by side in the middle and let them press on one another."""
-    angles, center = facing(dice), np.array([*dice.between(-0.02, 0.02, 2), 0.0])
-    radius, height = 1.3 * TIP, dice.between(0.05, 0.1)
+    angles, center = facing(rng), np.array([*rng.uniform(-0.02, 0.02, 2), 0.0])
+    radius, height = 1.3 * TIP, rng.uniform(0.05, 0.1)
     states = {"joint_positions": joints_for(world, around(center, radius, angles, height))}
-    states.update(out_of_the_way(world, dice))
-    return states, around(center, 0.0, angles, height + dice.between(-0.02, 0.02))
+    states.update(out_of_the_way(world, rng))
+    return states, around(center, 0.0, angles, height + rng.uniform(-0.02, 0.02))
 
 
 # --- all blocks ---------------------------------------------------------------------------------
 
 
-def tower(world: Any, dice: Dice) -> Setting:
+def tower(world: Any, rng: ProbeGenerator) -> Setting:
     """Stand the blocks on one another and let the fingers press on one of them."""
-    return pressed(world, dice, dice.between(-0.01, 0.01, 2), 0.0)
+    return pressed(world, rng, rng.uniform(-0.01, 0.01, 2), 0.0)
 
 
-def block_at_wall(world: Any, dice: Dice) -> Setting:
+def block_at_wall(world: Any, rng: ProbeGenerator) -> Setting:
     """Let the blocks slide along the wall, on one another."""
     size = sizes(world)[0]
-    angle = dice.between(-np.pi, np.pi)
+    angle = rng.uniform(-np.pi, np.pi)
     out, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     radius = np.sqrt((WALL_RADIUS - 3e-3) ** 2 - (size[1] / 2) ** 2) - size[0] / 2
-    velocity = 0.6 * out + dice.between(0.2, 0.5) * along
+    velocity = 0.6 * out + rng.uniform(0.2, 0.5) * along
     several = len(world.composition.blocks) > 1
     inward = 4e-3 if several else 0.0  # they are not quite straight
-    states = stacked(world, dice, (radius - inward) * out, CLEARANCE, angle)
+    states = stacked(world, rng, (radius - inward) * out, CLEARANCE, angle)
     for name in world.composition.blocks[:HIGHEST]:
         states[f"{name}.linear_velocity"] = np.array([*velocity, 0.0])
     return states, present_tips(world)
 
 
-def solved(world: Any, dice: Dice) -> Setting:
+def solved(world: Any, rng: ProbeGenerator) -> Setting:
     """Begin where the goal is fulfilled."""
     return world.task.solution(world.values()), present_tips(world)
 
 
-def leaving(world: Any, dice: Dice) -> Setting:
+def leaving(world: Any, rng: ProbeGenerator) -> Setting:
     """Begin where the goal is fulfilled, with the blocks on their way up."""
     states = world.task.solution(world.values())
     for name in world.composition.blocks:
-        up = dice.between(0.4, 0.7)
-        states[f"{name}.linear_velocity"] = np.array([*dice.between(-0.3, 0.3, 2), up])
+        up = rng.uniform(0.4, 0.7)
+        states[f"{name}.linear_velocity"] = np.array([*rng.uniform(-0.3, 0.3, 2), up])
     return states, present_tips(world)
 
 
 # --- what may come into being -------------------------------------------------------------------
 
 
-def on_newcomer(world: Any, dice: Dice) -> Setting:
+def on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
     """Stand some blocks where a further one would come into being, and press on one of them.
 
     High towers may be out of the fingers' reach there, so how many there are is drawn.
     """
     place = _newcomer(world)
     if place is None:
-        return tower(world, dice)
-    some = 1 + int(dice.between(0.0, min(HIGHEST, len(world.composition.blocks))))
-    return pressed(world, dice, place[:2], place[2], some)
+        return tower(world, rng)
+    some = 1 + int(rng.uniform(0.0, min(HIGHEST, len(world.composition.blocks))))
+    return pressed(world, rng, place[:2], place[2], some)
 
 
-def all_on_newcomer(world: Any, dice: Dice) -> Setting:
+def all_on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
     """Stand all blocks where a further one would come into being; the robot stays where it is."""
     place = _newcomer(world)
     if place is None:
-        return tower(world, dice)
-    return stacked(world, dice, place[:2], place[2]), present_tips(world)
+        return tower(world, rng)
+    return stacked(world, rng, place[:2], place[2]), present_tips(world)
 
 
-def on_coming_obstacle(world: Any, dice: Dice) -> Setting:
+def on_coming_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
     """Say that the next obstacle comes to lie in the middle, and press on blocks above it."""
     places, here = np.array(world[PLACES]), len(world.composition.obstacles)
     edge = numbers.OBSTACLE_SIZE[2]
-    middle = dice.between(-0.01, 0.01, 2)
+    middle = rng.uniform(-0.01, 0.01, 2)
     places[here] = [*middle, edge / 2]
-    states, drive = pressed(world, dice, middle, edge)
+    states, drive = pressed(world, rng, middle, edge)
     return {PLACES: places, **states}, drive
 
 
-def obstacle_ahead(world: Any, dice: Dice) -> Setting:
+def obstacle_ahead(world: Any, rng: ProbeGenerator) -> Setting:
     """Say that obstacles, should there be any, are where the fingers are about to go."""
     tips = present_tips(world).reshape(3, 3)
     places = np.array(world[PLACES])
     inward = -tips * [1.0, 1.0, 0.0] / np.linalg.norm(tips[:, :2], axis=1, keepdims=True)
     each = bool(world.compiled.bundles)  # then it matters in front of which finger one comes
-    ahead = tips + inward * (TIP + dice.between(0.0056, 0.008 if each else 0.006))
-    places[:3] = np.roll(ahead, int(dice.between(0.0, 3.0)), axis=0) if each else ahead
+    ahead = tips + inward * (TIP + rng.uniform(0.0056, 0.008 if each else 0.006))
+    places[:3] = np.roll(ahead, int(rng.uniform(0.0, 3.0)), axis=0) if each else ahead
     return {PLACES: places}, (tips + 0.05 * inward).ravel()
 
 
@@ -359,7 +361,7 @@ def _newcomer(world: Any) -> Floats | None:
 
 # --- which there are ----------------------------------------------------------------------------
 
-Kind = tuple[Callable[[Any, Dice], Setting], int | None]
+Kind = tuple[Callable[[Any, ProbeGenerator], Setting], int | None]
 """How a state is prepared, and how many control steps are then taken; see ``Scenario``."""
 
 _WITHOUT_BLOCKS: tuple[Kind, ...] = (
@@ -404,11 +406,11 @@ def scenarios(world: Any) -> tuple[Scenario, ...]:
     return tuple(Scenario(prepare.__name__, prepare, driven, steps) for prepare, steps in found)
 
 
-def driven(world: Any, drive: Floats, dice: Dice) -> Floats:
+def driven(world: Any, drive: Floats, rng: ProbeGenerator) -> Floats:
     """Turn fingertip positions into an action of the world's mode, with a little variety."""
     if world.action_mode == "end_effector_positions":
-        return np.asarray(drive + dice.between(-0.005, 0.005, 9))
-    joints = joints_for(world, drive) + dice.between(-0.05, 0.05, 9)
+        return np.asarray(drive + rng.uniform(-0.005, 0.005, 9))
+    joints = joints_for(world, drive) + rng.uniform(-0.05, 0.05, 9)
     if world.action_mode == "joint_positions":
         return np.asarray(joints)
     return np.asarray(np.clip(5.0 * (joints - np.array(world["joint_positions"])), -0.3, 0.3))

@@ -16,7 +16,7 @@ from scm_world.geometry import (
     rotation_matrix,
 )
 from scm_world.geometry.hulls import Hull, hull_of, hull_overlap
-from scm_world.tasks.base import numbers_of
+from scm_world.tasks.base import finite_numbers
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
 from scm_world.tasks.trifinger.entities.blocks import ToolBlock, block_mass
@@ -259,7 +259,7 @@ def unit_quaternion(option: str, orientation: Quaternion) -> Quaternion:
     Raises:
         UnknownOption: These are not four numbers, or they are all zero.
     """
-    given = numbers_of(orientation)
+    given = finite_numbers(orientation)
     if given is None or given.shape != (4,) or not given.any():
         raise UnknownOption(option, orientation, ("a quaternion x, y, z, w",))
     x, y, z, w = canonical(given).tolist()
@@ -280,7 +280,7 @@ def turn_of(option: str, orientation: Quaternion, hull: Hull | None) -> Quaterni
 
 
 def _checked(option: str, place: Place) -> tuple[float, ...]:
-    point = numbers_of(place)
+    point = finite_numbers(place)
     if point is None or point.shape not in ((2,), (3,)):
         raise UnknownOption(option, place, ("x, y", "x, y, z [m]"))
     return tuple(point.tolist())

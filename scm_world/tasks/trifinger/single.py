@@ -1,29 +1,27 @@
-"""What the tasks have in common in which one block should fill one goal of its shape."""
+"""One block that should fill one goal of its shape."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, Unpack
+from typing import Any, final
 
 import numpy as np
 
-from scm_world._types import ArrayLike, Floats, Values
+from scm_world._types import Floats
 from scm_world.errors import ModelError
 from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.hulls import Hull, extents
 from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, UNIT, Common, term
+from scm_world.tasks.rewards import Common, term
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import kernels, shapes, shaping
-from scm_world.tasks.trifinger.building import Building
+from scm_world.tasks.trifinger import kernels, shapes
 from scm_world.tasks.trifinger.entities.blocks import ToolBlock, block_mass, block_size, hull_size
 from scm_world.tasks.trifinger.entities.goals import GoalBlock, goal_orientation
 from scm_world.tasks.trifinger.reaching import minus_change
 from scm_world.tasks.trifinger.shapes import Place, Quaternion
-from scm_world.variables import Box, Draw, Function, Measured, Parent, Variable
-from scm_world.variables.kinds import SpaceName
+from scm_world.variables import Box, Function, Measured, Parent, Variable
 from scm_world.variables.spaces import Bound
 
 SIZE = "block.size"
@@ -35,7 +33,7 @@ class Alike(Common, total=False):
     """Options of tasks with one block and one goal, in addition to those of every task.
 
     Attributes:
-        shape: Of block and goal; a box if None. The size of a shape cannot change.
+        shape: Shape of block and goal; a box if None. The size of a shape cannot change.
         tool_block_mass: Default mass of the block [kg].
         tool_block_orientation: How it begins: quaternion (x, y, z, w). A shape is turned by so
             much from the way its points were given.
@@ -49,51 +47,48 @@ class Alike(Common, total=False):
     goal_block_orientation: Quaternion
 
 
-class OneBlock(Building):
-    """A task with one block and one goal of the same shape.
+@final
+class OneBlock:
+    """A block and a goal of the same shape.
 
     Args:
         tool_block_position: Where the center of the block begins: x and y if it stands on the
             floor, or x, y and z [m].
-        shape: See ``Alike``, also for what follows.
-        tool_block_mass: [kg].
-        tool_block_orientation: Quaternion.
-        goal_block_orientation: Quaternion.
-        common: Options of every task; see ``Common``.
+        options: Options of the task.
 
     Attributes:
-        shape: Of block and goal; None for a box.
+        common: The options that every task has.
+        shape: Shape of block and goal; None for a box.
         place: x and y of the block at the start, and the height of its lowest point [m].
     """
 
-    ready_terms = shaping.ONE_BLOCK
-
-    def __init__(
-        self,
-        *,
-        tool_block_position: Place,
-        shape: Hull | None = None,
-        tool_block_mass: float = numbers.BLOCK_MASS,
-        tool_block_orientation: Quaternion = numbers.IDENTITY,
-        goal_block_orientation: Quaternion = numbers.IDENTITY,
-        **common: Unpack[Common],
-    ) -> None:
-        super().__init__(**common)
+    def __init__(self, tool_block_position: Place, options: Alike) -> None:
+        self.common: Any = dict(options)
+        shape = self.common.pop("shape", None)
         if not (shape is None or isinstance(shape, Hull)):
             raise ModelError(
                 [f"shape must be a Hull: load_hull(path) or hull_of(points); {shape!r}"]
             )
-        self.shape = shape
-        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASSES.bounds)
+        self.shape: Hull | None = shape
+        mass = self.common.pop("tool_block_mass", numbers.BLOCK_MASS)
+        self._mass = checked("tool_block_mass", mass, numbers.BLOCK_MASSES.bounds)
         self._turns = {
-            TOOL: shapes.turn_of("tool_block_orientation", tool_block_orientation, shape),
-            GOAL: shapes.turn_of("goal_block_orientation", goal_block_orientation, shape),
+            name: shapes.turn_of(option, self.common.pop(option, numbers.IDENTITY), shape)
+            for name, option in (
+                (TOOL, "tool_block_orientation"),
+                (GOAL, "goal_block_orientation"),
+            )
         }
         self.place = shapes.start_place(
-            "tool_block_position", tool_block_position, self._below(TOOL)
+            "tool_block_position", tool_block_position, self.below(TOOL)
         )
 
-    def _below(self, name: str) -> float:
+    def causes(self, box: Iterable[str]) -> tuple[str, ...]:
+        """Return the variables that a goal is drawn for; a hull turns about the vertical only."""
+        turns = {} if self.shape is None else {f"{GOAL}.euler_orientation": f"{GOAL}.yaw"}
+        return tuple(turns.get(name, name) for name in box)
+
+    def below(self, name: str) -> float:
         """Compute how far block or goal reaches below its center as it begins [m]."""
         corners = () if self.shape is None else (np.array(self.shape.vertices),)
         size, turn = np.array(numbers.BLOCK_SIZE), np.array(self._turns[name])
@@ -101,16 +96,8 @@ class OneBlock(Building):
 
     def floor_polar(self, place: Place) -> tuple[float, float]:
         """Turn the place of a goal on the floor into radius [m] and angle [rad]."""
-        x, y = shapes.floor_place("goal_block_position", place, self._below(GOAL))
+        x, y = shapes.floor_place("goal_block_position", place, self.below(GOAL))
         return math.hypot(x, y), math.atan2(y, x)
-
-    def tools(self) -> tuple[str, ...]:
-        """One block."""
-        return (TOOL,)
-
-    def targets(self) -> dict[str, str]:
-        """One goal."""
-        return {GOAL: TOOL}
 
     def shared(self) -> Iterable[Variable]:
         """One size for both, or one shape."""
@@ -189,61 +176,20 @@ class OneBlock(Building):
             turn = Function(shapes.about_z, constants={"rest": rest})
             yield from (yaw, goal_orientation(GOAL, parents=(yaw.name,), mechanism=turn))
 
-    def sample_goal(self, space: SpaceName = "A") -> dict[str, Any]:
-        """Draw a new goal; one that is a shape is turned about the vertical only."""
-        drawn = super().sample_goal(space)
-        if self.shape is not None and drawn.pop(f"{GOAL}.euler_orientation", None):
-            drawn[f"{GOAL}.yaw"] = Draw(space)
-        return drawn
-
     def level(self, name: str) -> Bound:
-        """Give the height of the center of block or goal on the floor, as a bound of a space."""
+        """Return the height of the center of block or goal on the floor, as a bound of a space."""
         return shapes.level(f"{name}.size", self.shape, self._turns[name])
 
     def spaces(self, name: str, *, airborne: bool = False) -> tuple[Box, Box]:
-        """Give the spaces A and B of the cylindrical position of block or goal.
+        """Return the spaces A and B of the cylindrical position of block or goal.
 
         Args:
-            name: Which.
+            name: ``TOOL`` or ``GOAL``.
             airborne: Whether it may be in the air.
         """
         return shapes.block_spaces(
             f"{name}.size", airborne=airborne, hull=self.shape, rest=self._turns[name]
         )
-
-    def fractional_success(self) -> Measured:
-        """Declare how much of the goal is filled."""
-        if self.shape is None:
-            return super().fractional_success()
-        exact, parts = not self.conventions.aligned_boxes, ("vertices", *_POSE)
-        return Measured(
-            name=FRACTION,
-            bounds=UNIT if exact else None,
-            parents=tuple(f"{body}.{part}" for body in (TOOL, GOAL) for part in parts),
-            mechanism=Function(shapes.hull_filled if exact else shapes.hull_aligned),
-            doc="Fraction of the volume of the goal that the block fills.",
-        )
-
-    def view(self) -> tuple[tuple[str, ...], int, Callable[[Values], Floats]] | None:
-        """Describe what a hand sees of the block, if that is a box."""
-        return super().view() if self.shape is None else None
-
-    def _fraction(self, achieved: ArrayLike, desired: ArrayLike, *, aligned: bool) -> Floats:
-        if self.shape is None:
-            return super()._fraction(achieved, desired, aligned=aligned)
-        overlap = shapes.hull_aligned if aligned else shapes.hull_filled
-        corners = np.array(self.shape.vertices)
-
-        def filled(have: Floats, want: Floats) -> float:
-            poses = ((corners, box[3:6], box[6:]) for box in (have, want))
-            return overlap(*(part for pose in poses for part in pose))
-
-        vectorized = np.vectorize(filled, signature="(n),(n)->()", otypes=[float])
-        have, want = (np.asarray(boxes, dtype=float) for boxes in (achieved, desired))
-        return np.asarray(vectorized(have, want))
-
-
-_POSE = ("cartesian_position", "orientation")
 
 
 def tips_to_block(block: str = TOOL) -> Measured:

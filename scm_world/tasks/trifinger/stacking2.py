@@ -15,7 +15,7 @@ from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, Common, term
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shapes
-from scm_world.tasks.trifinger.building import Building
+from scm_world.tasks.trifinger.base import TriFingerTask
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
 from scm_world.tasks.trifinger.entities.blocks import ToolBlock, block_mass, block_size, coordinates
 from scm_world.tasks.trifinger.entities.goals import (
@@ -111,7 +111,7 @@ class GoalTower(Entity):
 
 
 @final
-class Stacking2(Building):
+class Stacking2(TriFingerTask):
     """Two blocks on the floor, and two goals of the same size that stand on one another.
 
     All four share the parent ``block.size``. The goals follow ``goal_tower``, whose center is as
@@ -152,6 +152,7 @@ class Stacking2(Building):
         FRACTION: 1.0,
     }
     goal_causes = (f"{TOWER}.polar", f"{TOWER}.euler_orientation")
+    tools, targets = TOOLS, dict(zip(GOALS, TOOLS, strict=True))  # the lower one first
     unchecked = (TOWER,)
 
     def __init__(
@@ -189,14 +190,6 @@ class Stacking2(Building):
         turn = shapes.unit_quaternion(f"{tool}_orientation", orientation)
         below = lowest_point(np.array(self._size), np.array(turn))
         return shapes.start_place(f"{tool}_position", place, below), turn
-
-    def tools(self) -> tuple[str, ...]:
-        """Two blocks."""
-        return TOOLS
-
-    def targets(self) -> dict[str, str]:
-        """Two goals, the lower one first."""
-        return dict(zip(GOALS, TOOLS, strict=True))
 
     def shared(self) -> Iterable[Variable]:
         """One size for all."""

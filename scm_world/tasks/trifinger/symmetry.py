@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from scm_world._types import Floats, Value
+from scm_world._types import Floats, Value, Values
 from scm_world.errors import UnknownOption
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import N_FINGERS
@@ -83,3 +83,11 @@ def turned(values: Mapping[str, Value], names: Iterable[str], thirds: int) -> di
         raise UnknownOption("observed variable of a symmetric lesson", name, allowed)
 
     return {name: one(name) for name in names}
+
+
+def thirds(values: Values, names: Iterable[str]) -> Iterable[tuple[Values, Sequence[int]]]:
+    """Turn the scene by one and by two thirds of a turn; actions are of joints."""
+    wanted = tuple(names)
+    for count in (1, 2):
+        order = swapped(np.arange(float(hardware.N_JOINTS)), count).astype(int).tolist()
+        yield turned(values, wanted, count), order

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any, Unpack, final
 
@@ -11,9 +11,11 @@ import numpy as np
 from scm_world._types import Floats, Value, Values
 from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import Common
+from scm_world.tasks.rewards import FRACTION, Common
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger.building import Assembly
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.base import TriFingerTask
+from scm_world.tasks.trifinger.building import Part, assembled
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
 from scm_world.tasks.trifinger.entities.blocks import ToolBlock
 from scm_world.tasks.trifinger.entities.goals import GoalBlock
@@ -125,7 +127,7 @@ def piece(
 
 
 @final
-class Towers(Assembly):
+class Towers(TriFingerTask):
     """A cuboid on the floor, cut into equal blocks.
 
     Its size, its place and into how many blocks it is cut along each axis are variables. The
@@ -148,7 +150,9 @@ class Towers(Assembly):
     name = "towers"
     decided_by = (NUMBER,)
     goal_causes = (NUMBER, MASS, DIMS, CENTER)
+    default_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
     interleaved = True
+    rest = hardware.RAISED  # the fingers begin out of the way
 
     def __init__(
         self,
@@ -171,16 +175,17 @@ class Towers(Assembly):
         x, y, z = (int(count) for count in values[NUMBER])
         return x, y, z
 
-    def parts(self) -> Iterable[tuple[str, dict[str, float]]]:
-        """Name the blocks, level by level, column by column."""
+    def parts(self) -> Iterable[Part]:
+        """List the blocks, level by level, column by column."""
         plan: Any = self.plan or self._number
         for level, col, row in np.ndindex(*(int(count) for count in reversed(plan))):
             which = {"level": float(level), "col": float(col), "row": float(row)}
             yield f"level_{level}_col_{col}_row_{row}", which
 
-    def piece(self, name: str, which: Mapping[str, float]) -> tuple[Entity, Entity]:
-        """Describe a block of the tower, and its place in it."""
-        return piece(name, **which, airborne=self.conventions.published_spaces)
+    def entities(self) -> Iterable[Entity]:
+        """The blocks, and their places in the tower."""
+        airborne = self.conventions.published_spaces
+        return assembled(self.parts(), piece, self.targets, airborne=airborne)
 
     def shared(self) -> Iterable[Variable]:
         """Declare the tower."""

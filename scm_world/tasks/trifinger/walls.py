@@ -12,10 +12,11 @@ from scm_world._types import Value, Values
 from scm_world.errors import InterventionError
 from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import Common
+from scm_world.tasks.rewards import FRACTION, Common
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware, layouts
-from scm_world.tasks.trifinger.building import Assembly
+from scm_world.tasks.trifinger.base import TriFingerTask
+from scm_world.tasks.trifinger.building import Part, assembled
 from scm_world.tasks.trifinger.entities.blocks import ToolBlock
 from scm_world.tasks.trifinger.entities.goals import GoalBlock
 from scm_world.tasks.trifinger.scattered import COUNT, obstacle_names, scattered, scattering
@@ -61,16 +62,16 @@ def brick(name: str, *, level: float, num: float, airborne: bool) -> tuple[ToolB
     )
 
 
-class Walls(Assembly):
-    """A wall of blocks.
+class StackedBlocks(TriFingerTask):
+    """A wall, regular or random; each block has its place in it.
 
     How many levels it has, how wide it is and how small its blocks are, are variables, and so is
-    the noise of a random wall: an intervention on one of the others keeps it. The layout follows
-    from them, or can be set as a whole. The fingers begin raised: at rest they would stand where
-    larger blocks begin.
+    the noise of a random wall: an intervention on one of the others keeps it; draw ``wall_noise``
+    for another wall. The layout follows from them, or can be set as a whole. The fingers begin
+    raised: at rest they would stand where larger blocks begin.
 
-    Attributes:
-        levels_a: Space A of the number of levels.
+    Reward terms:
+        fractional_success: How much of the wall the blocks fill.
 
     Args:
         tool_block_mass: Default mass of a block [kg].
@@ -79,13 +80,19 @@ class Walls(Assembly):
         max_level_width: Default greatest width of a level [m].
         common: Options of every task; see ``Common``.
 
+    Attributes:
+        levels: Bounds and spaces of the number of levels.
+
     Raises:
         UnknownOption: An argument is out of the bounds of its variable.
     """
 
+    name = "stacked_blocks"
     decided_by: ClassVar[tuple[str, ...]] = (LAYOUT,)
     goal_causes = (LEVELS, MASS, SIZE, WIDTH, NOISE)
+    default_weights: ClassVar[Mapping[str, float]] = {FRACTION: 1.0}
     interleaved = True
+    rest = hardware.RAISED
     levels: ClassVar[numbers.Range] = numbers.STACK_LEVELS
 
     def __init__(
@@ -116,8 +123,8 @@ class Walls(Assembly):
         return counts
 
     def counts(self) -> tuple[int, ...]:
-        """Say how many blocks each level has."""
-        return self.plan or self.regular()  # type: ignore[return-value] # from ``arrange`` # what arrange gives
+        """Return how many blocks each level has."""
+        return self.plan or self.regular()  # type: ignore[return-value] # from ``arrange``
 
     def regular(self) -> tuple[int, ...]:
         """Count the blocks of each level of the wall that there is without interventions."""
@@ -125,15 +132,16 @@ class Walls(Assembly):
         unused = np.zeros((layouts.MAX_LEVELS, 3))
         return layouts.counts(layouts.layout(levels, size, width, np.array(0), unused))
 
-    def parts(self) -> Iterable[tuple[str, dict[str, float]]]:
-        """Name the blocks, level by level."""
+    def parts(self) -> Iterable[Part]:
+        """List the blocks, level by level."""
         for level, count in enumerate(self.counts()):
             for num in range(count):
                 yield f"level_{level}_num_{num}", {"level": float(level), "num": float(num)}
 
-    def piece(self, name: str, which: Mapping[str, float]) -> tuple[Entity, Entity]:
-        """Describe a block of the wall, and its place in it."""
-        return brick(name, **which, airborne=self.conventions.published_spaces)
+    def entities(self) -> Iterable[Entity]:
+        """The blocks, and their places in the wall."""
+        airborne = self.conventions.published_spaces
+        return assembled(self.parts(), brick, self.targets, airborne=airborne)
 
     def solution(self, values: Values) -> dict[str, Value]:
         """Build the wall: all of it, so that it stands, with the fingers out of its way."""
@@ -215,29 +223,15 @@ def _noise() -> Iterable[Variable]:
     )
 
 
-@final
-class StackedBlocks(Walls):
-    """A wall, regular or random; each block has its place in it.
-
-    The arguments, and all variables, are those of ``Walls``. Draw ``wall_noise`` for another
-    random wall.
-
-    Reward terms:
-        fractional_success: How much of the wall the blocks fill.
-    """
-
-    name = "stacked_blocks"
-
-
 Plan = tuple[tuple[int, ...], int]
 
 
 @final
-class CreativeStackedBlocks(Walls):
+class CreativeStackedBlocks(StackedBlocks):
     """A wall, regular or random; the blocks of the first and last level have their places.
 
     What is between the two, the robot has to make up. Small boxes may be in the way. The other
-    variables are those of ``Walls``.
+    variables are those of ``StackedBlocks``.
 
     Reward terms:
         fractional_success: How much of the two levels the blocks fill.
@@ -279,15 +273,18 @@ class CreativeStackedBlocks(Walls):
         return super().arrange(values), int(values[COUNT])
 
     def counts(self) -> tuple[int, ...]:
-        """Say how many blocks each level has."""
+        """Return how many blocks each level has."""
         return self._arranged()[0]
 
-    def wanted(self, which: Mapping[str, float]) -> bool:
-        """Tell whether a block is in the first level or the last."""
-        return which["level"] in (0, len(self.counts()) - 1)
+    @property
+    def targets(self) -> dict[str, str]:
+        """The goals of the first level and of the last."""
+        ends = (0, len(self.counts()) - 1)
+        return {f"goal_{p}": f"tool_{p}" for p, which in self.parts() if which["level"] in ends}
 
+    @property
     def obstacles(self) -> tuple[str, ...]:
-        """Name the small boxes."""
+        """The small boxes."""
         return obstacle_names(self._arranged()[1])
 
     def _arranged(self) -> Plan:

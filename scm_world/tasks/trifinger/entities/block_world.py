@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, final
@@ -11,8 +12,8 @@ from scm_world.geometry.hulls import Hull
 from scm_world.models import GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.scene import Overlap, State
 from scm_world.tasks.composition import Commands, Composition, Entity
-from scm_world.tasks.conventions import CONVENTIONS, Conventions
 from scm_world.tasks.model import ModelComposition
+from scm_world.tasks.trifinger.conventions import CONVENTIONS, TriFingerConventions
 from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
 from scm_world.tasks.trifinger.hardware import (
     FINGERS,
@@ -51,7 +52,7 @@ class BlockWorld(Composition):
     deciding: tuple[str, ...] = ()
     torques: bool = False
     resolution: str = RESOLUTIONS[0]
-    conventions: Conventions = CONVENTIONS["scm_world"]
+    conventions: TriFingerConventions = CONVENTIONS["scm_world"]
     unchecked: tuple[str, ...] = ()
     solid: bool = field(init=False, default=True)
     blocks: tuple[str, ...] = field(init=False)
@@ -92,26 +93,31 @@ class BlockWorld(Composition):
         return self._systems[name]
 
     def overlaps(
-        self, scene: Scene, tolerance: float | None = None, asked: Iterable[str] = ()
+        self,
+        scene: Scene,
+        tolerance: float | None = None,
+        asked: Iterable[str] = (),
+        enough: float = math.inf,
     ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance [m]."""
         if tolerance is not None:
             return overlaps(scene, tolerance=tolerance)
-        if any(name.partition(".")[0] in self.unchecked for name in asked):
+        if self.unchecked and any(name.partition(".")[0] in self.unchecked for name in asked):
             return ()
         robot, others = self.conventions.robot_tolerance, self.conventions.tolerance
         return tuple(
             overlap
-            for overlap in overlaps(scene, tolerance=min(robot, others))
+            for overlap in overlaps(
+                scene,
+                tolerance=min(robot, others),
+                enough=max(enough, robot, others),
+            )
             if overlap.depth > (others if set(LINK_NAMES).isdisjoint(overlap.bodies) else robot)
         )
 
-    def thin(self, candidates: Any, before: Iterable[Overlap], *, whole: bool = True) -> None:
-        """Leave out candidates in which fingers, blocks or obstacles lie in one another."""
-        if not self.hulls:
-            tolerances = self.conventions.robot_tolerance, self.conventions.tolerance
-            blocks, obstacles = (self.blocks, self.obstacles) if whole else ((), ())
-            thin(candidates, blocks, obstacles, before, tolerances)
+    def thin(self, candidates: Any, limit: float) -> None:
+        """Leave out candidates whose fingers cross one another."""
+        thin(candidates, max(limit, self.conventions.robot_tolerance))
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable; edges into states follow from the kinematic trees."""

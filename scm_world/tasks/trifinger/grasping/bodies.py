@@ -189,7 +189,7 @@ class Sight:
         self._solid = (*world.composition.blocks, *self.walls)
         self.pairs = tuple(
             (tool, goal)
-            for goal, tool in task.targets().items()
+            for goal, tool in task.goal.targets.items()
             if tool in self._solid and f"{goal}.size" in self._values
         )
         if not self.pairs:

@@ -67,6 +67,19 @@ def _legs_kernel(joints: Floats, height: float, balls: Floats) -> None:
 
 
 @njit(cache=True)
+def _between_kernel(balls: Floats, one: tuple[int, int], other: tuple[int, int]) -> float:
+    """Compute the least distance of the centers of the balls of two legs [m]."""
+    squared = math.inf
+    for i in range(BALLS):
+        for j in range(BALLS):
+            x = balls[one[0], one[1], i, 0] - balls[other[0], other[1], j, 0]
+            y = balls[one[0], one[1], i, 1] - balls[other[0], other[1], j, 1]
+            z = balls[one[0], one[1], i, 2] - balls[other[0], other[1], j, 2]
+            squared = min(squared, x * x + y * y + z * z)
+    return math.sqrt(squared)
+
+
+@njit(cache=True)
 def deepest_kernel(
     joints: Floats, height: float, halves: Floats, centers: Floats, turns: Floats
 ) -> float:
@@ -100,12 +113,10 @@ def deepest_kernel(
                         outside, inside = outside + max(beyond, 0.0) ** 2, max(inside, beyond)
                     away = math.sqrt(outside) + min(inside, 0.0)
                     deepest = max(deepest, _RADII[part] - away)
-                for other in range(finger):
-                    for piece in range(2):
-                        for one in balls[other, piece]:
-                            x, y, z = ball - one
-                            away = math.sqrt(x * x + y * y + z * z)
-                            deepest = max(deepest, _RADII[part] + _RADII[piece] - away)
+            for other in range(finger):
+                for piece in range(2):
+                    away = _between_kernel(balls, (finger, part), (other, piece))
+                    deepest = max(deepest, _RADII[part] + _RADII[piece] - away)
     return deepest
 
 

@@ -112,6 +112,8 @@ SAMPLES = 9
 FIRMNESS = 0.5
 TURNING = 0.3  # [1/rad]
 TIGHT = 0.1
+REACHING = 0.5  # [1/m]
+MEETING = 0.3
 PLENTY = 0.05
 """What makes a way better or worse. A force that is just enough is worth 1."""
 
@@ -195,6 +197,7 @@ class Planner:
         first = self._strengths(table, start)
         table, first = table.only(first > 0.0), first[first > 0.0]
         ease = FIRMNESS * table.firm - TIGHT * (table.opening < max(OPENINGS))
+        ease += self._transit(table, start, over)
         worths, strengths = (
             np.full((len(ease), len(ways)), -np.inf),
             np.zeros((len(ease), len(ways))),
@@ -258,6 +261,17 @@ class Planner:
         _, reached, depth = self._poses(_above(tips, table, above)[opens], joints[opens])
         opens[opens] = reached & (depth <= 0.0)
         return opens
+
+    def _transit(self, table: Grip, body: Cuboid, above: float) -> Floats:
+        """Judge ways to the block: fingers should not meet; the shorter, the better. Shape (n,)."""
+        first = self._hand.tips(self._joints).reshape(3, 3)
+        first[:, 2] = np.maximum(first[:, 2], above)
+        last = _above(table.place(self._hand, body, table.opening), table, above)
+        worth: Floats = -REACHING * np.abs(last - first).max(axis=(1, 2), initial=0.0)
+        for share in (0.3, 0.6, 0.9):
+            _, _, depth = self._poses((1.0 - share) * first + share * last)
+            worth -= MEETING * (depth > 0.0)
+        return worth
 
     def _poses(
         self, tips: Floats, near: Floats | None = None, *more: tuple[Cuboid, float]

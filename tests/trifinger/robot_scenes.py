@@ -1,31 +1,25 @@
-"""Scenes, commands and comparisons for the conformance suites."""
+"""Scenes of the robot, commands and comparisons."""
 
 from __future__ import annotations
 
-import hashlib
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
 from itertools import product
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
-import pytest
 
 from scm_world._types import ArrayLike, Floats
-from scm_world.backends.base import Backend, EngineSnapshot
+from scm_world.backends import Backend
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import from_rotation_vector, quaternion_product
-from scm_world.models.scene import Difference, ParameterKey, Parameters, Scene
+from scm_world.models.scene import Difference, ParameterKey, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import FAST, PRECISE, Preset
 from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.tasks.trifinger.system import trifinger
 
 SUBSTEPS = 10
-LONG = 250  # control steps
-
 SEED = 20_26
 
 
@@ -115,14 +109,8 @@ def play(
     return states
 
 
-def digest(backend: Backend, preset: Preset) -> str:
-    """Hash what the busy scene does for a while."""
-    backend.build(busy_scene(preset))
-    return hashlib.sha256(play(backend, 30).tobytes()).hexdigest()
-
-
 def other_value(key: ParameterKey, value: Floats) -> Floats:
-    """Give another possible value of a parameter."""
+    """Return another possible value of a parameter."""
     match key[1]:
         case "gravity":
             return np.asarray(value + np.array([0.5, -0.3, 2.8]))
@@ -140,16 +128,14 @@ def other_value(key: ParameterKey, value: Floats) -> Floats:
             return quaternion_product(from_rotation_vector([0.05, -0.03, 0.1]), value)
         case "size":
             return np.asarray(value * np.array([0.8, 0.9, 0.7]))
-        case name if name in {
-            key[1] for key in trifinger().default_parameters() if key[0] == "controller"
-        }:
+        case "position_gains" | "velocity_gains" | "safety_damping" | "torque_limit":
             return np.asarray(value * 1.2)  # with less of them, fingers reach farther
         case _:
             return np.asarray(value * 0.7)
 
 
 def another(preset: Preset) -> Preset:
-    """Give the other numerical settings."""
+    """Return the other numerical settings."""
     return PRECISE if preset is FAST else FAST
 
 
@@ -170,70 +156,3 @@ def changed_states(state: PhysicalState) -> Iterator[tuple[str, PhysicalState]]:
         norms = np.linalg.norm(changed.orientations, axis=1, keepdims=True)
         changed.orientations[:] /= norms
         yield field, changed
-
-
-def same(first: Floats, second: Floats) -> bool:
-    """Compare two arrays bit for bit, but for the sign of zero."""
-    return bool(np.array_equal(first, second))
-
-
-def check_parameters(actual: Parameters, expected: Parameters) -> None:
-    """Compare parameters as engines keep them: colors with 32 bits or less."""
-    assert set(actual) == set(expected)
-    for key, value in expected.items():
-        tolerance = 1e-6 if key[1] == "color" else 1e-12
-        np.testing.assert_allclose(
-            actual[key], value, rtol=0, atol=tolerance, err_msg=".".join(key)
-        )
-        assert actual[key].shape == value.shape
-
-
-class Suite(ABC):
-    """What the parts of the conformance suite share.
-
-    Attributes:
-        preset: Numerical settings under which the suite runs.
-        long: Horizon of the longest comparison, in control steps.
-    """
-
-    preset: ClassVar[Preset] = FAST
-    long: ClassVar[int] = LONG
-
-    @abstractmethod
-    def make(self) -> Backend:
-        """Create a backend without a scene."""
-
-    @pytest.fixture
-    def scene(self) -> Scene:
-        """Describe the busy scene."""
-        return busy_scene(self.preset)
-
-    @pytest.fixture
-    def backend(self, scene: Scene) -> Iterator[Backend]:
-        """Provide a backend in the middle of an episode."""
-        with self.built(scene) as backend:
-            play(backend, 2, seed=1)
-            yield backend
-
-    @contextmanager
-    def built(self, scene: Scene) -> Iterator[Backend]:
-        """Provide a new backend with a scene, and close it."""
-        backend = self.make()
-        backend.build(scene)
-        try:
-            yield backend
-        finally:
-            backend.close()
-
-    def continued(self, backend: Backend, start: EngineSnapshot, steps: int = 10) -> Floats:
-        """Continue from a snapshot."""
-        backend.restore(start)
-        return play(backend, steps)
-
-    def change_and_undo(
-        self, backend: Backend, keys: Iterable[ParameterKey], parameters: Parameters
-    ) -> None:
-        """Set parameters to something else and back."""
-        for key in keys:
-            backend.apply(Difference(parameters={key: other_value(key, parameters[key])}))
-            backend.apply(Difference(parameters={key: parameters[key]}))

@@ -1,4 +1,4 @@
-"""Where the predecessor's choices differ from ours."""
+"""Conventions of CausalWorld, where they differ from ours."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world.errors import UnknownOption
 from scm_world.models.scene import TOLERANCE
+from scm_world.tasks.base import Conventions
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.variables import Box, Integers, Space, Variable
 
@@ -18,16 +18,11 @@ OBSTACLE_FRICTION = 1.0
 
 @final
 @dataclass(frozen=True)
-class Conventions:
-    """A set of choices that go together.
+class TriFingerConventions(Conventions):
+    """Conventions of the goal families.
 
     Attributes:
-        name: ``"scm_world"`` or ``"causal_world"``.
         aligned_boxes: Overlap of axis-aligned hulls, not capped, instead of the exact one.
-        reward_times_dt: Rewards multiplied by the control period.
-        extra_step: Episodes one step longer than their length.
-        published_observation: The published normalisation of observations, which values may
-            leave, and a time feature in seconds minus steps where a length is given.
         distance_as_reward: In reaching, the mean tip error itself is added to the reward.
         published_spaces: The spaces of the code instead of those of the paper: bright floors,
             blocks and goals in A, no space for gravity, blocks that begin in the air,
@@ -40,11 +35,7 @@ class Conventions:
         robot_tolerance: The same where one of them is a link of the robot [m].
     """
 
-    name: str
     aligned_boxes: bool = False
-    reward_times_dt: bool = False
-    extra_step: bool = False
-    published_observation: bool = False
     distance_as_reward: bool = False
     published_spaces: bool = False
     static_counts: bool = False
@@ -53,31 +44,19 @@ class Conventions:
     robot_tolerance: float = TOLERANCE
 
     def adapt(self, variables: Iterable[Variable]) -> Iterable[Variable]:
-        """Give variables the spaces that these conventions have."""
+        """Return the variables with the spaces of these conventions."""
         for variable in variables:
             yield _as_published(variable) if self.published_spaces else variable
 
 
 CONVENTIONS = {
-    "scm_world": Conventions("scm_world"),
-    "causal_world": Conventions(
+    "scm_world": TriFingerConventions(),
+    "causal_world": TriFingerConventions(
         *("causal_world", True, True, True, True, True, True, True, True),
         tolerance=0.03,
         robot_tolerance=0.0095,
     ),
 }
-
-
-def conventions(name: str) -> Conventions:
-    """Look conventions up by their name.
-
-    Raises:
-        UnknownOption: There are none of this name.
-    """
-    try:
-        return CONVENTIONS[name]
-    except KeyError:
-        raise UnknownOption("conventions", name, CONVENTIONS) from None
 
 
 def _as_published(variable: Variable) -> Variable:
@@ -99,7 +78,7 @@ def _as_published(variable: Variable) -> Variable:
 
 
 def _hull(shape: tuple[int, ...], a: Space | None, b: Space | None) -> Space | None:
-    """Give the smallest box around two spaces; None where their corners follow variables."""
+    """Return the smallest box around two spaces; None where their corners follow variables."""
     match a, b:
         case Integers(), Integers():
             return Integers(min(a.low, b.low), max(a.high, b.high))

@@ -1,0 +1,119 @@
+"""Which bodies are in one place: MuJoCo's collision detection, on a model of its own.
+
+A scene is looked at where it would be, before any engine realises it. What can touch is what is
+compared: pairs that the file excludes, parents and their children, and fixed bodies are not.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Set
+from functools import lru_cache
+from typing import Any, final
+
+import mujoco
+import numpy as np
+
+from scm_world._types import Floats, Integers
+from scm_world.backends.mujoco.backend import realize
+from scm_world.models.scene import SURFACES, Overlap, ParameterKey, Scene
+
+Shapes = tuple[int, int]
+"""Numbers of two shapes: the geoms of the model, then its flexes."""
+
+
+@final
+class _Scratch:
+    """A compiled structure, to put scenes into one after another."""
+
+    def __init__(self, structure: Any) -> None:
+        default = structure.default_scene().parameters
+        self._written: dict[ParameterKey, Floats] = {
+            key: value for key, value in default.items() if key[1] in SURFACES
+        }
+        self._now = realize(structure, self._written)
+        model, self.owners = self._now.model, self._now.owners
+        kinds = np.ones(model.ngeom + model.nflex, dtype=np.int64)
+        roots = model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)]
+        kinds[: model.ngeom][np.isin(model.body_rootid[model.geom_bodyid], roots)] = 0
+        kinds[: model.ngeom][model.body_weldid[model.geom_bodyid] == 0] = 2
+        self.ranks: dict[str, tuple[int, int]] = {}
+        for shape, (owner, kind) in enumerate(zip(self.owners, kinds.tolist(), strict=True)):
+            self.ranks.setdefault(owner, (kind, shape))
+
+    def contacts(self, scene: Scene) -> tuple[Integers, Floats]:
+        """Find the shapes that touch, shape (n, 2), and their depths, shape (n,) [m]."""
+        now, written, parameters = self._now, self._written, scene.parameters
+        changed = {k: parameters[k] for k, old in written.items() if parameters[k] is not old}
+        if changed:
+            now.edit(changed)
+            written |= changed
+        now.place(scene.state.vector.copy())
+        model, data = now.model, now.data
+        mujoco.mj_kinematics(model, data)
+        if model.nflex:
+            mujoco.mj_flex(model, data)
+        mujoco.mj_collision(model, data)
+        contact = data.contact
+        shapes = contact.geom
+        if model.nflex:
+            shapes = np.where(shapes < 0, model.ngeom + contact.flex, shapes)
+        return shapes, -contact.dist
+
+
+@lru_cache(maxsize=32)
+def _scratch(structure: Any, thread: int) -> _Scratch:
+    """Compile a structure once in each thread."""
+    return _Scratch(structure)
+
+
+def touching(scene: Scene, tolerance: float) -> frozenset[Shapes]:
+    """Return the shapes that lie deeper in one another than a tolerance [m]."""
+    shapes, depths = _scratch(scene.structure, threading.get_ident()).contacts(scene)
+    return frozenset((one, other) for one, other in shapes[depths > tolerance].tolist())
+
+
+def overlaps(
+    scene: Scene,
+    tolerance: float,
+    besides: Set[Shapes] = frozenset(),
+    enough: float = np.inf,
+) -> tuple[Overlap, ...]:
+    """List all pairs of bodies that lie deeper in one another than a tolerance.
+
+    Args:
+        scene: With complete parameters.
+        tolerance: How deep is too deep [m].
+        besides: Pairs of shapes that may lie in one another.
+        enough: Where some lie deeper than this in one another, the deepest alone are listed [m].
+
+    Returns:
+        One entry for each pair of names, with its greatest depth. First come bodies that move
+        freely, last those that never move; in a pair, too.
+
+    Example:
+        >>> from scm_world.tasks.trifinger.system import trifinger
+        >>> scene = trifinger(("tool_block",)).default_scene()
+        >>> overlaps(scene, 1e-4)
+        ()
+        >>> scene.state.positions[0, 2] = 0.03
+        >>> print(*overlaps(scene, 1e-4))
+        'tool_block' lies 2.5 mm deep in 'floor'
+    """
+    scratch = _scratch(scene.structure, threading.get_ident())
+    shapes, depths = scratch.contacts(scene)
+    if not len(depths):
+        return ()
+    found: dict[tuple[str, ...], Overlap] = {}
+    deepest = int(depths.argmax())
+    listed = [deepest] if depths[deepest] > enough and not besides else depths > tolerance
+    owners, ranks = scratch.owners, scratch.ranks
+    for (one, other), depth in zip(shapes[listed].tolist(), depths[listed].tolist(), strict=True):
+        names = owners[one], owners[other]
+        if names[0] == names[1] or (one, other) in besides:
+            continue
+        names = names if ranks[names[0]] < ranks[names[1]] else names[::-1]
+        if names not in found or found[names].depth < depth:
+            found[names] = Overlap(names, depth)
+    ordered = sorted(found, key=lambda names: [ranks[name] for name in names])
+    return tuple(map(found.__getitem__, ordered))
