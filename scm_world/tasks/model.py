@@ -83,7 +83,7 @@ class ModelComposition(Composition):
         Not listed are shapes that do so in the pose of the file. All is listed of a model that
         describes no bodies.
         """
-        if self._model.describe is None:
+        if not self._model.bodies:
             return ()
         from scm_world.backends.mujoco.overlaps import overlaps
 

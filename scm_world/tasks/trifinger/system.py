@@ -53,7 +53,7 @@ from scm_world.tasks.trifinger.hardware import (
     joints_of,
     link_name,
 )
-from scm_world.tasks.trifinger.published import alter, touching
+from scm_world.tasks.trifinger.published import alter, spinning_weights, touching
 from scm_world.tasks.trifinger.state import PhysicalState
 
 FLOOR = "floor"
@@ -569,7 +569,8 @@ def _bindings(mj: mujoco.MjModel, trees: Couplings, *, parts: _Parts) -> Iterato
     yield row("world.gravity", "m/s^2", _gravity, everything, "Acceleration of free fall.")
     rigid = partial(_restitution, rigid=CONTACT[parts.preset.name])
     yield row("world.restitution", "1", rigid, touching, "Speed after an impact over that before.")
-    yield row("world.spinning_friction", "m", _spinning, touching, "Torsional, of every contact.")
+    spins = partial(_spinning, parts=parts)
+    yield row("world.spinning_friction", "m", spins, touching, "Torsional, of every contact.")
     touched = trees.touching(fingers)
     yield row("robot.height", "m", _height, touched, "Height of the base; see ``hardware``.")
     links = [s for f in FINGERS for i in range(4) for s in link_shapes(f, i)]
@@ -624,8 +625,17 @@ def _gravity(mj: mujoco.MjModel, _: Any) -> Slot:
     return place(mj.opt.gravity)
 
 
-def _spinning(mj: mujoco.MjModel, _: Any) -> Slot:
-    return place(mj.geom_friction[:, 1], back=first, follow_up=couple)
+def _spinning(mj: mujoco.MjModel, _: Any, *, parts: _Parts) -> Slot:
+    if parts.published:
+        weights = spinning_weights(mj, parts.blocks, parts.obstacles)
+    else:
+        weights = np.ones(mj.ngeom)
+    view, base = mj.geom_friction[:, 1], mj.geom(shape_name(FINGERS[0], "base")).id
+
+    def write(value: Floats) -> None:
+        view[:] = value * weights
+
+    return Slot(write, lambda: view[base].copy(), follow_up=couple)
 
 
 def _height(mj: mujoco.MjModel, _: Any) -> Slot:
