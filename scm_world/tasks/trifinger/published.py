@@ -1,11 +1,12 @@
 """The TriFinger as CausalWorld 1.2 has it in Bullet, so that policies from there act here alike.
 
 What differs was found by comparing states step by step: the links are the convex hulls of their
-meshes, everything that can touch does, robot and blocks lose speed as they move, spinning friction belongs
-to blocks and obstacles alone, and torques are those before a step. The wall is ours.
+meshes, the table is a plate, everything that can touch does, robot and blocks lose speed as they
+move, spinning friction belongs to blocks and obstacles alone, and torques are those before a step.
+The wall is ours.
 
-``meshes.npz`` has the corners of these hulls, from CausalWorld 1.2 (MIT license), in the frames of
-the links [m].
+``meshes.npz`` has the corners of hulls and plate, from CausalWorld 1.2 (MIT license), in the frames of
+the bodies [m].
 """
 
 from __future__ import annotations

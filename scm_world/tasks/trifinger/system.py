@@ -631,11 +631,12 @@ def _spinning(mj: mujoco.MjModel, _: Any, *, parts: _Parts) -> Slot:
     else:
         weights = np.ones(mj.ngeom)
     view, base = mj.geom_friction[:, 1], mj.geom(shape_name(FINGERS[0], "base")).id
+    own = view[base, ...]
 
     def write(value: Floats) -> None:
         view[:] = value * weights
 
-    return Slot(write, lambda: view[base].copy(), follow_up=couple)
+    return Slot(write, own.copy, follow_up=couple)
 
 
 def _height(mj: mujoco.MjModel, _: Any) -> Slot:
