@@ -14,8 +14,6 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from scm_world.errors import ModelError
-from scm_world.models.bodies import ModelBodies
 from scm_world.models.scene import (
     ParameterKey,
     Scene,
@@ -70,12 +68,14 @@ class Parameter(Row):
         kind: ``"real"``, ``"rotation"`` (unit quaternion), ``"inertia"`` (principal moments, which
             obey the triangle inequality) or ``"switch"`` (0 or 1).
         visual: Whether it acts on pictures only.
+        body: Number of the body whose mass, place or shape it belongs to; -1 if to none.
     """
 
     key: ParameterKey = ("", "")
     slot: Callable[[Any, Any], Any] | None = field(default=None, repr=False)
     kind: Literal["real", "rotation", "inertia", "switch"] = "real"
     visual: bool = False
+    body: int = -1
 
 
 @final
@@ -134,6 +134,23 @@ class Readout:
 
 
 @final
+@dataclass(frozen=True)
+class BodyRow:
+    """A rigid body.
+
+    Attributes:
+        name: As contacts call it.
+        tree: Number of the kinematic tree that it moves with; -1 if it cannot move.
+        shapes: Names of its shapes.
+        joints: Names of the joints between it and its parent.
+    """
+
+    name: str
+    tree: int
+    shapes: tuple[str, ...]
+    joints: tuple[str, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
     """A system: what a backend compiles, and the tables of what there is.
@@ -154,8 +171,7 @@ class Model:
         notes: What acts without having a variable (plugins, flex), one sentence each.
         staged: Whether its physics steps have stages (Runge-Kutta), in each of which bodies may
             touch, while a backend lists the contacts of the last one alone.
-        describe: Gives the ``ModelBodies`` of the model, for backends that do not read its file. It
-            can be pickled.
+        bodies: All bodies, parents before their children; the first is the world.
     """
 
     name: str
@@ -170,7 +186,7 @@ class Model:
     refused: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
     staged: bool = False
-    describe: Callable[[Model], ModelBodies] | None = field(default=None, repr=False)
+    bodies: tuple[BodyRow, ...] = field(default=(), repr=False)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Model) and self.digest == other.digest
@@ -202,20 +218,9 @@ class Model:
         )
 
     @cached_property
-    def bodies(self) -> ModelBodies:
-        """The bodies in plain words.
-
-        Raises:
-            ModelError: Nobody can describe them.
-        """
-        if self.describe is None:
-            raise ModelError([f"{self.name!r} does not describe its bodies; read it from a file"])
-        return self.describe(self)
-
-    @cached_property
     def body_names(self) -> tuple[str, ...]:
         """Names of all bodies; the first is the world."""
-        return tuple(body.name for body in self.bodies.bodies)
+        return tuple(body.name for body in self.bodies)
 
     def empty_state(self) -> State:
         """Give a state to read into."""

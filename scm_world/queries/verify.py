@@ -386,19 +386,19 @@ def _apart(structure: Any, edge: Edge, touched: set[Pair]) -> str | None:
         return "nothing touched in any probe state"
     if not isinstance(structure, Model):
         return None
-    bodies = structure.bodies
-    rows = {joint.name: joint.body for joint in bodies.joints}
-    rows |= {geom.name: geom.body for geom in bodies.geoms}
-    rows |= {body.name: number for number, body in enumerate(bodies.bodies)}
+    bodies, rows = structure.bodies, dict[str, int]()
+    for elements in ("joints", "shapes"):
+        rows |= {name: n for n, body in enumerate(bodies) for name in getattr(body, elements)}
+    rows |= {body.name: number for number, body in enumerate(bodies)}
     one, other = (rows.get(name.partition(".")[0]) for name in (edge.cause, edge.effect))
     if one is None or other is None:
         return None
-    first, second = bodies.bodies[one].name, bodies.bodies[other].name
-    if not any(first in pair for pair in touched):
-        return f"{first} touched nothing in any probe state"
-    trees = nx.Graph([[bodies.roots[rows[name]] for name in pair] for pair in touched])
-    trees.remove_nodes_from([0])  # what is fixed passes nothing on
-    trees.add_nodes_from([bodies.roots[one], bodies.roots[other]])
-    if bodies.roots[one] and not nx.has_path(trees, bodies.roots[one], bodies.roots[other]):
-        return f"{first} and {second} touched in no probe state, nor through other bodies"
+    first, second = bodies[one], bodies[other]
+    if not any(first.name in pair for pair in touched):
+        return f"{first.name} touched nothing in any probe state"
+    trees = nx.Graph([[bodies[rows[name]].tree for name in pair] for pair in touched])
+    trees.remove_nodes_from([-1])  # what is fixed passes nothing on
+    trees.add_nodes_from([first.tree, second.tree])
+    if first.tree >= 0 and not nx.has_path(trees, first.tree, second.tree):
+        return f"{first.name} and {second.name} touched in no probe state, nor through other bodies"
     return None

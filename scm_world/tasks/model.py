@@ -83,7 +83,7 @@ class ModelComposition(Composition):
         Not listed are shapes that do so in the pose of the file. Nothing is listed of a model that
         describes no bodies.
         """
-        if self._model.describe is None:
+        if not self._model.bodies:
             return ()
         from scm_world.backends.mujoco.overlaps import overlaps
 
@@ -108,30 +108,16 @@ class ModelComposition(Composition):
 
     def touched(self) -> Mapping[str, tuple[str, ...]]:
         """Map each body to the states of its tree; none if the model describes no bodies."""
-        model, states = self._model, dict[str, list[str]]()
-        if model.describe is None:
-            return {}
+        model, states = self._model, dict[int, list[str]]()
         for row in model.states:
             for tree in row.trees:
-                states.setdefault(model.trees[tree], []).append(row.name)
-        found, top = dict[str, tuple[str, ...]](), [""]
-        for number, body in enumerate(model.bodies.bodies):  # parents come before children
-            if number:
-                top.append(top[body.parent] or body.name)
-            moves = model.bodies.roots[number] > 0
-            found[body.name] = (*states.get(top[number], ()),) if moves else ()
-        return found
+                states.setdefault(tree, []).append(row.name)
+        return {body.name: (*states.get(body.tree, ()),) for body in model.bodies}
 
     def shaped(self) -> Mapping[str, str]:
         """Map the parameters of bodies and shapes to the body."""
-        model, found = self._model, dict[str, str]()
-        for row in model.parameters if model.describe else ():
-            place = model.bodies.places.get(row.key)
-            if place and place.table in ("bodies", "geoms"):
-                geom = place.table == "geoms"
-                number = model.bodies.geoms[place.row].body if geom else place.row
-                found[row.name] = model.body_names[number]
-        return found
+        names = self._model.body_names
+        return {row.name: names[row.body] for row in self._model.parameters if row.body >= 0}
 
 
 class DeclaredTask(Task):

@@ -96,7 +96,7 @@ def _of_contacts(
             yield f"the {mujoco.mjtGeom(kind).name.removeprefix('mjGEOM_').lower()} {name!r}"
         if mj.geom_adhesion[geom] or np.any(mj.geom_surfacevel[geom]):
             yield f"adhesion or moving surface of the geom {name!r}"
-    dynamic = trees.dynamic.any(axis=1)
+    dynamic: NDArray[np.bool_] = np.asarray(trees.dynamic.any(axis=1))
     for name, one, other, alike in zip(
         names["pair"], mj.pair_geom1, mj.pair_geom2, _multiplied(mj), strict=True
     ):
@@ -108,7 +108,8 @@ def _multiplied(mj: mujoco.MjModel) -> NDArray[np.bool_]:
     """Tell which pairs have the product of the frictions of their shapes, shape (npair,)."""
     factors = mj.geom_friction[:, 0]
     products = factors[mj.pair_geom1] * factors[mj.pair_geom2]
-    found: NDArray[np.bool_] = np.equal(mj.pair_friction[:, :2], products[:, None]).all(axis=1)
+    same: Any = mj.pair_friction[:, :2] == products[:, None]
+    found: NDArray[np.bool_] = same.all(axis=1)
     return found
 
 

@@ -17,7 +17,6 @@ import numba
 import numpy as np
 
 from scm_world._types import Floats, Integers
-from scm_world.backends.mujoco.bodies import describe
 from scm_world.backends.mujoco.fields import (
     MEDIUM,
     Field,
@@ -30,8 +29,15 @@ from scm_world.backends.mujoco.readouts import find_readouts
 from scm_world.backends.mujoco.sources import Source, read_source, realized, understood
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, nearest
-from scm_world.models.bodies import ModelBodies
-from scm_world.models.model import REPORTED, Input, Model, Numbers, Parameter, StateRow
+from scm_world.models.model import (
+    REPORTED,
+    BodyRow,
+    Input,
+    Model,
+    Numbers,
+    Parameter,
+    StateRow,
+)
 from scm_world.models.scene import REVERSED, reversed_ranges
 
 _DSBL, _JNT, _TRN, _INT = (
@@ -212,7 +218,7 @@ def read_model(
         ),
         notes=(*replaced, *changed, *drift, *_notes(mj, keyframe)),
         staged=_is_staged(mj),
-        describe=described,
+        bodies=tuple(_bodies(mj, names, trees)),
     )
 
 
@@ -224,9 +230,14 @@ def compiled(model: Model) -> mujoco.MjModel:
     return realized(model.source)[0]
 
 
-def described(model: Model) -> ModelBodies:
-    """Describe the bodies of a model, for engines that do not read its source."""
-    return describe(compiled(model))
+def _bodies(
+    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings
+) -> Iterator[BodyRow]:
+    """List the bodies."""
+    for body, name in enumerate(names["body"]):
+        shapes = tuple(names["geom"][geom] for geom in np.flatnonzero(mj.geom_bodyid == body))
+        joints = tuple(names["joint"][joint] for joint in np.flatnonzero(mj.jnt_bodyid == body))
+        yield BodyRow(name, trees.tree(body) if mj.body_treeid[body] >= 0 else -1, shapes, joints)
 
 
 def _check(mj: mujoco.MjModel, where: str) -> None:
@@ -426,7 +437,16 @@ def _parameter(mj: mujoco.MjModel, data: mujoco.MjData, field: Field, *, bound: 
         slot=field.slot if bound else None,
         kind=field.nature,
         visual=field.visual,
+        body=_body_of(mj, field),
     )
+
+
+def _body_of(mj: mujoco.MjModel, field: Field) -> int:
+    """Return the number of the body that a field of a body or shape belongs to; -1 for others."""
+    if field.kind not in ("body", "geom"):
+        return -1
+    number = element_names(mj)[field.kind].index(field.element)
+    return number if field.kind == "body" else int(mj.geom_bodyid[number])
 
 
 def _numbers(values: Any) -> Numbers:

@@ -1,11 +1,12 @@
 """The TriFinger as CausalWorld 1.2 has it in Bullet, so that policies from there act here alike.
 
 What differs was found by comparing states step by step: the links are the convex hulls of their
-meshes, everything that can touch does, robot and blocks lose speed as they move, and torques are
-those before a step.
+meshes, the table is a plate, everything that can touch does, robot and blocks lose speed as they
+move, spinning friction belongs to blocks and obstacles alone, and torques are those before a step.
+The wall is ours.
 
-``meshes.npz`` has the corners of these hulls, from CausalWorld 1.2 (MIT license), in the frames of
-the links [m].
+``meshes.npz`` has the corners of hulls and plate, from CausalWorld 1.2 (MIT license), in the frames of
+the bodies [m].
 """
 
 from __future__ import annotations
@@ -65,3 +66,19 @@ def touching(
     for (finger, index), (its, other) in combinations(links, 2):
         if finger != its or other - index > 1:
             yield shapes[finger, index], shapes[its, other], False
+
+
+def spinning_weights(
+    mj: mujoco.MjModel, blocks: tuple[str, ...], obstacles: tuple[str, ...]
+) -> Floats:
+    """Return how many times the spinning friction of the scene each shape has, shape (ngeom,).
+
+    Only blocks and obstacles have one. Beside ``backends.bullet.client.spinning_shares``, which
+    are 1/2 and 3/4 for their frictions of 1 and 1/2, all of it is left. The bases, which touch
+    nothing, keep the number itself.
+    """
+    weights = np.zeros(mj.ngeom)
+    for names, weight in ((blocks, 2.0), (obstacles, 4.0 / 3.0)):
+        weights[[mj.geom(name).id for name in names]] = weight
+    weights[[mj.geom(f"{finger}/base").id for finger in FINGERS]] = 1.0
+    return weights

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from importlib import import_module
 from typing import Any, final
@@ -53,7 +53,7 @@ from scm_world.tasks.trifinger.hardware import (
     joints_of,
     link_name,
 )
-from scm_world.tasks.trifinger.published import alter, touching
+from scm_world.tasks.trifinger.published import alter, spinning_weights, touching
 from scm_world.tasks.trifinger.state import PhysicalState
 
 FLOOR = "floor"
@@ -99,8 +99,8 @@ class TriFinger(Model):
             and fingertips collide with them.
         hulls: The movable blocks that are no boxes, each with its convex shape.
         torques: Whether joint torques are commanded [N m], and not joint positions [rad].
-        published: What Bullet realises in place of it: the bodies of the predecessor; see
-            ``published``. None where that is the same.
+        published: Whether Bullet realises the bodies of the predecessor; see ``published``.
+        instead: What Bullet realises then.
     """
 
     blocks: tuple[str, ...] = ()
@@ -109,6 +109,7 @@ class TriFinger(Model):
     hulls: tuple[tuple[str, Hull], ...] = ()
     torques: bool = False
     published: bool = False
+    instead: Model | None = field(default=None, repr=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how it is made, so that pickling costs little."""
@@ -140,7 +141,7 @@ class TriFinger(Model):
     def realization(self, backend: str) -> Any:
         """Return what Bullet realises, or how the robot is realised without physics, or drawn."""
         if backend == "bullet":
-            return self.published
+            return self.instead
         if backend not in _REALIZATIONS:
             return None
         module, what = _REALIZATIONS[backend]
@@ -205,7 +206,7 @@ def trifinger(
     described = {name: getattr(read, name) for name in read.__dataclass_fields__}
     described["digest"] += f" {published}"
     instead = _read(replace(parts, published=True), resolution) if published else None
-    return TriFinger(**described, **{**vars(parts), "published": instead})
+    return TriFinger(**described, **{**vars(parts), "published": published}, instead=instead)
 
 
 def _read(parts: _Parts, resolution: str) -> Model:
@@ -297,9 +298,9 @@ def _compiled(parts: _Parts) -> mujoco.MjModel:
     spec.add_key(name=START, qpos=start)
     model, defaults = spec.compile(), _defaults(parts)
     scratch = mujoco.MjData(model)
-    for field in _bindings(model, Couplings(model), parts=parts):
-        slot = field.slot(model, scratch)
-        slot.write(np.asarray(defaults[field.name], dtype=np.float64))
+    for bound in _bindings(model, Couplings(model), parts=parts):
+        slot = bound.slot(model, scratch)  # type: ignore[misc] # every binding has one
+        slot.write(np.asarray(defaults[bound.name], dtype=np.float64))
     couple(model)
     mujoco.mj_setConst(model, scratch)
     return model
@@ -568,7 +569,8 @@ def _bindings(mj: mujoco.MjModel, trees: Couplings, *, parts: _Parts) -> Iterato
     yield row("world.gravity", "m/s^2", _gravity, everything, "Acceleration of free fall.")
     rigid = partial(_restitution, rigid=CONTACT[parts.preset.name])
     yield row("world.restitution", "1", rigid, touching, "Speed after an impact over that before.")
-    yield row("world.spinning_friction", "m", _spinning, touching, "Torsional, of every contact.")
+    spins = partial(_spinning, parts=parts)
+    yield row("world.spinning_friction", "m", spins, touching, "Torsional, of every contact.")
     touched = trees.touching(fingers)
     yield row("robot.height", "m", _height, touched, "Height of the base; see ``hardware``.")
     links = [s for f in FINGERS for i in range(4) for s in link_shapes(f, i)]
@@ -623,8 +625,18 @@ def _gravity(mj: mujoco.MjModel, _: Any) -> Slot:
     return place(mj.opt.gravity)
 
 
-def _spinning(mj: mujoco.MjModel, _: Any) -> Slot:
-    return place(mj.geom_friction[:, 1], back=first, follow_up=couple)
+def _spinning(mj: mujoco.MjModel, _: Any, *, parts: _Parts) -> Slot:
+    if parts.published:
+        weights = spinning_weights(mj, parts.blocks, parts.obstacles)
+    else:
+        weights = np.ones(mj.ngeom)
+    view, base = mj.geom_friction[:, 1], mj.geom(shape_name(FINGERS[0], "base")).id
+    own = view[base, ...]
+
+    def write(value: Floats) -> None:
+        view[:] = value * weights
+
+    return Slot(write, own.copy, follow_up=couple)
 
 
 def _height(mj: mujoco.MjModel, _: Any) -> Slot:
