@@ -127,7 +127,7 @@ class TriFinger(Model):
             hulls=self.hulls,
             torques=self.torques,
             resolution=next(r for r in RESOLUTIONS if joints_of(r)[0].names[0] in names),
-            published=self.published is not None,
+            published=self.published,
         )
 
     def hull(self, block: str) -> Hull | None:
