@@ -34,7 +34,7 @@ from scm_world.variables import (
     Variable,
 )
 from scm_world.variables.bundles import bundle
-from scm_world.variables.kinds import parent_of
+from scm_world.variables.kinds import Coupled, parent_of
 from scm_world.variables.mechanisms import Stacked
 
 CONTROL_DT = 0.02
@@ -361,7 +361,10 @@ class ModelTask(DeclaredTask):
         ]
         actions = [self._action(row) for row in system.inputs]
         together = [bundle("action", actions, doc="All controls.")] if len(actions) > 1 else []
-        causes = causes_of(system)
+        seen = (row for row in system.parameters if not row.visual)
+        moving = (row for row in system.states if not row.reported)
+        effects = {row.name: (row.always, row.contact) for row in (*seen, *moving, *system.inputs)}
+        causes = causes_of(effects, {row.trees for row in system.states})
         states: list[Variable] = []
         for row in system.states:
             states += self._state(row, causes[row.trees])
@@ -426,30 +429,42 @@ class ModelTask(DeclaredTask):
             )
         return Action(**fields)
 
-    def _state(self, row: Any, causes: tuple[Parent, ...]) -> Iterable[Variable]:
+    def _state(self, row: Any, causes: Causes) -> Iterable[Variable]:
         """Declare a state, and the variable that its beginning is drawn as, if it is."""
         default = self.spaces.get(row.name, {}).get("default", row.default)
         state = Measured(
             **self._fields(row, row.kind),
             default=_numbers(f"spaces[{row.name!r}]['default']", default, row.shape),
-            parents=causes,
+            parents=Coupled(*causes, ()),
             settable_state=not row.reported,
         )
         return beginning(state, self.start.get(row.name))
 
 
-def causes_of(model: Model) -> dict[frozenset[int], tuple[Parent, ...]]:
-    """List what acts on the states of each group of trees, as edges of lag 1, which they share."""
-    found: dict[frozenset[int], tuple[Parent, ...]] = {}
-    seen = (row for row in model.parameters if not row.visual)
-    states = [row for row in model.states if not row.reported]
-    rows = [row for row in (*seen, *states, *model.inputs) if row.always or row.contact]
-    for trees in {row.trees for row in model.states}:
-        found[trees] = tuple(
-            parent_of(row.name, 1, None if trees & row.always else "contact")
-            for row in rows
-            if trees & (row.always | row.contact)
+Trees = frozenset[int]
+Causes = tuple[tuple[Parent, ...], Mapping[str, Parent]]
+"""Causes of lag 1 that act in every step, and those that act while there is contact, by name."""
+
+
+def causes_of(
+    effects: Mapping[str, tuple[Trees, Trees]], groups: Iterable[Trees]
+) -> dict[Trees, Causes]:
+    """List what acts on the states of each group of trees; they share it.
+
+    Args:
+        effects: For each variable the trees that it acts on always, and by contact.
+        groups: Of trees that have states together.
+    """
+    alike: dict[tuple[str, ...], Mapping[str, Parent]] = {}
+    found: dict[Trees, Causes] = {}
+    for own in groups:
+        always = [name for name, (sure, _) in effects.items() if own & sure]
+        acting = tuple(
+            name for name, (sure, touching) in effects.items() if own & (sure | touching)
         )
+        if acting not in alike:
+            alike[acting] = {name: parent_of(name, 1, "contact") for name in acting}
+        found[own] = tuple(parent_of(name, 1) for name in always), alike[acting]
     return found
 
 

@@ -155,9 +155,10 @@ def find_readouts(
 def _joints_of(mj: mujoco.MjModel, row: StateRow) -> list[int]:
     """Return the joint of each number of a state; none for activations."""
     if row.array == "qpos":
-        starts = mj.jnt_qposadr
-        return (np.searchsorted(starts, row.numbers, side="right") - 1).tolist()
-    return mj.dof_jntid[list(row.numbers)].tolist() if row.array == "qvel" else []
+        found = np.searchsorted(mj.jnt_qposadr, row.numbers, side="right") - 1
+    else:
+        found = mj.dof_jntid[list(row.numbers) if row.array == "qvel" else []]
+    return [int(joint) for joint in found]
 
 
 @final

@@ -576,7 +576,7 @@ def _bindings(mj: mujoco.MjModel, trees: Couplings, *, parts: _Parts) -> Iterato
     links = [s for f in FINGERS for i in range(4) for s in link_shapes(f, i)]
     yield friction("robot", links, touched)
     yield row("robot.joint_damping", "N m s/rad", _damping, robot, "Of every joint.")
-    gains = {"safety_damping": (("biasprm", N_JOINTS, 2, -1.0),)}
+    gains: dict[str, Any] = {"safety_damping": (("biasprm", N_JOINTS, 2, -1.0),)}
     if not parts.torques:
         gains["position_gains"] = (("gainprm", 0, 0, 1.0), ("biasprm", 0, 1, -1.0))
         gains["velocity_gains"] = (("biasprm", 0, 2, -1.0),)

@@ -12,7 +12,7 @@ from scm_world.geometry.hulls import Hull
 from scm_world.models import GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.scene import Overlap, State
 from scm_world.tasks.composition import Commands, Composition, Entity
-from scm_world.tasks.model import ModelComposition
+from scm_world.tasks.model import ModelComposition, causes_of
 from scm_world.tasks.trifinger.conventions import CONVENTIONS, TriFingerConventions
 from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
 from scm_world.tasks.trifinger.hardware import (
@@ -22,8 +22,7 @@ from scm_world.tasks.trifinger.hardware import (
     RESOLUTIONS,
     preset,
 )
-from scm_world.variables import Parent, Variable
-from scm_world.variables.kinds import parent_of
+from scm_world.variables import Variable
 from scm_world.variables.reserved import PRESET
 
 if TYPE_CHECKING:
@@ -134,22 +133,12 @@ class BlockWorld(Composition):
             row.name: (row.always, row.contact) for row in system.states if not row.reported
         }
         for entity in self.entities:
-            for name, states in entity.actions().items():
-                reached = frozenset().union(*(trees[state] for state in states))
+            for name, acted_on in entity.actions().items():
+                reached = frozenset().union(*(trees[state] for state in acted_on))
                 effects[name] = reached, every - reached
-        effects |= {
-            PRESET: (every, frozenset()),
-            **dict.fromkeys(self.deciding, (frozenset(), every)),
-        }
-        shared: dict[tuple[str, ...], dict[str, Parent]] = {}
-        causes: dict[frozenset[int], tuple[tuple[Parent, ...], dict[str, Parent]]] = {}
-        for own in set(trees.values()):
-            always = [name for name, effect in effects.items() if not own.isdisjoint(effect[0])]
-            others = tuple(n for n, e in effects.items() if not own.isdisjoint(e[0] | e[1]))
-            alike = shared.setdefault(
-                others, {name: parent_of(name, 1, "contact") for name in others}
-            )
-            causes[own] = tuple(parent_of(name, 1) for name in always), alike
+        nowhere: frozenset[int] = frozenset()
+        effects |= {PRESET: (every, nowhere), **dict.fromkeys(self.deciding, (nowhere, every))}
+        causes = causes_of(effects, set(trees.values()))
         declared: list[Variable] = list(self.shared)
         for entity in self.entities:
             variables, states = entity.declared
