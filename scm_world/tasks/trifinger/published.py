@@ -5,8 +5,8 @@ meshes, the table is a plate, everything that can touch does, robot and blocks l
 move, spinning friction belongs to blocks and obstacles alone, and torques are those before a step.
 The wall is ours.
 
-``meshes.npz`` has the corners of hulls and plate, from CausalWorld 1.2 (MIT license), in the frames of
-the bodies [m].
+``meshes.npz`` has the corners of hulls and plate, from CausalWorld 1.2 (MIT license), in the frames
+of the bodies [m].
 """
 
 from __future__ import annotations
