@@ -4,15 +4,13 @@ Run it with ``python examples/own_task.py [N]``; a recipe takes its name, too.
 """
 
 import sys
-from collections.abc import Iterable
-from typing import ClassVar, Unpack
+from typing import Any, ClassVar, Unpack
 
 import gymnasium
 import numpy as np
 
 from scm_world.evaluation import Protocol, evaluate
 from scm_world.tasks import TriFingerTask, register, term
-from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger.entities.goals import goal_position
 from scm_world.tasks.trifinger.single import GOAL, TOOL, Alike, OneBlock
 from scm_world.variables import Function, Parent, Variable
@@ -33,28 +31,21 @@ class Centering(TriFingerTask):
     """One block, and a goal in the middle of the floor."""
 
     name = "centering"
-    options = Alike  # those of one block, its shape and its mass among them
-    tools, targets = (TOOL,), {GOAL: TOOL}  # constants
     default_weights: ClassVar = {"reward.nearer": 100.0, "fractional_success": 1.0}
 
     def __init__(self, **options: Unpack[Alike]) -> None:
         self.block = OneBlock((0.0, 0.1), options)
         super().__init__(**self.block.common)
 
-    def shared(self) -> Iterable[Variable]:
-        """Declare the size that both have."""
-        return self.block.shared()
-
-    def entities(self) -> tuple[Entity, ...]:
+    def entities(self) -> tuple[Any, ...]:
         """List block and goal."""
         where = goal_position(GOAL, parents=(f"{GOAL}.size",), mechanism=Function(middle))
-        block = self.block
-        return block.tool(spaces=block.spaces(TOOL)), block.goal(where, spaces=block.spaces(GOAL))
+        return self.block.tool(), self.block.goal(where)
 
     def dense(self) -> tuple[Variable, ...]:
         """Declare what is rewarded besides filling the goal."""
-        place = f"{TOOL}.cartesian_position"
-        return (term("reward.nearer", nearer, (place, Parent(place, 1)), "How much nearer it is."),)
+        at = f"{TOOL}.cartesian_position"
+        return (term("reward.nearer", nearer, (at, Parent(at, 1)), "How much nearer it is."),)
 
 
 def main(n: str = "5") -> None:

@@ -34,6 +34,7 @@ from scm_world.variables import (
     Variable,
 )
 from scm_world.variables.bundles import bundle
+from scm_world.variables.kinds import parent_of
 from scm_world.variables.mechanisms import Stacked
 
 CONTROL_DT = 0.02
@@ -80,7 +81,7 @@ class ModelComposition(Composition):
     ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance [m].
 
-        Not listed are shapes that do so in the pose of the file. All is listed of a model that
+        Not listed are shapes that do so in the pose of the file. Nothing is listed of a model that
         describes no bodies.
         """
         if not self._model.bodies:
@@ -445,7 +446,7 @@ def causes_of(model: Model) -> dict[frozenset[int], tuple[Parent, ...]]:
     rows = [row for row in (*seen, *states, *model.inputs) if row.always or row.contact]
     for trees in {row.trees for row in model.states}:
         found[trees] = tuple(
-            Parent(row.name, 1, None if trees & row.always else "contact")
+            parent_of(row.name, 1, None if trees & row.always else "contact")
             for row in rows
             if trees & (row.always | row.contact)
         )

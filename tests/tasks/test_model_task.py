@@ -397,17 +397,6 @@ def test_the_audit_of_bullet_says_that_a_friction_has_no_effect() -> None:
     assert world.do({"cube.friction": 1.5}).remarks == ()
 
 
-def test_a_body_below_the_floor_is_accepted() -> None:
-    """In a world of any model overlaps are not refused; contact pushes the body out."""
-    world = World.from_mjcf(SLIPPERY.format(priority=0))
-    world.reset(seed=0)
-    world.do({"c.cartesian_position": [0.0, 0.0, 0.05], "d.cartesian_position": [1.0, 0.0, 2.0]})
-    assert world["c.cartesian_position"][2] == 0.05
-    for _ in range(25):
-        world.step([])
-    assert world["c.cartesian_position"][2] > 0.09
-
-
 @pytest.mark.parametrize(
     "options",
     [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -187,7 +186,7 @@ class RobotConformance(BackendConformance):
 
     def test_a_new_block_moves_nothing(self, backend: Backend, scene: Scene) -> None:
         """When a block comes, the others keep their state and their parameters."""
-        more = replace(scene.structure, blocks=(*scene.structure.blocks, "new"))
+        more = scene.structure.with_(blocks=(*scene.structure.blocks, "new"))
         backend.apply(Difference(parameters={("near", "mass"): np.array(0.05)}))
         before = backend.state()
         backend.apply(Difference(structure=more))
@@ -202,7 +201,7 @@ class RobotConformance(BackendConformance):
         other = {key: other_parameter(key, value) for key, value in scene.parameters.items()}
         backend.apply(Difference(parameters=other))
         before = backend.state()
-        more = replace(scene.structure, obstacles=("new", "ledge"))
+        more = scene.structure.with_(obstacles=("new", "ledge"))
         for structure in (more, more.with_(preset=another(self.preset))):
             backend.apply(Difference(structure=structure))
             self.check_parameters(backend.parameters(other), other)

@@ -109,7 +109,7 @@ class TriFingerTask(Task):
 
     Attributes:
         interleaved: Whether block and goal alternate in the observation.
-        shape: Shape of block and goal, where that is not a box.
+        block: The block and its goal, a ``OneBlock``, where there is one of each.
         goal_causes: The variables that a new goal is drawn for.
         default_weights: Weight of every dense reward term, in order, and of
             ``fractional_success``.
@@ -136,7 +136,7 @@ class TriFingerTask(Task):
     choices: ClassVar[Mapping[str, Conventions]] = CONVENTIONS
 
     interleaved: ClassVar[bool] = False
-    shape: Hull | None = None
+    block: Any = None
     goal_causes: tuple[str, ...] = ()
     default_weights: ClassVar[Mapping[str, float]]
     paper_weights: ClassVar[Mapping[str, float]] = {}
@@ -193,17 +193,30 @@ class TriFingerTask(Task):
     @property
     def tools(self) -> tuple[str, ...]:
         """Names of the blocks that should be moved: one for each part."""
+        if self.block is not None:
+            return tuple(self.block.targets.values())
         return tuple(f"tool_{name}" for name, _ in self.parts())
 
     @property
     def targets(self) -> Mapping[str, str]:
         """Names of the goals, each with the block that its solution puts there."""
+        if self.block is not None:
+            return dict(self.block.targets)
         return {f"goal_{name}": f"tool_{name}" for name, _ in self.parts()}
 
     @property
     def obstacles(self) -> tuple[str, ...]:
         """Names of the obstacles."""
         return ()
+
+    @property
+    def shape(self) -> Hull | None:
+        """Shape of block and goal, where that is not a box."""
+        return None if self.block is None else self.block.shape
+
+    def shared(self) -> Iterable[Variable]:
+        """Declare one size, or one shape, for block and goal, where there is one of each."""
+        return () if self.block is None else self.block.shared()
 
     def dense(self) -> Iterable[Variable]:
         """Declare the dense reward terms."""

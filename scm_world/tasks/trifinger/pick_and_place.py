@@ -114,7 +114,6 @@ class PickAndPlace(TriFingerTask):
     options = Alike
     obstacles = (WALL,)
     ready_terms = shaping.ONE_BLOCK
-    tools, targets = (TOOL,), {GOAL: TOOL}  # a constant
     goal_causes: tuple[str, ...] = (SIDE, f"{GOAL}.polar", f"{GOAL}.euler_orientation")
 
     def __init__(
@@ -126,7 +125,7 @@ class PickAndPlace(TriFingerTask):
     ) -> None:
         self.block = OneBlock(tool_block_position, options)
         super().__init__(**self.block.common)
-        self.shape, self.goal_causes = self.block.shape, self.block.causes(self.goal_causes)
+        self.goal_causes = self.block.causes(self.goal_causes)
         self._polar = self.block.floor_polar(goal_block_position)
 
     def entities(self) -> Iterable[Entity]:

@@ -96,7 +96,6 @@ class Picking(TriFingerTask):
     }
     options = Alike
     ready_terms = shaping.ONE_BLOCK
-    tools, targets = (TOOL,), {GOAL: TOOL}  # a constant
     goal_causes: tuple[str, ...] = (HEIGHT,)
 
     def __init__(
@@ -108,12 +107,8 @@ class Picking(TriFingerTask):
     ) -> None:
         self.block = OneBlock(tool_block_position, options)
         super().__init__(**self.block.common)
-        self.shape, self.goal_causes = self.block.shape, self.block.causes(self.goal_causes)
+        self.goal_causes = self.block.causes(self.goal_causes)
         self._height = checked("goal_height", goal_height, HEIGHT_BOUNDS)
-
-    def shared(self) -> Iterable[Variable]:
-        """One size, or one shape, for both."""
-        return self.block.shared()
 
     def entities(self) -> Iterable[Entity]:
         """A block and its goal."""

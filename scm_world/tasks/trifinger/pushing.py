@@ -46,7 +46,6 @@ class Pushing(TriFingerTask):
     paper_weights = {"reward.orientation": 0.0}  # noqa: RUF012 # a constant
     options = Alike
     ready_terms = shaping.ONE_BLOCK
-    tools, targets = (TOOL,), {GOAL: TOOL}  # a constant
     goal_causes: tuple[str, ...] = ("goal_block.polar", "goal_block.euler_orientation")
 
     def __init__(
@@ -58,23 +57,18 @@ class Pushing(TriFingerTask):
     ) -> None:
         self.block = OneBlock(tool_block_position, options)
         super().__init__(**self.block.common)
-        self.shape, self.goal_causes = self.block.shape, self.block.causes(self.goal_causes)
+        self.goal_causes = self.block.causes(self.goal_causes)
         self._polar = self.block.floor_polar(goal_block_position)
-
-    def shared(self) -> Iterable[Variable]:
-        """One size, or one shape, for both."""
-        return self.block.shared()
 
     def entities(self) -> Iterable[Entity]:
         """A block and its goal."""
-        yield self.block.tool(spaces=self.block.spaces(TOOL))
+        yield self.block.tool()
         rests = turned_on_the_floor if self.shape is None else shapes.hull_on_the_floor
         yield self.block.goal(
             polar(GOAL, self._polar, a=numbers.POLAR_A, b=numbers.POLAR_B),
             goal_position(
                 GOAL, parents=(f"{GOAL}.polar", *self.block.form(GOAL)), mechanism=Function(rests)
             ),
-            spaces=self.block.spaces(GOAL),
         )
 
     def dense(self) -> Iterable[Variable]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from typing import Any, final
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, ClassVar, final
 
 import numpy as np
 
@@ -59,8 +59,11 @@ class OneBlock:
     Attributes:
         common: The options that every task has.
         shape: Shape of block and goal; None for a box.
+        targets: The goal, with the block that belongs there.
         place: x and y of the block at the start, and the height of its lowest point [m].
     """
+
+    targets: ClassVar[Mapping[str, str]] = {GOAL: TOOL}
 
     def __init__(self, tool_block_position: Place, options: Alike) -> None:
         self.common: Any = dict(options)
@@ -121,26 +124,27 @@ class OneBlock:
     def tool(
         self,
         *,
-        spaces: tuple[Box, Box],
+        spaces: tuple[Box, Box] | None = None,
         start: Function | None = None,
         causes: tuple[str, ...] = (),
     ) -> Entity:
         """Describe the block.
 
         Args:
-            spaces: A and B of its cylindrical position.
+            spaces: A and B of its cylindrical position; those on the floor if None.
             start: Where it begins, if that has further causes than size, orientation and shape.
             causes: The further ones.
         """
         corners = () if self.shape is None else (f"{TOOL}.vertices",)
+        a, b = spaces or self.spaces(TOOL)
         return ToolBlock(
             TOOL,
             size=self.size_of(TOOL),
             mass=block_mass(f"{TOOL}.mass", default=self._mass),
             spawn=start or Function(shapes.stand, constants={"place": self.place}),
             spawn_from=(*corners, *causes),
-            a=spaces[0],
-            b=spaces[1],
+            a=a,
+            b=b,
             hull=self.shape,
             orientation=self._turns[TOOL],
             carry=None if self.shape is None else Function(shapes.keep_lowest_corner),
@@ -149,17 +153,17 @@ class OneBlock:
     def goal(
         self,
         *place: Variable,
-        spaces: tuple[Box, Box],
+        spaces: tuple[Box, Box] | None = None,
         inverse: Callable[[Floats], Floats] = from_cylindrical,
     ) -> Entity:
         """Describe the goal.
 
         Args:
             place: Its position, and the causes of it.
-            spaces: A and B of its cylindrical position.
+            spaces: A and B of its cylindrical position; those on the floor if None.
             inverse: Cartesian position where a cylindrical one is set.
         """
-        (a, b), box = spaces, self.shape is None
+        (a, b), box = spaces or self.spaces(GOAL), self.shape is None
         pose = (*place, *self._goal_turn())
         size = self.size_of(GOAL)
         return GoalBlock(
