@@ -180,12 +180,15 @@ def settle(model: Model, given: State) -> list[float]:
     for name in model.layout.reported:
         where = model.layout.slices[name]
         numbers[where] = [0.0] * (where.stop - where.start)
-    for start in rotations(model):
-        turn = numbers[start : start + 4]
-        square = sum(part * part for part in turn)
-        if abs(square - 1.0) >= UNIT and square != 0.0:
-            scale = math.sqrt(square)
-            numbers[start : start + 4] = [part / scale for part in turn]
+    slices = model.layout.slices
+    for row in model.states:
+        if row.kind == "rotation":
+            where = slices[row.name]
+            turn = numbers[where]
+            square = sum(part * part for part in turn)
+            scale = math.sqrt(square) if abs(square - 1.0) >= UNIT and square else 1.0
+            scale = -scale if row.frame == "world" and turn[3] < 0.0 else scale
+            numbers[where] = [part / scale for part in turn]
     return numbers
 
 
