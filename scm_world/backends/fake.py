@@ -16,7 +16,7 @@ from scm_world.models.scene import State
 class FakeBackend(InMemory):
     """No forces and no contacts: nothing moves.
 
-    A structure can say otherwise. Its ``realization("fake")`` has three functions:
+    A model can say otherwise. Its ``fake`` has three functions:
     ``move(structure, state, command, seconds)`` and ``settle(state)``, which change a state in
     place, and ``inertia(structure, parameters, body)``.
     """
@@ -31,7 +31,7 @@ class FakeBackend(InMemory):
             UnknownOption: There is no such body.
         """
         self._check([(body, "mass")])
-        custom = self._structure.realization("fake")
+        custom = getattr(self._structure, "fake", None)
         if custom is not None:
             return np.asarray(custom.inertia(self._structure, self._parameters, body))
         self._check([(body, "inertia")])
@@ -43,7 +43,7 @@ class FakeBackend(InMemory):
         Raises:
             EngineFailure: A number is not finite afterwards.
         """
-        custom = self._structure.realization("fake")
+        custom = getattr(self._structure, "fake", None)
         if custom is not None:
             custom.move(self._structure, self._state, command, substeps * self._structure.timestep)
         if not np.isfinite(self._state.vector).all():
@@ -51,6 +51,6 @@ class FakeBackend(InMemory):
 
     def _place(self, state: State) -> None:
         super()._place(state)
-        custom = self._structure.realization("fake")
+        custom = getattr(self._structure, "fake", None)
         if custom is not None:
             custom.settle(self._state)

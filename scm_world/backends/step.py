@@ -90,9 +90,6 @@ class StepModel:
     vectorized: bool = False
     signature: Literal["dicts", "arrays"] = "dicts"
 
-    def realization(self, backend: str) -> None:
-        """Return None: the function itself is the physics."""
-
     @cached_property
     def digest(self) -> str:
         """Hash of the function and the tables."""

@@ -172,6 +172,9 @@ class Model:
         staged: Whether its physics steps have stages (Runge-Kutta), in each of which bodies may
             touch, while a backend lists the contacts of the last one alone.
         bodies: All bodies, parents before their children; the first is the world.
+        instead: The model that Bullet realises in place of this one, where that is another one.
+        views: Its cameras, and what pictures of goals show, where there is more than in its file.
+        fake: What moves without physics; see ``backends.fake``. It can be pickled.
     """
 
     name: str
@@ -187,6 +190,9 @@ class Model:
     notes: tuple[str, ...] = ()
     staged: bool = False
     bodies: tuple[BodyRow, ...] = field(default=(), repr=False)
+    instead: Model | None = field(default=None, repr=False)
+    views: Any = field(default=None, repr=False)
+    fake: Any = field(default=None, repr=False)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Model) and self.digest == other.digest
@@ -243,6 +249,3 @@ class Model:
         for name, where in self.layout.slices.items():
             if name in there:
                 state.vector[where] = before.state.vector[there[name]]
-
-    def realization(self, backend: str) -> None:
-        """Return None: every backend realises a model in its own way."""

@@ -148,15 +148,6 @@ class Structure(Protocol):
     def carried(self, state: State, before: Scene) -> None:
         """Copy the states that another structure has too, from a scene of it into a state."""
 
-    def realization(self, backend: str) -> Any:
-        """Return a custom realisation, or None where the backend's own one applies.
-
-        Args:
-            backend: ``"mujoco"``: a class derived from ``backends.mujoco.realization.Realization``;
-                ``"bullet"``: one derived from ``backends.bullet.client.Client``; ``"fake"``: see
-                ``backends.fake``; ``"renderer"``: ``models.camera.Views``.
-        """
-
 
 @final
 @dataclass(frozen=True)

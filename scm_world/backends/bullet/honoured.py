@@ -35,8 +35,7 @@ UNIT = 1e-12  # a quaternion whose squared norm is this near to 1 is taken as it
 
 def realized(model: Model) -> Model:
     """Return the model that stands for another one in this engine; usually itself."""
-    instead: Any = model.realization("bullet")  # type: ignore[func-returns-value]
-    return instead or model
+    return model.instead or model
 
 
 @lru_cache(maxsize=64)

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 def views_of(structure: Any) -> Views | None:
     """Return the cameras that a structure brings, if it does."""
-    found: Views | None = structure.realization("renderer")
+    found: Views | None = getattr(structure, "views", None)
     return found
 
 

@@ -128,7 +128,6 @@ class TriFingerTask(Task):
     action_modes = tuple(ACTIONS)
     presets = tuple(PRESETS)
     resolutions = RESOLUTIONS
-    generated_graph = True
     time_unit = TIMESTEP
     frame_skip = 10
     n_actions = hardware.N_JOINTS

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from scm_world._types import Floats
 from scm_world.models import Parameters
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.system import TriFinger
+
+if TYPE_CHECKING:
+    from scm_world.tasks.trifinger.system import TriFinger
 
 
 def move(structure: TriFinger, state: PhysicalState, command: Floats, seconds: float) -> None:

@@ -19,9 +19,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from importlib import import_module
 from typing import Any, final
 
 import mujoco
@@ -37,7 +36,8 @@ from scm_world.backends.mujoco.trees import NOTHING, Couplings, Effect
 from scm_world.geometry.hulls import Hull
 from scm_world.models.model import Model
 from scm_world.models.scene import State
-from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger import fake, hardware
+from scm_world.tasks.trifinger.cameras import VIEWS
 from scm_world.tasks.trifinger.hardware import (
     FAST,
     FINGERS,
@@ -109,7 +109,6 @@ class TriFinger(Model):
     hulls: tuple[tuple[str, Hull], ...] = ()
     torques: bool = False
     published: bool = False
-    instead: Model | None = field(default=None, repr=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how it is made, so that pickling costs little."""
@@ -138,21 +137,6 @@ class TriFinger(Model):
         """Return a state to read into."""
         return PhysicalState(self.layout)
 
-    def realization(self, backend: str) -> Any:
-        """Return what Bullet realises, or how the robot is realised without physics, or drawn."""
-        if backend == "bullet":
-            return self.instead
-        if backend not in _REALIZATIONS:
-            return None
-        module, what = _REALIZATIONS[backend]
-        found = import_module(f"scm_world.tasks.trifinger.{module}")
-        return found if what is None else getattr(found, what)
-
-
-_REALIZATIONS = {
-    "fake": ("fake", None),
-    "renderer": ("cameras", "VIEWS"),
-}
 
 START = "start"
 """The keyframe in which fingers and blocks are clear of one another."""
@@ -206,7 +190,8 @@ def trifinger(
     described = {name: getattr(read, name) for name in read.__dataclass_fields__}
     described["digest"] += f" {published}"
     instead = _read(replace(parts, published=True), resolution) if published else None
-    return TriFinger(**described, **{**vars(parts), "published": published}, instead=instead)
+    described |= {"instead": instead, "views": VIEWS, "fake": fake}
+    return TriFinger(**described, **{**vars(parts), "published": published})
 
 
 def _read(parts: _Parts, resolution: str) -> Model:
