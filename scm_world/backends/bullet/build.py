@@ -131,13 +131,11 @@ class Built:
 
 
 def _plans(mj: mujoco.MjModel, touching: list[int]) -> Iterator[Plan]:
-    """List what becomes a unit: shapes that cannot move; what hangs on the world; free bodies.
+    """List what becomes a unit: what hangs on the world; shapes that cannot move; free bodies.
 
-    Kinematic trees that hang on the world share a multibody, as far as there is room: the engine
-    is asked and told of all of them at once, and solves each by itself.
+    They meet in this order. Kinematic trees that hang on the world share a multibody, as far as
+    there is room: the engine is asked and told of all of them at once, and solves each by itself.
     """
-    still = mj.body_treeid[mj.geom_bodyid] < 0
-    yield from (Plan([], [], [geom]) for geom in touching if still[geom])
     free, hanging, room = list[Plan](), Plan([], [], []), MOST_LINKS
     for tree in range(mj.ntree):
         plan = plan_of(mj, tree, touching)
@@ -152,6 +150,8 @@ def _plans(mj: mujoco.MjModel, touching: list[int]) -> Iterator[Plan]:
         hanging.joints.extend(plan.joints)
         hanging.geoms.extend(plan.geoms)
     yield from ([hanging] if hanging.bodies else [])
+    still = mj.body_treeid[mj.geom_bodyid] < 0
+    yield from (Plan([], [], [geom]) for geom in touching if still[geom])
     yield from free
 
 
@@ -463,7 +463,7 @@ def _settle(
 ) -> None:
     """Take away what the engine does by itself: damping, motors, sleep, a highest speed."""
     # One property a call: beside damping or maxJointVelocity, all others would land on the base.
-    damping = _damping(mj, free=-1 in joints.values())
+    damping = custom(mj, "bullet_damping", int(-1 in joints.values()))
     engine.changeDynamics(made, -1, linearDamping=damping, physicsClientId=client)
     engine.changeDynamics(made, -1, angularDamping=damping, physicsClientId=client)
     engine.changeDynamics(made, -1, maxJointVelocity=FASTEST, physicsClientId=client)
@@ -488,14 +488,14 @@ def _settle(
             )
 
 
-def _damping(mj: mujoco.MjModel, *, free: bool) -> float:
-    """Return what a multibody loses of its speed in a second, roughly; usually nothing.
+def custom(mj: mujoco.MjModel, name: str, index: int = 0) -> float:
+    """Return a custom number that a model has for this engine; 0 if it has none.
 
-    A model says that for this engine with two custom numbers ``bullet_damping``: for what hangs on
-    the world, and for free bodies.
+    ``bullet_damping`` is what multibodies lose of their speed in a second, roughly: what hangs on
+    the world, and free bodies. ``bullet_early_end`` is the residual at which the solver ends.
     """
-    number = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_NUMERIC, "bullet_damping")
-    return 0.0 if number < 0 else float(mj.numeric_data[mj.numeric_adr[number] + int(free)])
+    number = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_NUMERIC, name)
+    return 0.0 if number < 0 else float(mj.numeric_data[mj.numeric_adr[number] + index])
 
 
 def _couple(

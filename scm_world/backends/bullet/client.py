@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import ContactPoint
-from scm_world.backends.bullet.build import BALL, FREE, Built, Handle, solid
+from scm_world.backends.bullet.build import BALL, FREE, Built, Handle, custom, solid
 from scm_world.backends.bullet.honoured import heavy, realized, rotations
 from scm_world.backends.bullet.joints import Part, parts
 from scm_world.backends.mujoco import reading
@@ -231,9 +231,6 @@ class Client:
         self._built = Built(engine, self.handle)
         engine.setPhysicsEngineParameter(
             numSolverIterations=SOLVER_ITERATIONS,
-            # An early end, decided for all bodies together, would let bodies act on each
-            # other without touching.
-            solverResidualThreshold=0.0,
             deterministicOverlappingPairs=1,
             physicsClientId=self.handle,
         )
@@ -259,11 +256,9 @@ class Client:
         self._twin.place(np.array(instant.state))
         for part in self._parts:
             part.put(self._twin.data)
-        moves = self._twin.model.body_treeid[self._twin.model.geom_bodyid] >= 0
-        for geom, place in self._built.geoms.items():
-            if moves[geom]:
-                both = self._filters[place]
-                self.engine.setCollisionFilterGroupMask(*place, *both, physicsClientId=self.handle)
+        for place in self._built.geoms.values():
+            both = self._filters[place]
+            self.engine.setCollisionFilterGroupMask(*place, *both, physicsClientId=self.handle)
         self._check(instant.state)
         self._untouched = instant.state
 
@@ -362,6 +357,9 @@ class Client:
         gravity = np.zeros(3) if disabled(mj, _OFF.mjDSBL_GRAVITY) else mj.opt.gravity
         yield ("gravity", WORLD), gravity.tolist()
         yield ("timestep", WORLD), mj.opt.timestep
+        # An early end, decided for all bodies together, lets bodies act on each other without
+        # touching: only a model that asks for it has one.
+        yield ("early_end", WORLD), custom(mj, "bullet_early_end")
         for body, place in built.bodies.items():
             yield ("solid", place), (float(mj.body_mass[body]), *solid(mj, body)[0].tolist())
         rigid = not disabled(mj, _OFF.mjDSBL_CONSTRAINT)
@@ -392,6 +390,8 @@ class Client:
                 engine.setGravity(*value, **options)
             case "timestep":
                 engine.setPhysicsEngineParameter(fixedTimeStep=value, **options)
+            case "early_end":
+                engine.setPhysicsEngineParameter(solverResidualThreshold=value, **options)
             case "solid":
                 mass, *moments = value
                 engine.changeDynamics(*place, mass=mass, localInertiaDiagonal=moments, **options)

@@ -53,7 +53,7 @@ from scm_world.tasks.trifinger.hardware import (
     joints_of,
     link_name,
 )
-from scm_world.tasks.trifinger.published import alter, spinning_weights, touching
+from scm_world.tasks.trifinger.published import SIDES, alter, restore, spinning_weights, touching
 from scm_world.tasks.trifinger.state import PhysicalState
 
 FLOOR = "floor"
@@ -283,6 +283,8 @@ def _compiled(parts: _Parts) -> mujoco.MjModel:
         start += [x, 0.09 * row, _BLOCK_HALF + LAYER * layer, 1.0, 0.0, 0.0, 0.0]
     spec.add_key(name=START, qpos=start)
     model, defaults = spec.compile(), _defaults(parts)
+    if parts.published:
+        restore(model)
     scratch = mujoco.MjData(model)
     for bound in _bindings(model, Couplings(model), parts=parts):
         slot = bound.slot(model, scratch)  # type: ignore[misc] # every binding has one
@@ -577,7 +579,8 @@ def _bindings(mj: mujoco.MjModel, trees: Couplings, *, parts: _Parts) -> Iterato
             effect = trees.always([tree]) if index else NOTHING
             yield row(f"{link}.mass", "kg", slot, effect, "Its inertia scales with it.")
             yield color(link, link_shapes(finger, index))
-    walls, insides = ([name(i) for i in range(WALL_SEGMENTS)] for name in (wall_name, inside_name))
+    walls = [wall_name(i) for i in range(SIDES if parts.published else WALL_SEGMENTS)]
+    insides = [inside_name(i) for i in range(WALL_SEGMENTS)]
     for name, shapes, seen in ((FLOOR, [FLOOR], [FLOOR]), (STAGE, walls, insides)):
         yield friction(name, shapes, touching)
         yield color(name, seen)
