@@ -26,7 +26,7 @@ from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
 from scm_world.tasks.trifinger.kinematics import forward, link_frames
-from scm_world.tasks.trifinger.system import trifinger
+from scm_world.tasks.trifinger.system import tip_name, trifinger
 
 TOP = Camera("top", eye=(0.0, 0.0, 0.25), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
 """Below the robot's hub, looking down."""
@@ -115,7 +115,7 @@ def test_fingertips_appear_where_kinematics_puts_them(scene: Scene) -> None:
         camera = Camera("side", tuple(eye.tolist()), tuple(tip.tolist()))
         image = render(scene, camera)
         owner = image.segmentation[pixel(image, camera, tip)]
-        assert image.names[owner] == hardware.link_name(finger, 3)
+        assert image.names[owner] == tip_name(finger)
 
 
 def test_capsules_follow_their_links(scene: Scene) -> None:
@@ -154,7 +154,7 @@ def test_every_color_can_be_seen(scene: Scene, body: str) -> None:
         own = was.shows(body)
         for finger in hardware.FINGERS:
             if body == hardware.link_name(finger, 3):  # a tip has the color of its link
-                own = own | was.shows(hardware.link_name(finger, 3))
+                own = own | was.shows(tip_name(finger))
         np.testing.assert_array_equal(changed, own)
         seen += int(changed.sum())
     assert seen > 0

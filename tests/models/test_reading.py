@@ -16,7 +16,7 @@ from model_files import LONG, PENDULUM, QUICK, SUITE, URDFS, arrays, model_file,
 
 from scm_world.backends import read_model
 from scm_world.backends.mujoco.fields import slots
-from scm_world.backends.mujoco.reading import compiled, contact_bodies, permutation
+from scm_world.backends.mujoco.reading import compiled, permutation
 from scm_world.backends.mujoco.sources import realized
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.models import Model
@@ -310,7 +310,7 @@ def test_mocap_bodies_have_a_pose_that_can_be_set() -> None:
 
 def test_contacts_name_bodies() -> None:
     """The world's own shapes belong to the world."""
-    assert contact_bodies(compiled(read_model(pile(2)))) == ("world", "b0", "b1")
+    assert read_model(pile(2)).owners == ("world", "b0", "b1")
 
 
 # --- settings ----------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import ActionError, MissingExtra, ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.recording import record
 from scm_world.policies import MlpPolicy, load_policy
-from scm_world.tasks import Observation
+from scm_world.tasks import make_task
 from scm_world.training import imitation
 from scm_world.training.imitation import (
     Demonstrations,
@@ -221,7 +222,8 @@ def test_an_episode_ends_once_it_is_settled() -> None:
 
 def test_a_task_without_symmetries_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is silently left out of a lesson."""
-    monkeypatch.setattr("scm_world.tasks.Picking.observation", Observation())
+    seen = replace(make_task("picking").observation, symmetries=None)
+    monkeypatch.setattr("scm_world.tasks.Picking.observation", seen)
     with pytest.raises(UnknownOption, match=r"symmetric.*False"):
         shown(1, symmetric=True)
 

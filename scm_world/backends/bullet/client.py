@@ -517,8 +517,7 @@ class Client:
 
         The engine also keeps points of bodies that only came near; they are left out.
         """
-        owners = self._twin.model.geom_bodyid
-        names = {h: self._names[owners[geom]] for geom, h in self._built.geoms.items()}
+        names = {h: self._twin.owners[geom] for geom, h in self._built.geoms.items()}
         return tuple(
             ContactPoint(
                 bodies=(names[point[1], point[3]], names[point[2], point[4]]),

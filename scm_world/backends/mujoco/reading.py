@@ -126,6 +126,7 @@ def read_model(
     controls: Sequence[str] | None = None,
     bindings: Bindings | None = None,
     frame: Literal["body", "world"] = "body",
+    part_of: Mapping[str, str] | None = None,
 ) -> Model:
     """Read a model, and describe it by tables.
 
@@ -156,6 +157,8 @@ def read_model(
             effect then.
         frame: ``"world"`` for angular velocities of free bodies in the world, and orientations with
             w >= 0; ``"body"`` for those that MuJoCo has.
+        part_of: Bodies that contacts are not listed of, each with the body that they are a part of:
+            ``{"fingertip": "lower_link"}``.
 
     Raises:
         UnreadableFile: There is no such file, or it is no text.
@@ -200,6 +203,7 @@ def read_model(
     keys = "\0".join(f"{row.name}\0{row.key}" for row in parameters)
     keys += "" if keyframe is None else f"\0{keyframe}"
     keys += "" if states is None else f"\0{[*states.items()]}"
+    keys += "" if part_of is None else f"\0{[*part_of.items()]}"
     keys += "" if (frame, len(inputs)) == ("body", mj.nu) else f"\0{frame} {len(inputs)}"
     return Model(
         name=name or own_name or "model",
@@ -219,6 +223,7 @@ def read_model(
         notes=(*replaced, *changed, *drift, *_notes(mj, keyframe)),
         staged=_is_staged(mj),
         bodies=tuple(_bodies(mj, names, trees)),
+        owners=contact_bodies(mj, part_of or {}),
     )
 
 
@@ -708,10 +713,11 @@ def _inputs(
             )
 
 
-def contact_bodies(mj: mujoco.MjModel) -> tuple[str, ...]:
+def contact_bodies(mj: mujoco.MjModel, part_of: Mapping[str, str]) -> tuple[str, ...]:
     """Name the body of every shape, then the flexes, as lists of contacts do."""
     names = element_names(mj)
-    return (*(names["body"][int(body)] for body in mj.geom_bodyid), *names["flex"])
+    own = [names["body"][int(body)] for body in mj.geom_bodyid]
+    return (*(part_of.get(name, name) for name in own), *names["flex"])
 
 
 def body_names(mj: mujoco.MjModel) -> tuple[str, ...]:

@@ -141,7 +141,7 @@ class Realization:
         self._constant = frozenset(key for key, slot in self._slots.items() if slot.constant)
         self._follow_ups = {key: f for key, slot in self._slots.items() if (f := slot.follow_up)}
         self._bodies = reading.body_names(compiled)
-        self.owners = reading.contact_bodies(compiled)
+        self.owners = structure.owners
         self.kept: dict[ParameterKey, Floats] = {}
         self.applied: Parameters | None = None
         self._numbers: bytes | None = None  # of what is kept, if nothing was written since

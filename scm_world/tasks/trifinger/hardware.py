@@ -107,11 +107,6 @@ class Capsule:
     end: tuple[float, float, float]
     radius: float
 
-    def moved(self, by: tuple[float, float, float]) -> Capsule:
-        """Return the same shape, moved in the frame of the link [m]."""
-        (a, b, c), (d, e, f), (x, y, z) = self.start, self.end, by
-        return Capsule((a + x, b + y, c + z), (d + x, e + y, f + z), self.radius)
-
 
 COLLISION = {
     "upper": Capsule((-0.177, 0.0055, 0.0), (-0.0225, 0.0055, 0.0), 0.0225),

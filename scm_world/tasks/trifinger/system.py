@@ -212,6 +212,7 @@ def _read(parts: _Parts, resolution: str) -> Model:
         controls=[f"{joint}_servo" for joint in _JOINT_NAMES],
         bindings=partial(_bindings, parts=parts),
         frame="world",
+        part_of={tip_name(finger): link_name(finger, 3) for finger in FINGERS},
     )
 
 
@@ -486,8 +487,7 @@ def _add_robot(spec: mujoco.MjSpec, contact: tuple[float, float], *, torques: bo
         tip.mass, tip.inertia, tip.explicitinertial = hardware.TIP_MASS, hardware.TIP_INERTIA, True
         tip.ipos = hardware.TIP_CENTER["mujoco"]
         tip.add_site(name=tip_name(finger), group=UNSEEN)
-        shape = hardware.COLLISION["tip"].moved(hardware.TIP_ORIGIN)
-        _add_capsule(body, shape_name(finger, "tip"), shape)
+        _add_capsule(tip, shape_name(finger, "tip"), hardware.COLLISION["tip"])
     for purpose, limit in (("servo", _SPEC.limit), ("safety", 0.0)):
         motor = float(torques and purpose == "servo")
         for joint in _JOINT_NAMES:
