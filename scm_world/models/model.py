@@ -173,7 +173,8 @@ class Model:
             touch, while a backend lists the contacts of the last one alone.
         bodies: All bodies, parents before their children; the first is the world.
         owners: Name of the body of each shape, and of each flex, as contacts list it.
-        instead: The model that Bullet realises in place of this one, where that is another one.
+        instead: Makes the model that Bullet realises in place of this one, where that is another
+            one. It can be pickled.
         views: Its cameras, and what pictures of goals show, where there is more than in its file.
         fake: What moves without physics; see ``backends.fake``. It can be pickled.
     """
@@ -192,7 +193,7 @@ class Model:
     staged: bool = False
     bodies: tuple[BodyRow, ...] = field(default=(), repr=False)
     owners: tuple[str, ...] = field(default=(), repr=False)
-    instead: Model | None = field(default=None, repr=False)
+    instead: Callable[[], Model] | None = field(default=None, repr=False)
     views: Any = field(default=None, repr=False)
     fake: Any = field(default=None, repr=False)
 

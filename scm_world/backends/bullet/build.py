@@ -493,6 +493,8 @@ def custom(mj: mujoco.MjModel, name: str, index: int = 0) -> float:
 
     ``bullet_damping`` is what multibodies lose of their speed in a second, roughly: what hangs on
     the world, and free bodies. ``bullet_early_end`` is the residual at which the solver ends.
+    ``bullet_explicit_servos`` says that actuators act with the speed before a step: one that brakes
+    with the speed after it, as if nothing were touched, presses too little on what it touches.
     """
     number = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_NUMERIC, name)
     return 0.0 if number < 0 else float(mj.numeric_data[mj.numeric_adr[number] + index])

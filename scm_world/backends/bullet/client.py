@@ -469,6 +469,8 @@ class Client:
         options.disableflags |= SMOOTH
         if options.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             options.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        if custom(mj, "bullet_explicit_servos"):
+            options.integrator = mujoco.mjtIntegrator.mjINT_EULER
         self._twin.command[:] = command
         forces, rates, step = np.empty(mj.nv), np.empty(mj.nv), options.timestep
         for _ in range(substeps):

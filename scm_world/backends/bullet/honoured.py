@@ -33,9 +33,10 @@ from scm_world.models.scene import ParameterKey, State
 UNIT = 1e-12  # a quaternion whose squared norm is this near to 1 is taken as it is
 
 
+@lru_cache(maxsize=64)
 def realized(model: Model) -> Model:
     """Return the model that stands for another one in this engine; usually itself."""
-    return model.instead or model
+    return model if model.instead is None else model.instead()
 
 
 @lru_cache(maxsize=64)

@@ -45,8 +45,6 @@ def alter(spec: mujoco.MjSpec) -> None:
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
     spec.add_numeric(name="bullet_damping", size=2, data=DAMPING)
     spec.add_numeric(name="bullet_early_end", size=1, data=[EARLY_END])
-    for finger in FINGERS:
-        spec.body(f"robot_finger_{finger}_tip").ipos = (0.0, 0.0, 0.0)
     for name, corners in meshes().items():
         spec.add_mesh(name=name, uservert=corners.ravel().tolist())
         shapes = ["floor"] if name == TABLE else [f"{finger}/{name}" for finger in FINGERS]

@@ -189,11 +189,20 @@ def trifinger(
     read = _read(parts, resolution)
     described = {name: getattr(read, name) for name in read.__dataclass_fields__}
     described["digest"] += f" {published}"
-    instead = _read(replace(parts, published=True), resolution) if published else None
+    instead = partial(_read, replace(parts, engine="bullet", published=published), resolution)
     described |= {"instead": instead, "views": VIEWS, "fake": fake}
-    return TriFinger(**described, **{**vars(parts), "published": published})
+    return TriFinger(
+        **described,
+        blocks=blocks,
+        preset=preset,
+        obstacles=obstacles,
+        hulls=hulls,
+        torques=torques,
+        published=published,
+    )
 
 
+@lru_cache(maxsize=64)
 def _read(parts: _Parts, resolution: str) -> Model:
     """Compile what there is, and describe it."""
     states: dict[str, list[str]] = {}
@@ -224,7 +233,11 @@ _JOINT_NAMES = tuple(link_name(finger, index) for finger in FINGERS for index in
 @final
 @dataclass(frozen=True)
 class _Parts:
-    """What there is, and how it is commanded; see ``TriFinger``. ``published`` is the variant."""
+    """What there is, and how it is commanded; see ``TriFinger``.
+
+    ``published`` is the variant of the predecessor; ``engine`` decides where the mass of a
+    fingertip lies.
+    """
 
     blocks: tuple[str, ...]
     preset: Preset
@@ -232,6 +245,7 @@ class _Parts:
     hulls: tuple[tuple[str, Hull], ...]
     torques: bool
     published: bool = False
+    engine: str = "mujoco"
 
 
 def _compiled(parts: _Parts) -> mujoco.MjModel:
@@ -247,7 +261,7 @@ def _compiled(parts: _Parts) -> mujoco.MjModel:
     for name in parts.obstacles:
         _add_shape(spec.worldbody.add_body(name=name), name, **box, **_OBSTACLE_POSE)
     _add_wall(spec.worldbody)
-    _add_robot(spec, CONTACT[parts.preset.name], torques=parts.torques)
+    _add_robot(spec, parts)
     for name in parts.blocks:
         body, hull = spec.worldbody.add_body(name=name), hulls.get(name)
         body.add_freejoint()
@@ -270,6 +284,8 @@ def _compiled(parts: _Parts) -> mujoco.MjModel:
         pair.solref, pair.solreffriction = contact, friction
         pair.friction = (1.0, 1.0, SPINNING_FRICTION, _ROLLING_FRICTION, _ROLLING_FRICTION)
     pairs = contact_pairs(parts)
+    if parts.engine == "bullet":
+        spec.add_numeric(name="bullet_explicit_servos", size=1, data=[1.0])
     if parts.published:
         alter(spec)
         pairs = touching(parts.blocks, parts.obstacles)
@@ -444,12 +460,13 @@ def _add_wall(world: mujoco.MjsBody) -> None:
         )
 
 
-def _add_robot(spec: mujoco.MjSpec, contact: tuple[float, float], *, torques: bool) -> None:
+def _add_robot(spec: mujoco.MjSpec, parts: _Parts) -> None:
     """Hang each finger from the world; then add nine servos or motors, and nine dampers.
 
     MuJoCo works in the frame of the center of mass of a kinematic tree. With a tree per finger,
     and the links that cannot move outside of them, no mass changes the roundings elsewhere.
     """
+    contact = CONTACT[parts.preset.name]
     height, world = hardware.NOMINAL_HEIGHT - hardware.TABLE_OFFSET, spec.worldbody
     hub = world.add_body(name=ROBOT, pos=(0.0, 0.0, height))
     ellipsoid = mujoco.mjtGeom.mjGEOM_ELLIPSOID
@@ -485,11 +502,11 @@ def _add_robot(spec: mujoco.MjSpec, contact: tuple[float, float], *, torques: bo
             _add_capsule(body, shape_name(finger, name), hardware.COLLISION[name])
         tip = body.add_body(name=tip_name(finger), pos=hardware.TIP_ORIGIN)
         tip.mass, tip.inertia, tip.explicitinertial = hardware.TIP_MASS, hardware.TIP_INERTIA, True
-        tip.ipos = hardware.TIP_CENTER["mujoco"]
+        tip.ipos = hardware.TIP_CENTER[parts.engine]
         tip.add_site(name=tip_name(finger), group=UNSEEN)
         _add_capsule(tip, shape_name(finger, "tip"), hardware.COLLISION["tip"])
     for purpose, limit in (("servo", _SPEC.limit), ("safety", 0.0)):
-        motor = float(torques and purpose == "servo")
+        motor = float(parts.torques and purpose == "servo")
         for joint in _JOINT_NAMES:
             spec.add_actuator(  # without gains: they are parameters and follow
                 name=f"{joint}_{purpose}",
