@@ -101,7 +101,7 @@ def test_load_and_choose(fresh: Any) -> None:
     fresh.click("#variable details:last-child button >> nth=0")
     until(fresh, f"studio.panel.name === '{effects[0]}'")
     kinds = fresh.evaluate("studio.view.lanes[0].shapes.map(s => s.kind)")
-    assert {"plane", "mesh", "box", "sphere"} == {*kinds}
+    assert {"plane", "mesh", "box", "ellipsoid"} == {*kinds}
 
 
 def test_do_and_release(fresh: Any) -> None:
