@@ -23,7 +23,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.output.reading import read_bytes
+from scm_world.output.reading import read_bytes, regular
 
 _CHOICES = {
     "integrator": mujoco.mjtIntegrator,
@@ -130,6 +130,7 @@ def read_source(
         where, stem, mj = "the MjModel", "", copy.copy(source)
     else:
         spec, where, stem, urdf = _specified(source)
+        _check_files(spec)
         if urdf:
             _complete(spec, where, fixed_base=fixed_base)
         with understood(where):
@@ -146,6 +147,26 @@ def read_source(
     name = mj.names.split(b"\0", 1)[0].decode()
     name = stem if name in ("", _UNNAMED) else name
     return Source(binary.tobytes(), mujoco.__version__), name, where, notes
+
+
+def _check_files(spec: mujoco.MjSpec) -> None:
+    """Refuse files that MuJoCo would read without an end.
+
+    Raises:
+        UnreadableFile: A device, a pipe, or a file that is too large.
+    """
+    named = [(spec.meshdir, part.file) for part in (*spec.meshes, *spec.hfields, *spec.skins)]
+    for texture in spec.textures:
+        named += [(spec.texturedir, name) for name in (texture.file, *texture.cubefiles)]
+    for folder, name in named:
+        inner = os.path.basename(name) if spec.strippath else name
+        path = Path(spec.modelfiledir, folder, inner)
+        if name and path.exists() and not path.is_dir():
+            try:
+                regular(path)
+            except OSError as error:
+                advice = "correct the path that the model names"
+                raise UnreadableFile(str(path), str(error), advice) from None
 
 
 def _options(given: Mapping[str, Any]) -> tuple[tuple[str, float], ...]:
