@@ -63,10 +63,7 @@ RAISED = (-1.56, -0.08, -2.7) * 3  # [rad]
 ASIDE = (0.0, 1.5, -1.5) * 3  # [rad] stretched outward, the lower links hanging
 
 LINK_MASS = (1.0, 0.14854, 0.14854, 0.0307)  # [kg] links 0 to 3 of a finger
-TIP_MASS = 0.01  # [kg]
-TIP_CENTER = {"mujoco": TIP_ORIGIN, "bullet": (0.0, 0.0, 0.0)}
-"""Where its mass lies, in its own frame [m]. On MuJoCo that is 0.16 m beyond the tip, by mistake.
-It stays until policies are trained again: with the mass at the tip, grasps that held there slip."""
+TIP_MASS = 0.01  # [kg] in the origin of its frame
 TIP_INERTIA = (1.66666666667e-07,) * 3  # [kg m²]
 
 

@@ -189,7 +189,7 @@ def trifinger(
     read = _read(parts, resolution)
     described = {name: getattr(read, name) for name in read.__dataclass_fields__}
     described["digest"] += f" {published}"
-    instead = partial(_read, replace(parts, engine="bullet", published=published), resolution)
+    instead = partial(_read, replace(parts, published=True), resolution) if published else None
     described |= {"instead": instead, "views": VIEWS, "fake": fake}
     return TriFinger(
         **described,
@@ -233,11 +233,7 @@ _JOINT_NAMES = tuple(link_name(finger, index) for finger in FINGERS for index in
 @final
 @dataclass(frozen=True)
 class _Parts:
-    """What there is, and how it is commanded; see ``TriFinger``.
-
-    ``published`` is the variant of the predecessor; ``engine`` decides where the mass of a
-    fingertip lies.
-    """
+    """What there is, and how it is commanded; see ``TriFinger``."""
 
     blocks: tuple[str, ...]
     preset: Preset
@@ -245,7 +241,6 @@ class _Parts:
     hulls: tuple[tuple[str, Hull], ...]
     torques: bool
     published: bool = False
-    engine: str = "mujoco"
 
 
 def _compiled(parts: _Parts) -> mujoco.MjModel:
@@ -284,8 +279,7 @@ def _compiled(parts: _Parts) -> mujoco.MjModel:
         pair.solref, pair.solreffriction = contact, friction
         pair.friction = (1.0, 1.0, SPINNING_FRICTION, _ROLLING_FRICTION, _ROLLING_FRICTION)
     pairs = contact_pairs(parts)
-    if parts.engine == "bullet":
-        spec.add_numeric(name="bullet_explicit_servos", size=1, data=[1.0])
+    spec.add_numeric(name="bullet_explicit_servos", size=1, data=[1.0])
     if parts.published:
         alter(spec)
         pairs = touching(parts.blocks, parts.obstacles)
@@ -502,7 +496,7 @@ def _add_robot(spec: mujoco.MjSpec, parts: _Parts) -> None:
             _add_capsule(body, shape_name(finger, name), hardware.COLLISION[name])
         tip = body.add_body(name=tip_name(finger), pos=hardware.TIP_ORIGIN)
         tip.mass, tip.inertia, tip.explicitinertial = hardware.TIP_MASS, hardware.TIP_INERTIA, True
-        tip.ipos = hardware.TIP_CENTER[parts.engine]
+        tip.ipos = (0.0, 0.0, 0.0)  # MuJoCo takes ``pos`` where none is said
         tip.add_site(name=tip_name(finger), group=UNSEEN)
         _add_capsule(tip, shape_name(finger, "tip"), hardware.COLLISION["tip"])
     for purpose, limit in (("servo", _SPEC.limit), ("safety", 0.0)):
