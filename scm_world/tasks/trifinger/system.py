@@ -21,12 +21,11 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from itertools import combinations, product
 from typing import Any, final
 
 import mujoco
-import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.backends.mujoco.fields import Field, Slots
@@ -300,13 +299,9 @@ def contact_pairs(parts: Parts) -> Iterator[tuple[str, str, bool]]:
         )
         # Nothing but a tip reaches the ring: the knee stays within 0.232 m of the center.
         yield from ((wall, f"{finger}/tip", False) for wall in walls)
-    for i, finger in enumerate(FINGERS):
-        for other in FINGERS[i + 1 :]:
-            yield from (
-                (f"{finger}/{mine}", f"{other}/{its}", False)
-                for mine in SHAPES[1:]
-                for its in SHAPES[1:]
-            )
+    for finger, other in combinations(FINGERS, 2):
+        for mine, its in product(SHAPES[1:], repeat=2):
+            yield f"{finger}/{mine}", f"{other}/{its}", False
 
 
 def _write_options(spec: mujoco.MjSpec, parts: Parts) -> None:
@@ -608,17 +603,16 @@ def _box(mj: mujoco.MjModel, _: Any, *, name: str, quantity: str) -> Slot:
     mass, inertia = mj.body_mass[body, ...], mj.body_inertia[body]
     half = mj.geom_size[mj.geom(name).id]
 
-    def weigh(value: Floats) -> None:
-        mass[...] = value
-        _fill_box(float(mass), half, inertia)
+    def write(value: Floats) -> None:
+        if quantity == "mass":
+            mass[...] = value
+        else:
+            half[:] = 0.5 * value
+        (x, y, z), third = (half * half).tolist(), float(mass) / 3.0
+        inertia[:] = third * (y + z), third * (z + x), third * (x + y)  # m/12 (b² + c²)
 
-    def resize(value: Floats) -> None:
-        np.multiply(value, 0.5, out=half)
-        _fill_box(float(mass), half, inertia)
-
-    if quantity == "mass":
-        return Slot(weigh, mass.copy, constant=True)
-    return Slot(resize, lambda: 2.0 * half, constant=True)
+    read = mass.copy if quantity == "mass" else lambda: 2.0 * half
+    return Slot(write, read, constant=True)
 
 
 def _obstacle(mj: mujoco.MjModel, _: Any, *, name: str, quantity: str) -> Slot:
@@ -629,14 +623,6 @@ def _obstacle(mj: mujoco.MjModel, _: Any, *, name: str, quantity: str) -> Slot:
     if quantity == "orientation":
         return turn(mj.geom_quat[shape])
     return place(mj.geom_size[shape], to=lambda v: 0.5 * v, back=lambda v: 2.0 * v, constant=True)
-
-
-@numba.njit("void(f8, f8[::1], f8[::1])", cache=True)
-def _fill_box(mass: float, half: Floats, inertia: Floats) -> None:
-    """Give a solid box its moments of inertia, m/12 (b² + c²)."""
-    for axis in range(3):
-        b, c = half[(axis + 1) % 3], half[(axis + 2) % 3]
-        inertia[axis] = mass / 3.0 * (b * b + c * c)
 
 
 def _restitution(mj: mujoco.MjModel, _: Any, *, rigid: tuple[float, float]) -> Slot:
@@ -673,15 +659,7 @@ patch of contact gives two thirds of its radius."""
 
 def couple(mj: mujoco.MjModel) -> None:
     """Write the product of its two frictions into every contact pair, and its spinning friction."""
-    _couple(mj.geom_friction, mj.pair_geom1, mj.pair_geom2, mj.pair_friction)
-
-
-@numba.njit("void(f8[:, ::1], i4[::1], i4[::1], f8[:, ::1])", cache=True)
-def _couple(
-    factors: Floats, first: NDArray[np.int32], second: NDArray[np.int32], pairs: Floats
-) -> None:
-    for i in range(first.shape[0]):
-        product = factors[first[i], 0] * factors[second[i], 0]
-        pairs[i, 0] = product
-        pairs[i, 1] = product
-        pairs[i, 2] = min(factors[first[i], 1], SPINNING_LIMIT * product)
+    factors, first = mj.geom_friction, mj.pair_geom1
+    both = factors[first, 0] * factors[mj.pair_geom2, 0]
+    mj.pair_friction[:, :2] = both[:, None]
+    mj.pair_friction[:, 2] = np.minimum(factors[first, 1], SPINNING_LIMIT * both)
