@@ -29,7 +29,6 @@ from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
 from scm_world.geometry.rotations import quaternion_product, to_rotation_vector
 from scm_world.models.scene import Difference, Parameters, Scene
 from scm_world.tasks.trifinger import fake, hardware
-from scm_world.tasks.trifinger.hardware import controller_spec
 from scm_world.tasks.trifinger.kinematics import forward, inverse
 from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.tasks.trifinger.system import TriFinger
@@ -200,9 +199,11 @@ class TriFingerPlatform(InMemory):
                     physicsClientId=client,
                 )  # fmt: skip
         pybullet.setGravity(*turned(found["world", "gravity"], 1), physicsClientId=client)
-        spec = controller_spec(found)
-        robot.position_gains, robot.velocity_gains = np.tile(spec.kp, 3), np.tile(spec.kd, 3)
-        robot.safety_kd, robot.max_motor_torque = np.tile(spec.safety, 3), spec.limit
+        law = {key[1]: value for key, value in found.items() if key[0] == "controller"}
+        robot.position_gains = np.tile(law["position_gains"], 3)
+        robot.velocity_gains = np.tile(law["velocity_gains"], 3)
+        robot.safety_kd = np.tile(law["safety_damping"], 3)
+        robot.max_motor_torque = float(law["torque_limit"])
 
     def _play(self, command: Floats, substeps: int) -> None:
         """Hold a command, and read what the platform observes then."""
