@@ -102,9 +102,8 @@ def test_it_tries_again() -> None:
 def test_two_fingers_carry_through_the_air_by_feedback() -> None:
     """On the floor three fingers are chosen."""
     for task, fingers, over in (("picking", 2, False), ("pushing", 3, False), (TASKS[1], 2, True)):
-        job = Choice(Sight(world_of(task, "mujoco"))).job()
-        assert job is not None
-        _, move = job
+        move = Choice(Sight(world_of(task, "mujoco"))).move()
+        assert move is not None
         assert sum(move.grip.used) == fingers
         assert move.over == over
 
@@ -140,9 +139,8 @@ def test_by_feedback_a_block_is_turned_less_where_no_grip_can_make_the_whole_tur
     for episode in range(9):
         runner.begin(everything, seed=0, episode=episode)
         sight = Sight(env.world)
-        goal, job = sight.body("goal_block"), Choice(sight).job()
-        if job is not None:  # fingers have no room between a wall and a block close to it
-            _, move = job
+        goal, move = sight.body("goal_block"), Choice(sight).move()
+        if move is not None:  # fingers have no room between a wall and a block close to it
             np.testing.assert_allclose(move.end.place[:2], goal.place[:2])
             fills.append(move.end.fills(goal))
     runner.close()

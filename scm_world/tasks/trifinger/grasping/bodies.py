@@ -200,10 +200,6 @@ class Sight:
         """See a block, a goal or an obstacle."""
         return body_of(name, self._values)
 
-    def goals(self) -> list[Cuboid]:
-        """Read all goals."""
-        return [self.body(goal) for _, goal in self.pairs]
-
     def solid(self) -> dict[str, Cuboid]:
         """See everything that fingers could run into, by name."""
         return {name: self.body(name) for name in self._solid}

@@ -126,7 +126,6 @@ class Program:
 
     def __init__(self, world: Any) -> None:
         self._sight = Sight(world)
-        self._tool: str | None = None
         self._move: Move | None = None
         self._goals = np.empty((0, 4))  # for which the job was chosen
         self._idle = self._waiting = self._back = 0
@@ -145,7 +144,8 @@ class Program:
     def memory(self) -> Floats:
         """Say what is remembered; see ``Feedback.memory``."""
         used = self._move.grip.used if self._move is not None else (False,) * 3
-        taken = [self._move is not None and tool == self._tool for tool, _ in self._sight.pairs]
+        name = self._move.start.name if self._move is not None else None
+        taken = [tool == name for tool, _ in self._sight.pairs]
         return np.where([*taken, *used, self._opens, self._back > 0], 1.0, -1.0)
 
     def command(self, world: Any) -> Floats:
@@ -165,7 +165,7 @@ class Program:
             place = tips.copy()
             place[:, 2] = np.maximum(tips[:, 2], 0.09)
             return self._to(place, TRAVEL, tips, before)
-        body, grip, used = self._body(), move.grip, move.grip.used
+        body, grip, used = sight.body(move.start.name), move.grip, move.grip.used
         own = body.own(tips)
         inward, away = np.sign(grip.inward), own - grip.touch
         across = -(away * inward).sum(axis=1)
@@ -190,18 +190,16 @@ class Program:
 
     # --- which block, and where to -----------------------------------------------------------
 
-    def _body(self) -> Cuboid:
-        return self._sight.body(str(self._tool))
-
     def _planned(self) -> Move | None:
         """Keep the job until the block has arrived or has fallen over, or a goal moves.
 
         Fingers that are stuck go back first.
         """
         move, self._idle = self._move, self._idle - 1
-        goals = np.array([[*goal.place, goal.yaw] for goal in self._sight.goals()])
+        pairs = self._sight.pairs
+        goals = np.array([[*g.place, g.yaw] for g in (self._sight.body(goal) for _, goal in pairs)])
         if move is not None:
-            body = self._body()
+            body = self._sight.body(move.start.name)
             error = math.dist(move.end.place, body.place), abs(self._turn(move, body))
             stuck = self._waiting > STUCK
             if stuck:
@@ -214,8 +212,7 @@ class Program:
                 self._idle = 0
         if move is None and self._idle <= 0 and self._back <= 0:
             self._idle, self._waiting, self._opens = AGAIN, 0, False
-            self._tool, self._move = Choice(self._sight).job() or (self._tool, None)
-            self._goals = goals
+            self._move, self._goals = Choice(self._sight).move(), goals
         return self._move
 
     def _open(self, move: Move, body: Cuboid) -> bool:
@@ -278,7 +275,7 @@ class Program:
     def _carry(self, move: Move, body: Cuboid, tips: Floats, before: Floats) -> Floats:
         """Press, and bring the block nearer to its end."""
         sight, grip = self._sight, move.grip
-        hand, joints, tool = sight.hand, sight.joints, str(self._tool)
+        hand, joints, tool = sight.hand, sight.joints, body.name
         used, shares = grip.used, np.abs(grip.inward).max(axis=1)
         wanted, strength, follows = sight.wanted(tool), move.strength, 1.0
         turn = turn_about_z(body.yaw).T
@@ -321,7 +318,7 @@ class Program:
         """Choose how a block moves in this control step, shape (3,) [m], and turns [rad]."""
         error, turn = move.end.place - body.place, self._turn(move, body)
         far = math.hypot(error[0], error[1])
-        burden = self._sight.burden(str(self._tool)) / max(press, 1e-9)
+        burden = self._sight.burden(body.name) / max(press, 1e-9)
         pace = CARRY * max(min(max((0.7 - burden) / 0.5, 0.0), 1.0) ** 2, 0.3)
         height, most, least = move.height, RISE, RISE
         below = height - float(body.place[2])
@@ -329,7 +326,7 @@ class Program:
             soon = self._passing(body, error, min(SOON, far))
             height = max(self._passing(body, error, far), float(body.half[2]) + CLEARANCE)
             below = soon - float(body.place[2]) if soon > 0.0 else 0.014 - body.bottom
-            spare = self._sight.friction(str(self._tool)) * press * max(1.0 - burden, 0.0)
+            spare = self._sight.friction(body.name) * press * max(1.0 - burden, 0.0)
             most, least = min(max(spare / STIFF, SLOWEST), FASTEST), SINK
         elif not move.over:
             below = min(below, 0.014 - body.bottom)
