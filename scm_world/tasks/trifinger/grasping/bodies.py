@@ -222,6 +222,6 @@ class Sight:
         return FIRM + MARGIN * self.burden(tool)
 
 
-def unit(world: Any) -> tuple[int, int]:
-    """Say which episode this is."""
-    return world.noise.seed, world.episode
+def instant(world: Any) -> tuple[int, int, int]:
+    """Return which episode it is, as seed and number, and which of its control steps."""
+    return world.noise.seed, world.episode, world.index

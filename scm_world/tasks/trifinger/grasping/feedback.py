@@ -12,7 +12,13 @@ import numpy as np
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ActionError
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, smallest, turn_about_z, unit
+from scm_world.tasks.trifinger.grasping.bodies import (
+    Cuboid,
+    Sight,
+    instant,
+    smallest,
+    turn_about_z,
+)
 from scm_world.tasks.trifinger.grasping.choice import Choice
 from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand
 from scm_world.tasks.trifinger.grasping.ways import (
@@ -93,7 +99,7 @@ class Feedback:
             problem = "a grasp needs joint or fingertip positions as actions, not torques"
             raise ActionError(problem, world.action_mode)
         program = self._programs.get(world)
-        if program is None or not program.goes_on(world):
+        if program is None or program.next != instant(world):
             program = self._programs[world] = Program(world)
         command = program.command(world)
         return program.hand.tips(command) if "effector" in world.action_mode else command
@@ -122,6 +128,9 @@ class Program:
 
     Args:
         world: With blocks that have goals.
+
+    Attributes:
+        next: The instant whose command comes next.
     """
 
     def __init__(self, world: Any) -> None:
@@ -130,16 +139,12 @@ class Program:
         self._goals = np.empty((0, 4))  # for which the job was chosen
         self._idle = self._waiting = self._back = 0
         self._opens = False
-        self._unit, self._next = unit(world), world.index
+        self.next = instant(world)
 
     @property
     def hand(self) -> Hand:
         """The robot."""
         return self._sight.hand
-
-    def goes_on(self, world: Any) -> bool:
-        """Tell whether the present is the step after the last one."""
-        return bool(world.index == self._next and self._unit == unit(world))
 
     def memory(self) -> Floats:
         """Say what is remembered; see ``Feedback.memory``."""
@@ -150,7 +155,8 @@ class Program:
 
     def command(self, world: Any) -> Floats:
         """Give the joint positions to command now, shape (9,) [rad]."""
-        sight, self._next = self._sight, world.index + 1
+        sight, (seed, episode, index) = self._sight, self.next
+        self.next = seed, episode, index + 1
         sight.look(world)
         hand, joints = sight.hand, sight.joints
         before = _commanded(world, sight)
@@ -205,7 +211,9 @@ class Program:
             if stuck:
                 self._back = RETREAT
             self._opens |= move.release and bool((np.array(error) < ARRIVED).all())
-            done = self._opens and self._open(move, body)
+            tips = self._sight.hand.tips(self._sight.joints).reshape(3, 3)
+            away = np.abs(tips - self._place(move, body, 0.0))[move.grip.used].max(axis=1)
+            done = self._opens and away.min() > 0.8 * move.grip.opening
             moved = not np.array_equal(goals, self._goals)
             if stuck or done or moved or math.hypot(*body.lean) > 0.6:
                 move = self._move = None
@@ -214,13 +222,6 @@ class Program:
             self._idle, self._waiting, self._opens = AGAIN, 0, False
             self._move, self._goals = Choice(self._sight).move(), goals
         return self._move
-
-    def _open(self, move: Move, body: Cuboid) -> bool:
-        """Tell whether fingers have let go."""
-        used = move.grip.used
-        tips = self._sight.hand.tips(self._sight.joints).reshape(3, 3)
-        away = np.abs(tips - self._place(move, body, 0.0))[used].max(axis=1)
-        return bool(away.min() > 0.8 * move.grip.opening)
 
     @staticmethod
     def _turn(move: Move, body: Cuboid) -> float:
@@ -283,7 +284,9 @@ class Program:
             strength = float(hand.strengths(joints[None], (grip.inward @ turn)[None])[0])
             follows = float(np.interp(body.bottom, OFF, (0.0, 1.0)))
         press = min(PRESS if wanted < LIGHT else FIRMLY * wanted, strength)
-        if not grip.firm and move.over and self._lands(move, body):
+        far = math.dist(body.place[:2], move.end.place[:2])
+        lands = far < 2.0 * LANDING and max(body.bottom, move.end.bottom) < LANDING
+        if not grip.firm and move.over and lands:  # near the floor, and near a goal on it
             press *= 1.0 - SOFT * min(math.hypot(*body.lean) / TILTED, 1.0)
         forces = press * grip.inward @ turn
         forces[:, 2] += sight.weight(tool) * shares / shares.sum()
@@ -307,12 +310,6 @@ class Program:
         aim[~used] = self._place(move, body, 0.0)[~used]
         found = hand.bounded(hand.solve(aim.ravel(), joints) + more)
         return np.clip(found, before - PUSHED, before + PUSHED)
-
-    @staticmethod
-    def _lands(move: Move, body: Cuboid) -> bool:
-        """Return whether a block is near the floor and near its goal, which is on the floor."""
-        far = math.dist(body.place[:2], move.end.place[:2])
-        return far < 2.0 * LANDING and max(body.bottom, move.end.bottom) < LANDING
 
     def _speed(self, move: Move, body: Cuboid, press: float) -> tuple[Floats, float]:
         """Choose how a block moves in this control step, shape (3,) [m], and turns [rad]."""
