@@ -153,8 +153,8 @@ def _parts(observations: Any) -> dict[str, Floats]:
         rows = [np.concatenate(list(_flat(row))) for row in observations]
         lengths = sorted({len(row) for row in rows})
         if len(lengths) > 1:
-            given, allowed = f"dictionaries of {lengths} numbers", ("a list of whole dictionaries",)
-            raise UnknownOption("observations", given, allowed)
+            given = f"dictionaries of {lengths} numbers"
+            raise UnknownOption("observations", given, ("a list of whole dictionaries",))
         flat = np.array(rows)
     else:
         flat = np.asarray(observations)

@@ -172,8 +172,15 @@ def trifinger(
                             [m], ``orientation`` (4,)
     ======================  ==========================================
     """
-    given = (blocks, preset, obstacles, hulls, torques, resolution, published)
-    parts = Parts(**dict(zip(_PARTS, given, strict=True)))
+    parts = Parts(
+        blocks=blocks,
+        preset=preset,
+        obstacles=obstacles,
+        hulls=hulls,
+        torques=torques,
+        resolution=resolution,
+        published=published,
+    )
     read = _read(replace(parts, published=False))
     described = {name: getattr(read, name) for name in read.__dataclass_fields__}
     described["digest"] += f" {published}"
@@ -438,6 +445,13 @@ def _yaw(angle: float) -> tuple[float, float, float, float]:
 # --- bindings ----------------------------------------------------------------------------------
 
 
+GAINS: tuple[tuple[Any, ...], ...] = (
+    ("position_gains", _SPEC.kp, "N m/rad", ("gainprm", 0, 0, 1.0), ("biasprm", 0, 1, -1.0)),
+    ("safety_damping", _SPEC.safety, "N m s/rad", ("biasprm", N_JOINTS, 2, -1.0)),
+    ("velocity_gains", _SPEC.kd, "N m s/rad", ("biasprm", 0, 2, -1.0)),
+)
+"""Name, default and unit; then array, first actuator, column and sign of each place."""
+
 Row = tuple[Field, object]
 """A parameter, and its default."""
 
@@ -482,14 +496,8 @@ def _rows(mj: mujoco.MjModel, trees: Couplings, parts: Parts) -> Iterator[Row]:
     links = [f"{f}/{shape}" for f in FINGERS for shapes in LINK_SHAPES for shape in shapes]
     yield friction("robot", 0.5, links, touched)
     yield row("robot.joint_damping", 0.0, "N m s/rad", _damping, robot, "Of every joint.")
-    gains = [("safety_damping", _SPEC.safety, "N m s/rad", (("biasprm", N_JOINTS, 2, -1.0),))]
-    if not parts.torques:
-        position = (("gainprm", 0, 0, 1.0), ("biasprm", 0, 1, -1.0))
-        gains.insert(0, ("position_gains", _SPEC.kp, "N m/rad", position))
-        gains.append(("velocity_gains", _SPEC.kd, "N m s/rad", (("biasprm", 0, 2, -1.0),)))
-    for name, gain, unit, places in gains:
-        slot = partial(_gains, places=places)
-        doc = "Of the three joints of a finger."
+    for name, gain, unit, *places in GAINS[1:2] if parts.torques else GAINS:
+        slot, doc = partial(_gains, places=places), "Of the three joints of a finger."
         yield row(f"controller.{name}", gain, unit, slot, robot, doc)
     doc = "Largest torque of a joint."
     yield row("controller.torque_limit", _SPEC.limit, "N m", _limit, robot, doc)
@@ -568,10 +576,7 @@ def _limit(mj: mujoco.MjModel, _: Any) -> Slot:
 
 
 def _gains(mj: mujoco.MjModel, _: Any, *, places: Sequence[tuple[str, int, int, float]]) -> Slot:
-    """Find a number for each joint of a finger, shape (3,); all fingers have the same.
-
-    ``places`` are array, first actuator, column and sign of each copy.
-    """
+    """Find a number for each joint of a finger, shape (3,); all fingers have the same."""
     views = [
         (getattr(mj, f"actuator_{array}")[start : start + N_JOINTS, column], sign)
         for array, start, column, sign in places
