@@ -62,20 +62,28 @@ class Parameter(Row):
     """A property of an element that holds until it is set again.
 
     Attributes:
-        key: The element and the property, as backends know it.
-        slot: For a binding: finds where the value is written, given MuJoCo's model and data; it can
-            be pickled. None for a field of the compiled model, which is found by its key.
+        slot: Finds where the value stands, given MuJoCo's model and data; it can be pickled. None
+            for what cannot be written.
         kind: ``"real"``, ``"rotation"`` (unit quaternion), ``"inertia"`` (principal moments, which
             obey the triangle inequality) or ``"switch"`` (0 or 1).
         visual: Whether it acts on pictures only.
         body: Number of the body whose mass, place or shape it belongs to; -1 if to none.
+        usual: Whether it is exposed unless something else is asked for.
+        refusal: Why it cannot be set, to be read after its name; empty if it can.
     """
 
-    key: ParameterKey = ("", "")
-    slot: Callable[[Any, Any], Any] | None = field(default=None, repr=False)
+    slot: Callable[[Any, Any], Any] | None = field(default=None, repr=False, compare=False)
     kind: Literal["real", "rotation", "inertia", "switch"] = "real"
     visual: bool = False
     body: int = -1
+    usual: bool = True
+    refusal: str = ""
+
+    @property
+    def key(self) -> ParameterKey:
+        """The element and the property, as backends know it."""
+        element, _, attribute = self.name.rpartition(".")
+        return element, attribute
 
 
 @final
@@ -238,6 +246,10 @@ class Model:
     def default_scene(self) -> Scene:
         """Give the scene in which every parameter and every state has its default."""
         return Scene(self, self.default_parameters(), self.empty_state())
+
+    def slots(self, mj: Any, data: Any) -> dict[ParameterKey, Any]:
+        """Find the places of all parameters in MuJoCo's model and data."""
+        return {row.key: row.slot(mj, data) for row in self.parameters if row.slot is not None}
 
     def default_parameters(self) -> dict[ParameterKey, Any]:
         """Give the default of every parameter, by key."""

@@ -269,7 +269,7 @@ class Client:
             compiled = reading.compiled(model)
             self._model, self._inside = model, None
             self._twin = realize(model, arrays(parameters))
-            self._names, self._pulled = reading.body_names(compiled), _pulled(compiled)
+            self._names, self._pulled = model.body_names, _pulled(compiled)
             self._usual, self._spinning = usual_friction(compiled), spinning_shares(compiled)
             trees = Couplings(compiled)
             self._dynamic = np.flatnonzero(trees.dynamic.any(axis=1)).tolist()

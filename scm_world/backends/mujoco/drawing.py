@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.backends.mujoco.backend import realize
-from scm_world.backends.mujoco.reading import body_names
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Parameters, Scene
 from scm_world.models.shapes import (
@@ -81,7 +80,7 @@ class VisibleModel:
         self._given: tuple[Any, bytes] = ((), b"")  # the parameters that were written last
         self.model, self.data = now.model, now.data
         model = now.model
-        self.names = body_names(model)
+        self.names = structure.body_names
         mocap = model.body_mocapid[model.body_rootid] >= 0
         self._moves: NDArray[np.bool_] = (model.body_weldid != 0) | mocap
         self._rows = rows = np.flatnonzero(np.isin(model.geom_type, list(_KINDS)) & _looks(model))

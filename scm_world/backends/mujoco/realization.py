@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.contacts import Touches, touches
-from scm_world.backends.mujoco.slots import Slot
 from scm_world.backends.mujoco.states import (
     LastStep,
     Turned,
@@ -101,16 +100,6 @@ def lost(structure: Any, vector: Floats, time: float) -> str:
     )
 
 
-def slots_of(
-    structure: Model, model: mujoco.MjModel, data: mujoco.MjData
-) -> dict[ParameterKey, Slot]:
-    """Find the places of all parameters in a copy of the compiled model, and in its data."""
-    rows = structure.parameters
-    keys = [row.key for row in rows if row.slot is None]
-    found = fields.slots(reading.compiled(structure), keys, model, data) if keys else {}
-    return found | {row.key: row.slot(model, data) for row in rows if row.slot is not None}
-
-
 class Realization:
     """A compiled model with parameters and a state of its own.
 
@@ -137,10 +126,10 @@ class Realization:
         self.model = model = copy.copy(compiled)
         self.data = data = mujoco.MjData(model)
         self._scratch = mujoco.MjData(model)
-        self._slots = slots_of(structure, model, data)
+        self._slots = structure.slots(model, data)
         self._constant = frozenset(key for key, slot in self._slots.items() if slot.constant)
         self._follow_ups = {key: f for key, slot in self._slots.items() if (f := slot.follow_up)}
-        self._bodies = reading.body_names(compiled)
+        self._bodies = structure.body_names
         self.owners = structure.owners
         self.kept: dict[ParameterKey, Floats] = {}
         self.applied: Parameters | None = None

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from scm_world._types import Floats, Integers
-from scm_world.backends.mujoco.reading import body_names, permutation
+from scm_world.backends.mujoco.reading import permutation
 from scm_world.models.model import Model
 
 
@@ -232,7 +232,7 @@ class Turned:
         for joint in np.flatnonzero(mj.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)).tolist():
             q, v = int(mj.jnt_qposadr[joint]) + 3, int(mj.jnt_dofadr[joint]) + 3
             if v in in_world:
-                names.append(body_names(mj)[int(mj.jnt_bodyid[joint])])
+                names.append(model.body_names[int(mj.jnt_bodyid[joint])])
                 starts.append((qpos[q + 1], qvel[v]))
                 own.append((q, v))
         first = np.array(own, dtype=np.int64).reshape(-1, 2)

@@ -29,12 +29,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.backends.mujoco.fields import Field
+from scm_world.backends.mujoco.fields import numbers
 from scm_world.backends.mujoco.reading import read_model
 from scm_world.backends.mujoco.slots import Slot, first, place, turn
 from scm_world.backends.mujoco.trees import NOTHING, Couplings, Effect
 from scm_world.geometry.hulls import Hull
-from scm_world.models.model import Model
+from scm_world.models.model import Model, Parameter
 from scm_world.models.scene import State
 from scm_world.tasks.trifinger import fake, hardware
 from scm_world.tasks.trifinger.cameras import VIEWS
@@ -302,7 +302,7 @@ def _compiled(parts: _Parts) -> mujoco.MjModel:
     if parts.published:
         restore(model)
     scratch = mujoco.MjData(model)
-    for bound in _bindings(model, Couplings(model), parts=parts):
+    for bound in _bindings(model, scratch, Couplings(model), parts=parts):
         slot = bound.slot(model, scratch)  # type: ignore[misc] # every binding has one
         slot.write(np.asarray(defaults[bound.name], dtype=np.float64))
     couple(model)
@@ -548,7 +548,9 @@ def _yaw(angle: float) -> tuple[float, float, float, float]:
 # --- bindings ----------------------------------------------------------------------------------
 
 
-def _bindings(mj: mujoco.MjModel, trees: Couplings, *, parts: _Parts) -> Iterator[Field]:
+def _bindings(
+    mj: mujoco.MjModel, data: mujoco.MjData, trees: Couplings, *, parts: _Parts
+) -> Iterator[Parameter]:
     """List the parameters: what each is, where it is written, and on which trees it acts."""
     fingers = [trees.tree(mj.body(link_name(finger, 1)).id) for finger in FINGERS]
     everything, touching = trees.always(trees.every), trees.touching(trees.every)
@@ -556,17 +558,18 @@ def _bindings(mj: mujoco.MjModel, trees: Couplings, *, parts: _Parts) -> Iterato
 
     def row(
         name: str, unit: str, slot: Callable[..., Slot], effect: Effect, doc: str, **rest: Any
-    ) -> Field:
-        element, _, attribute = name.rpartition(".")
-        return Field(
-            "binding", element, attribute, unit, doc, slot, lambda: effect, name=name, **rest
-        )
+    ) -> Parameter:
+        default, (always, contact) = slot(mj, data).read(), effect
+        return Parameter(
+            name, unit, default.shape, numbers(default), -math.inf, math.inf, doc, always, contact,
+            slot=slot, **rest,
+        )  # fmt: skip
 
-    def color(element: str, shapes: Sequence[str]) -> Field:
+    def color(element: str, shapes: Sequence[str]) -> Parameter:
         slot = partial(_color, shapes=tuple(shapes))
         return row(f"{element}.color", "1", slot, NOTHING, "Red, green and blue.", visual=True)
 
-    def friction(element: str, shapes: Sequence[str], effect: Effect) -> Field:
+    def friction(element: str, shapes: Sequence[str], effect: Effect) -> Parameter:
         slot = partial(_friction, shapes=tuple(shapes))
         return row(f"{element}.friction", "1", slot, effect, "Factor of all its contacts.")
 
@@ -621,7 +624,7 @@ def _bindings(mj: mujoco.MjModel, trees: Couplings, *, parts: _Parts) -> Iterato
         for what, unit in (("size", "m"), ("position", "m"), ("orientation", "1")):
             slot = partial(_obstacle, name=name, quantity=what)
             nature: Any = "rotation" if what == "orientation" else "real"
-            yield row(f"{name}.{what}", unit, slot, effect, "Of the box.", nature=nature)
+            yield row(f"{name}.{what}", unit, slot, effect, "Of the box.", kind=nature)
         yield friction(name, [name], effect)
         yield color(name, [name])
 
