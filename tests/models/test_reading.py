@@ -300,9 +300,7 @@ def test_mocap_bodies_have_a_pose_that_can_be_set() -> None:
     row = next(row for row in model.parameters if row.name == "hand.position")
     mj = copy.copy(compiled(model))
     data = mujoco.MjData(mj)
-    model.slots(mj, data)[row.key].write(
-        np.array([0.0, 0.3, 1.0])
-    )
+    model.slots(mj, data)[row.key].write(np.array([0.0, 0.3, 1.0]))
     mujoco.mj_step(mj, data, 500)
     assert data.body("held").xpos[1] == pytest.approx(0.3, abs=0.05)
 
