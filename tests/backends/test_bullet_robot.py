@@ -15,6 +15,7 @@ import robot_scenes
 from robot_scenes import busy_scene
 
 from scm_world.backends.bullet import BulletBackend
+from scm_world.backends.mujoco.reading import compiled
 from scm_world.errors import EngineFailure, MissingEngine
 from scm_world.models import Difference
 from scm_world.tasks.trifinger import hardware

@@ -206,11 +206,10 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
     if isinstance(source, mujoco.MjSpec):
         return source.copy(), "the MjSpec", "", False
     if isinstance(source, str) and source.lstrip().startswith("<"):
-        where, text, plain = "the XML text", source, True
+        where, text = "the XML text", source
     elif isinstance(source, str | os.PathLike):
         path = Path(source)
-        data = _contents(path)
-        where, text, plain = str(path), _decoded(data), _is_utf8(data)
+        where, text = str(path), _contents(path)
     else:
         raise ModelError(
             [
@@ -231,18 +230,13 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
     with understood(where):
         if path is None:
             return mujoco.MjSpec.from_string(text), where, "", tag == "robot"
-        parts = _included(text, path.parent)
-        if path.suffix in (".xml", ".urdf") and plain and all(map(_is_utf8, parts.values())):
-            spec = mujoco.MjSpec.from_file(str(path))
-        else:
-            texts = {name: _decoded(part).encode() for name, part in parts.items()}
-            spec = mujoco.MjSpec.from_string(text, include=texts)
-            spec.modelfiledir = str(path.parent)
+        spec = mujoco.MjSpec.from_string(text, include=_included(text, path.parent))
+        spec.modelfiledir = str(path.parent)
     return spec, where, path.stem, tag == "robot"
 
 
-def _contents(path: Path) -> bytes:
-    """Read a model file.
+def _contents(path: Path) -> str:
+    """Read and decode a model file.
 
     Raises:
         UnreadableFile: There is none, or it is no text.
@@ -252,9 +246,10 @@ def _contents(path: Path) -> bytes:
         data = read_bytes(path)
     except OSError as error:
         raise UnreadableFile(str(path), (error.strerror or str(error)).lower(), advice) from error
-    if "\0" in _decoded(data).rstrip("\0"):
+    text = _decoded(data)
+    if "\0" in text.rstrip("\0"):
         raise UnreadableFile(str(path), "it is no text", advice)
-    return data
+    return text
 
 
 def _decoded(data: bytes) -> str:
@@ -278,24 +273,15 @@ def _decoded(data: bytes) -> str:
     return text.replace("\r\n", "\n")
 
 
-def _is_utf8(data: bytes) -> bool:
-    """Return whether a file is in UTF-8, which MuJoCo reads."""
-    try:
-        data.decode()
-    except UnicodeDecodeError:
-        return False
-    return True
-
-
 def _included(text: str, folder: Path) -> dict[str, bytes]:
-    """Read the files that an MJCF text includes, and those that they include."""
+    """Read the files that an MJCF text includes, and those that they include, as UTF-8."""
     found: dict[str, bytes] = {}
     texts = [text]
     for one in texts:  # which grows
         for name in re.findall(r"<include\b[^>]*\bfile\s*=\s*[\"']([^\"']+)", one):
             if name not in found and (folder / name).exists():
-                found[name] = _contents(folder / name)
-                texts.append(_decoded(found[name]))
+                texts.append(_contents(folder / name))
+                found[name] = texts[-1].encode()
     return found
 
 
