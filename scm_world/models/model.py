@@ -115,12 +115,6 @@ class StateRow(Row):
 
 @final
 @dataclass(frozen=True)
-class Input(Row):
-    """A number that a controller decides. Its bounds are the range of the actuator."""
-
-
-@final
-@dataclass(frozen=True)
 class Readout:
     """A quantity that follows from states and parameters at lag 0, such as the place of a site.
 
@@ -172,7 +166,7 @@ class Model:
         timestep: Physics step [s].
         parameters: What can be set and holds.
         states: What moves, in the order of the state vector.
-        inputs: The components of a command, in order.
+        inputs: The components of a command, in order; their bounds are the ranges of actuators.
         readouts: What follows at lag 0 from the others; those that were asked for.
         trees: Names of the kinematic trees (bodies with one root), by number.
         refused: What cannot be set or exposed, by name, with the reason.
@@ -193,7 +187,7 @@ class Model:
     timestep: float
     parameters: tuple[Parameter, ...]
     states: tuple[StateRow, ...]
-    inputs: tuple[Input, ...]
+    inputs: tuple[Row, ...]
     readouts: tuple[Readout, ...] = ()
     trees: tuple[str, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
@@ -257,10 +251,3 @@ class Model:
             row.key: np.array(np.broadcast_to(row.default, row.shape), dtype=np.float64)
             for row in self.parameters
         }
-
-    def carried(self, state: State, before: Scene) -> None:
-        """Copy the states that another structure has too, from a scene of it into a state."""
-        there = before.state.layout.slices
-        for name, where in self.layout.slices.items():
-            if name in there:
-                state.vector[where] = before.state.vector[there[name]]

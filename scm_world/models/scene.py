@@ -85,6 +85,13 @@ class State:
     def __iter__(self) -> Iterator[str]:
         return iter(self.layout.names)
 
+    def carry(self, before: State) -> None:
+        """Copy the states that another one has, too: of one name and one size."""
+        there = before.layout.slices
+        for name, where in self.layout.slices.items():
+            if name in there and there[name].stop - there[name].start == where.stop - where.start:
+                self.vector[where] = before.vector[there[name]]
+
     def coincides(self, other: State) -> bool:
         """Tell whether all numbers that can be set are the same."""
         same = self.vector == other.vector
@@ -144,9 +151,6 @@ class Structure(Protocol):
 
     def default_scene(self) -> Scene:
         """Give the scene in which every parameter and every state has its default."""
-
-    def carried(self, state: State, before: Scene) -> None:
-        """Copy the states that another structure has too, from a scene of it into a state."""
 
 
 @final
@@ -296,5 +300,5 @@ def complete(now: Scene, structure: Structure, difference: Difference) -> Differ
     state = difference.state
     if state is None:
         state = default.state
-        structure.carried(state, now)
+        state.carry(now.state)
     return Difference(structure, {**default.parameters, **stays, **difference.parameters}, state)

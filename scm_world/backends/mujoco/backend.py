@@ -19,8 +19,7 @@ from scm_world.backends.base import (
 from scm_world.backends.mujoco.batch import BatchSlot, MujocoBatch
 from scm_world.backends.mujoco.contacts import Touches
 from scm_world.backends.mujoco.realization import Realization, refuse_callbacks
-from scm_world.errors import EngineFailure, ModelError
-from scm_world.models.model import Model
+from scm_world.errors import EngineFailure
 from scm_world.models.scene import (
     Difference,
     ParameterKey,
@@ -52,19 +51,6 @@ class Payload:
     memory: Any
     touches: Touches | None
     replay: tuple[Floats, int] | None = None
-
-
-def realize(structure: Any, parameters: Parameters) -> Realization:
-    """Compile a structure, and write all parameters.
-
-    Raises:
-        ModelError: It is nothing that MuJoCo can realise.
-    """
-    if not isinstance(structure, Model):
-        raise ModelError([f"MuJoCo cannot realise a {type(structure).__name__}; it takes models"])
-    fresh = Realization(structure)
-    fresh.edit(parameters)
-    return fresh
 
 
 @final
@@ -245,7 +231,7 @@ class MujocoBackend(Backend):
         """Give a structure with these parameters: the present one edited, or a new one."""
         now: Realization | None = vars(self).get("_now")
         if now is None or structure != now.structure:
-            return realize(structure, parameters)
+            return Realization(structure, parameters)
         now.edit(parameters)
         return now
 

@@ -13,10 +13,9 @@ from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
 import mujoco
-import numba
 import numpy as np
 
-from scm_world._types import Floats, Integers
+from scm_world._types import Integers
 from scm_world.backends.mujoco.fields import (
     MEDIUM,
     control_unit,
@@ -32,10 +31,10 @@ from scm_world.errors import ModelError, UnknownOption, nearest
 from scm_world.models.model import (
     REPORTED,
     BodyRow,
-    Input,
     Model,
     Numbers,
     Parameter,
+    Row,
     StateRow,
 )
 from scm_world.models.scene import REVERSED, reversed_ranges
@@ -69,38 +68,18 @@ def callbacks() -> list[str]:
     ]
 
 
-@numba.njit("b1(f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])", cache=True)
-def sensible(
-    masses: Floats, moments: Floats, inertia: Floats, dof_weights: Floats, body_weights: Floats
-) -> bool:
-    """Tell whether masses and what MuJoCo derives from them are those of something that can move.
+def sensible(mj: mujoco.MjModel) -> bool:
+    """Return whether masses, and what MuJoCo derives from them, are those of something that moves.
 
-    Args:
-        masses: Of the bodies, shape (nbody,).
-        moments: Their principal moments of inertia, shape (nbody, 3).
-        inertia: Diagonal of the inertia matrix, shape (nv,).
-        dof_weights: Inverse weights, shape (nv,).
-        body_weights: Inverse weights, shape (nbody, 2).
+    They are finite and not negative, and moments of inertia obey the triangle inequality.
     """
-    for body in range(masses.shape[0]):
-        a, b, c = moments[body]
-        least, most = min(a, b, c), max(a, b, c)
-        if not (0.0 <= masses[body] < math.inf and least >= 0.0 and most < math.inf):
-            return False
-        if not a + b + c - 2.0 * most >= -1e-6 * most:  # the triangle inequality
-            return False
-        for weight in body_weights[body]:
-            if not 0.0 <= weight < math.inf:
-                return False
-    for dof in range(inertia.shape[0]):
-        if not (0.0 < inertia[dof] < math.inf and 0.0 <= dof_weights[dof] < math.inf):
-            return False
-    return True
-
-
-def inertia_of(mj: mujoco.MjModel) -> tuple[Floats, ...]:
-    """Return views of what ``sensible`` looks at."""
-    return mj.body_mass, mj.body_inertia, mj.dof_M0, mj.dof_invweight0, mj.body_invweight0
+    most = mj.body_inertia.max(axis=1)
+    parts = mj.body_mass, mj.body_inertia, mj.dof_M0, mj.dof_invweight0, mj.body_invweight0
+    return (
+        all(part.min() >= 0.0 and part.max() < math.inf for part in parts)
+        and mj.dof_M0.min() > 0.0
+        and bool((mj.body_inertia.sum(axis=1) - 2.0 * most >= -1e-6 * most).all())
+    )
 
 
 Bindings = Callable[[mujoco.MjModel, mujoco.MjData, Couplings], Iterable[Parameter]]
@@ -284,7 +263,7 @@ def _check_inertia(mj: mujoco.MjModel, where: str) -> Iterator[str]:
     model, data = copy.copy(mj), mujoco.MjData(mj)
     data.warning.number[:] = 1  # MuJoCo prints the first warning of a kind
     mujoco.mj_setConst(model, data)
-    if data.warning.number[0] == 1 and sensible(*inertia_of(model)):
+    if data.warning.number[0] == 1 and sensible(model):
         return
     moments, names = mj.body_inertia, element_names(mj)
     possible = (mj.body_mass >= 0.0) & (moments.min(axis=1) >= 0.0)
@@ -626,7 +605,7 @@ def _of_actuator(
 
 def _inputs(
     mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings, data: mujoco.MjData
-) -> Iterator[Input]:
+) -> Iterator[Row]:
     """Describe the components of a command; the data have those of the beginning."""
     for actuator in range(mj.nactuator):
         name = names["actuator"][actuator]
@@ -636,7 +615,7 @@ def _inputs(
         _, always, contact = _of_actuator(trees, actuator, stateful=stateful)
         for i in range(first, first + count):
             low, high = _ends(mj.actuator_ctrllimited[i], mj.actuator_ctrlrange[i])
-            yield Input(
+            yield Row(
                 name=f"{name}.control" if count == 1 else f"{name}.control_{i - first}",
                 unit=unit,
                 shape=(),

@@ -25,7 +25,7 @@ from scm_world.backends.mujoco.states import (
     turned_bodies,
 )
 from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import EngineFailure, Infeasible, UnknownOption
+from scm_world.errors import EngineFailure, Infeasible, ModelError, UnknownOption
 from scm_world.models.model import Model
 from scm_world.models.scene import (
     REVERSED,
@@ -79,6 +79,10 @@ class Realization:
 
     Args:
         structure: The description of the model.
+        parameters: All that differ from it, and all that are compared later.
+
+    Raises:
+        ModelError: It is not a model.
 
     Attributes:
         structure: What was compiled.
@@ -94,7 +98,10 @@ class Realization:
             taken elsewhere, so that their contacts are not in the data.
     """
 
-    def __init__(self, structure: Model) -> None:
+    def __init__(self, structure: Any, parameters: Parameters) -> None:
+        if not isinstance(structure, Model):
+            kind = type(structure).__name__
+            raise ModelError([f"MuJoCo cannot realise a {kind}; it takes models"])
         self._compiled = compiled = reading.compiled(structure)
         self.structure = structure
         self.model = model = copy.copy(compiled)
@@ -127,10 +134,10 @@ class Realization:
         self._last: LastStep | None = None
         self._written: Floats | None = None  # since the last step, if bodies are turned
         self._counts = data.warning.number
-        self._weights = reading.inertia_of(model)
         self._size = int(mujoco.mj_stateSize(model, STATE))
         # MuJoCo prints a warning, and writes it to a file, when it counts the first of its kind.
         self._counts[:] = self._scratch.warning.number[:] = 1
+        self.edit(parameters)
 
     # --- state ---------------------------------------------------------------------------------
 
@@ -368,7 +375,7 @@ class Realization:
             self._scratch.warning.number[:] = 1
             return f"MuJoCo says: {error}"
         singular = self._scratch.warning.number
-        if singular[0] != 1 or not reading.sensible(*self._weights):
+        if singular[0] != 1 or not reading.sensible(self.model):
             singular[0] = 1
             return "masses and moments of inertia would not be those of something that can move"
         return ""

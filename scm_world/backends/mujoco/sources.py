@@ -125,7 +125,7 @@ def read_source(
         ModelError: It is no such thing, MuJoCo refuses it, or it has plugins.
         UnknownOption: An option is not one.
     """
-    chosen, notes, plugins = _options(options), tuple[str, ...](), ""
+    notes, plugins = tuple[str, ...](), ""
     if isinstance(source, mujoco.MjModel):
         where, stem, mj = "the MjModel", "", copy.copy(source)
     else:
@@ -140,8 +140,8 @@ def read_source(
     if mj.nplugin:
         what = f"{where} uses {mj.nplugin} plugin(s){plugins}"
         raise ModelError([f"{what}: what they act on is unknown; remove them"])
-    for option, value in chosen:
-        setattr(mj.opt, option, type(getattr(mj.opt, option))(value))
+    for option, value in options.items():
+        _set_option(mj.opt, option, value)
     binary = np.empty(mujoco.mj_sizeModel(mj), np.uint8)
     mujoco.mj_saveModel(mj, None, binary)
     name = mj.names.split(b"\0", 1)[0].decode()
@@ -169,27 +169,21 @@ def _check_files(spec: mujoco.MjSpec) -> None:
                 raise UnreadableFile(str(path), str(error), advice) from None
 
 
-def _options(given: Mapping[str, Any]) -> tuple[tuple[str, float], ...]:
-    """Read options: numbers, or the words of MJCF.
+def _set_option(options: mujoco.MjOption, name: str, value: Any) -> None:
+    """Set an option to a number, or to a word of MJCF.
 
     Raises:
         UnknownOption: There is no such option, or no such word.
     """
-    found = []
-    for name, value in sorted(given.items()):
-        if name in _CHOICES:
-            words = {
-                member.partition("_")[2].lower(): float(int(kind))
-                for member, kind in _CHOICES[name].__members__.items()
-            }
-            if str(value).lower() not in words:
-                raise UnknownOption(name, value, words)
-            found.append((name, words[str(value).lower()]))
-        elif name in _NUMBERS:
-            found.append((name, float(value)))
-        else:
-            raise UnknownOption("setting", name, (*_CHOICES, *_NUMBERS))
-    return tuple(found)
+    if name not in (*_CHOICES, *_NUMBERS):
+        raise UnknownOption("setting", name, (*_CHOICES, *_NUMBERS))
+    if name in _CHOICES:
+        members = _CHOICES[name].__members__.items()
+        words = {member.partition("_")[2].lower(): int(kind) for member, kind in members}
+        if str(value).lower() not in words:
+            raise UnknownOption(name, value, words)
+        value = words[str(value).lower()]
+    setattr(options, name, type(getattr(options, name))(float(value)))
 
 
 def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
