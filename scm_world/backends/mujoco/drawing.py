@@ -78,7 +78,7 @@ class VisibleModel:
         self._given: tuple[Any, bytes] = ((), b"")  # the parameters that were written last
         self.model, self.data = now.model, now.data
         model = now.model
-        self.names = structure.body_names
+        self.names: tuple[str, ...] = structure.body_names
         mocap = model.body_mocapid[model.body_rootid] >= 0
         self._moves: NDArray[np.bool_] = (model.body_weldid != 0) | mocap
         self._rows = rows = np.flatnonzero(np.isin(model.geom_type, list(_KINDS)) & _looks(model))

@@ -166,8 +166,8 @@ def turned_bodies(model: Model, mj: mujoco.MjModel) -> tuple[tuple[str, ...], In
             names.append(model.body_names[int(mj.jnt_bodyid[joint])])
             turned.append([*range(qpos[q + 1], qpos[q + 1] + 4), *range(qvel[v], qvel[v] + 3)])
             own.append([*range(q, q + 4), *range(mj.nq + v, mj.nq + v + 3)])
-    found = (np.array(places, dtype=np.int64).reshape(-1, 7) for places in (turned, own))
-    return tuple(names), *found
+    places = np.array([turned, own], dtype=np.int64).reshape(2, -1, 7)
+    return tuple(names), places[0], places[1]
 
 
 LastStep = tuple[tuple[str, ...], Floats, Floats]
