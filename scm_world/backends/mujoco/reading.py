@@ -224,11 +224,7 @@ def _bodies(
 
 
 def _check(mj: mujoco.MjModel, where: str) -> None:
-    """Refuse what has effects that no graph could declare.
-
-    Raises:
-        ModelError: All that is wrong.
-    """
+    """Refuse what has effects that no graph could declare."""
     problems = []
     if mj.nv == 0:
         hint = "add a joint, or a freejoint; for a URDF, fixed_base=False lets its root link move"
@@ -285,11 +281,7 @@ def _check_inertia(mj: mujoco.MjModel, where: str) -> Iterator[str]:
 
 
 def _start(mj: mujoco.MjModel, keyframe: str | int | None) -> mujoco.MjData:
-    """Return the state in which episodes begin.
-
-    Raises:
-        UnknownOption: There is no such keyframe.
-    """
+    """Return the state in which episodes begin."""
     data = mujoco.MjData(mj)
     if keyframe is not None:
         names = [mj.key(i).name or str(i) for i in range(mj.nkey)]
@@ -361,11 +353,7 @@ def _notes(mj: mujoco.MjModel, keyframe: str | int | None, staged: bool) -> Iter
 
 
 def _exposed(rows: Sequence[Parameter], patterns: Sequence[str] | None) -> set[str]:
-    """Choose the parameters that can be set.
-
-    Raises:
-        ModelError: A pattern names nothing, or only what cannot be set.
-    """
+    """Choose the parameters that can be set."""
     can = [row for row in rows if not row.refusal]
     if patterns is None:
         return {row.name for row in can if row.usual}
@@ -534,11 +522,7 @@ def _grouped(
     states: Mapping[str, Sequence[str]] | None,
     reported: Sequence[str],
 ) -> tuple[StateRow, ...]:
-    """Put elementary states together, in the order of the state vector.
-
-    Raises:
-        ModelError: A name or a pattern names nothing, or a state is left out or taken twice.
-    """
+    """Put elementary states together, in the order of the state vector."""
     known = [name for name, row in elements.items() if row.reported]
     asked = {name for pattern in reported for name in fnmatch.filter(known, pattern)}
     problems = [

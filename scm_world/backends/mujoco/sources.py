@@ -150,11 +150,7 @@ def read_source(
 
 
 def _check_files(spec: mujoco.MjSpec) -> None:
-    """Refuse files that MuJoCo would read without an end.
-
-    Raises:
-        UnreadableFile: A device, a pipe, or a file that is too large.
-    """
+    """Refuse files that MuJoCo would read without an end."""
     named = [(spec.meshdir, part.file) for part in (*spec.meshes, *spec.hfields, *spec.skins)]
     for texture in spec.textures:
         named += [(spec.texturedir, name) for name in (texture.file, *texture.cubefiles)]
@@ -170,11 +166,7 @@ def _check_files(spec: mujoco.MjSpec) -> None:
 
 
 def _set_option(options: mujoco.MjOption, name: str, value: Any) -> None:
-    """Set an option to a number, or to a word of MJCF.
-
-    Raises:
-        UnknownOption: There is no such option, or no such word.
-    """
+    """Set an option to a number, or to a word of MJCF."""
     if name not in (*_CHOICES, *_NUMBERS):
         raise UnknownOption("setting", name, (*_CHOICES, *_NUMBERS))
     if name in _CHOICES:
@@ -191,10 +183,6 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
 
     Returns:
         The specification, how to call it, the stem of its file, and whether it is a URDF.
-
-    Raises:
-        UnreadableFile: There is no such file, or it is no text.
-        ModelError: It is neither MJCF nor URDF, or MuJoCo does not understand it.
     """
     path = None
     if isinstance(source, mujoco.MjSpec):
@@ -230,11 +218,7 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
 
 
 def _contents(path: Path) -> str:
-    """Read and decode a model file.
-
-    Raises:
-        UnreadableFile: There is none, or it is no text.
-    """
+    """Read and decode a model file."""
     advice = "give the path of an MJCF (.xml, .mjcf) or URDF (.urdf) file, or XML text"
     try:
         data = read_bytes(path)
@@ -310,11 +294,7 @@ def understood(where: str) -> Iterator[None]:
 
 
 def _complete(spec: mujoco.MjSpec, where: str, *, fixed_base: bool) -> None:
-    """Add to a URDF what MuJoCo leaves out: a free root, files of packages, motors, repairs.
-
-    Raises:
-        ModelError: MuJoCo does not compile it for another reason than its inertias.
-    """
+    """Add to a URDF what MuJoCo leaves out: a free root, files of packages, motors, repairs."""
     for body in () if fixed_base else spec.worldbody.bodies:
         if not body.joints:  # MuJoCo fixes the root link to the world
             body.add_freejoint()
@@ -345,11 +325,7 @@ def _packaged(name: str, folder: Path) -> Path | None:
 
 
 def _check_names(text: str, where: str) -> None:
-    """Refuse links and moving joints of a URDF that share a name, which MuJoCo would leave out.
-
-    Raises:
-        ModelError: With the names.
-    """
+    """Refuse links and moving joints of a URDF that share a name, which MuJoCo would leave out."""
     try:
         root = ElementTree.fromstring(text)  # noqa: S314 # expat bounds what entities become
     except ElementTree.ParseError:  # MuJoCo minds less, or says what is wrong
