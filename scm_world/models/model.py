@@ -234,11 +234,11 @@ class Model:
         return tuple(body.name for body in self.bodies)
 
     def empty_state(self) -> State:
-        """Give a state to read into."""
+        """Return a state to read into."""
         return State(self.layout)
 
     def default_scene(self) -> Scene:
-        """Give the scene in which every parameter and every state has its default."""
+        """Return the scene in which every parameter and every state has its default."""
         return Scene(self, self.default_parameters(), self.empty_state())
 
     def slots(self, mj: Any, data: Any) -> dict[ParameterKey, Any]:
@@ -246,7 +246,7 @@ class Model:
         return {row.key: row.slot(mj, data) for row in self.parameters if row.slot is not None}
 
     def default_parameters(self) -> dict[ParameterKey, Any]:
-        """Give the default of every parameter, by key."""
+        """Return the default of every parameter, by key."""
         return {
             row.key: np.array(np.broadcast_to(row.default, row.shape), dtype=np.float64)
             for row in self.parameters

@@ -73,13 +73,13 @@ class State:
         return self.with_vector(self.vector.copy())
 
     def with_vector(self, vector: Floats) -> Self:
-        """Give a state of the same layout with other numbers."""
+        """Return a state of the same layout with other numbers."""
         other = object.__new__(type(self))
         other.layout, other.vector = self.layout, vector
         return other
 
     def __getitem__(self, name: str) -> Floats:
-        """Give one state by its name, as a view."""
+        """Return one state by its name, as a view."""
         return self.vector[self.layout.slices[name]]
 
     def __iter__(self) -> Iterator[str]:
@@ -93,7 +93,7 @@ class State:
                 self.vector[where] = before.vector[there[name]]
 
     def coincides(self, other: State) -> bool:
-        """Tell whether all numbers that can be set are the same."""
+        """Return whether all numbers that can be set are the same."""
         same = self.vector == other.vector
         return bool((same if same.all() else same | ~self.layout.can_be_set).all())
 
@@ -147,10 +147,10 @@ class Structure(Protocol):
         """Layout of the state; a ``StateLayout``."""
 
     def empty_state(self) -> Any:
-        """Give a state to read into; a ``State``."""
+        """Return a state to read into; a ``State``."""
 
     def default_scene(self) -> Scene:
-        """Give the scene in which every parameter and every state has its default."""
+        """Return the scene in which every parameter and every state has its default."""
 
 
 @final

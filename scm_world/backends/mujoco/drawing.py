@@ -257,7 +257,7 @@ def visible(scene: Scene) -> VisibleModel:
 
 
 def _looks(model: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Tell which geoms are shown, shape (ngeom,)."""
+    """Return which geoms are shown, shape (ngeom,)."""
     shown: NDArray[np.bool_] = model.geom_group < SHOWN_GROUPS
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     for body in range(1, model.nbody):
@@ -309,7 +309,7 @@ def _height_field(model: mujoco.MjModel, field: int) -> Mesh:
 
 
 def _texture(model: mujoco.MjModel, material: int) -> Floats | None:
-    """Give the two colors of the checkerboard closest to a texture, shape (2, 3); None without."""
+    """Return the two colors of the checkerboard closest to a texture, shape (2, 3), if any."""
     roles = model.mat_texid[material]
     texture = max(int(roles[_ROLE.mjTEXROLE_RGB]), int(roles[_ROLE.mjTEXROLE_RGBA]))
     if texture < 0:

@@ -751,7 +751,7 @@ _NAMED = (
 
 
 def _free(name: str, taken: set[str]) -> str:
-    """Give a name that is not taken, with a number if need be, and take it."""
+    """Return a name that is not taken, with a number if need be, and take it."""
     free, n = name, 1
     while free in taken:
         n += 1

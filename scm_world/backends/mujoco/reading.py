@@ -57,7 +57,7 @@ _control, _passive, _act_dyn, _act_gain, _act_bias, _filter = CALLBACKS.values()
 
 
 def callbacks() -> list[str]:
-    """Say of each callback that is in use why no model can have it; none of them is usual."""
+    """List why no model can have the callbacks that are in use; usually there are none."""
     if not (_control() or _passive() or _act_dyn() or _act_gain() or _act_bias() or _filter()):
         return []
     return [
@@ -255,7 +255,7 @@ def _check(mj: mujoco.MjModel, where: str) -> None:
 
 
 def _check_inertia(mj: mujoco.MjModel, where: str) -> Iterator[str]:
-    """Say which bodies have no inertia that there can be, or which joints have none to move."""
+    """List bodies with impossible inertia, or joints that have none to move."""
     model, data = copy.copy(mj), mujoco.MjData(mj)
     data.warning.number[:] = 1  # MuJoCo prints the first warning of a kind
     mujoco.mj_setConst(model, data)
@@ -299,7 +299,7 @@ DRIFT = 1e-4
 
 
 def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator[str]:
-    """Say how far plain MuJoCo, with its warm start, goes elsewhere where iterations are few."""
+    """Measure how far plain MuJoCo, with its warm start, differs where iterations are few."""
     if mj.opt.iterations >= FEW:
         return
     ends = []
@@ -332,7 +332,7 @@ def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator
 
 
 def _notes(mj: mujoco.MjModel, keyframe: str | int | None, staged: bool) -> Iterator[str]:
-    """Say what acts without having a variable, and what is not used."""
+    """List what acts without having a variable, and what is not used."""
     if mj.nflex:
         yield f"{mj.nflex} flex(es) act through their vertices; their material has no variables."
     if staged:
@@ -522,7 +522,7 @@ def _grouped(
     states: Mapping[str, Sequence[str]] | None,
     reported: Sequence[str],
 ) -> tuple[StateRow, ...]:
-    """Put elementary states together, in the order of the state vector."""
+    """Group elementary states, in the order of the state vector."""
     known = [name for name, row in elements.items() if row.reported]
     asked = {name for pattern in reported for name in fnmatch.filter(known, pattern)}
     problems = [
@@ -576,7 +576,7 @@ def _row_of(rows: Iterable[StateRow], what: str) -> Numbers:
 def _of_actuator(
     trees: Couplings, actuator: int, *, stateful: bool
 ) -> tuple[int, frozenset[int], frozenset[int]]:
-    """Give the tree that an actuator is counted to, and what it acts on.
+    """Return the tree that an actuator is counted to, and the trees that it acts on.
 
     The inner state of an actuator belongs to the tree it moves.
     """

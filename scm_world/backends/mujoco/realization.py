@@ -58,7 +58,7 @@ def refuse_callbacks() -> None:
 
 
 def lost(structure: Any, vector: Floats, time: float) -> str:
-    """Say which states are not finite, and when.
+    """Return which states are not finite, and when, as a sentence.
 
     Args:
         structure: With the names of the states.
@@ -194,7 +194,7 @@ class Realization:
         self.replay = self._last = self._written = None
 
     def problem(self) -> str:
-        """Say what is wrong with what a step left, or nothing."""
+        """Return why the state after a step is invalid; empty if it is valid."""
         mujoco.mj_getState(self.model, self.data, self._motion, MOTION)
         if self._motion @ self._zeros == 0.0 and self._counts[1] + self._counts[2] == 2:
             return ""
@@ -279,7 +279,7 @@ class Realization:
         return Couplings(self._compiled).dynamic
 
     def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """Say with which shapes a friction that was changed has no effect.
+        """List with which shapes a friction that was changed has no effect.
 
         Source:
             MuJoCo, *Computation, Contact*: of two shapes the one with the higher priority decides,
@@ -362,7 +362,7 @@ class Realization:
             raise
 
     def followed(self, keys: Iterable[ParameterKey]) -> str:
-        """Compute what follows from some parameters; say what is wrong with it, or nothing."""
+        """Compute what follows from some parameters; return why that is invalid, or nothing."""
         keys = tuple(keys)
         for follow_up in {self._follow_ups[key] for key in keys if key in self._follow_ups}:
             follow_up(self.model)
@@ -381,7 +381,7 @@ class Realization:
         return ""
 
     def _culprits(self, keys: Iterable[ParameterKey]) -> list[ParameterKey]:
-        """Name those of some parameters that no body can have; all that count if none is wrong."""
+        """List the parameters among some that no body can have; all that count if none is wrong."""
         constant = [key for key in keys if key in self._constant]
         wrong = []
         for key in constant:

@@ -383,7 +383,7 @@ def _principal(body: Any) -> Floats:
 
 
 def _add_motors(spec: mujoco.MjSpec) -> None:
-    """Give every hinge and slide of a URDF a motor, as its joints are meant to be driven.
+    """Add a motor for every hinge and slide of a URDF, as its joints are meant to be driven.
 
     The control is the torque or force of the joint [N m] or [N], within the effort that the URDF
     allows; it is not limited where there is none. A joint that mimics another one has none.

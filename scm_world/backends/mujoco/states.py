@@ -38,7 +38,7 @@ def _rotate(turn: Floats, start: int, vector: Floats, inverse: bool) -> None:
 
 @numba.njit("void(f8[:, ::1], i4[::1], i8[:, ::1])", cache=True)
 def into_world(vectors: Floats, which: Any, turned: Integers) -> None:
-    """Give quaternions a w that is not negative, and turn angular velocities into the world.
+    """Make w of quaternions not negative, and turn angular velocities into the world.
 
     Args:
         vectors: States, one to a row, changed in place.
