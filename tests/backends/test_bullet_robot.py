@@ -15,7 +15,7 @@ import robot_scenes
 from robot_scenes import busy_scene
 
 from scm_world.backends.bullet import BulletBackend
-from scm_world.backends.mujoco.reading import body_names, compiled
+from scm_world.backends.mujoco.reading import compiled
 from scm_world.errors import EngineFailure, MissingEngine
 from scm_world.models import Difference
 from scm_world.tasks.trifinger import hardware
@@ -41,7 +41,7 @@ def backend() -> Iterator[BulletBackend]:
 def robot(backend: BulletBackend) -> tuple[Any, Any, tuple[str, ...]]:
     """Give the engine, the client that holds the last step, and the names of the bodies."""
     client = backend._last()
-    return backend._engine, client, body_names(compiled(backend.structure))
+    return backend._engine, client, backend.structure.body_names
 
 
 def test_links_are_where_kinematics_has_them(backend: BulletBackend) -> None:

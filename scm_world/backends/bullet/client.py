@@ -20,7 +20,7 @@ from scm_world.backends.bullet.build import BALL, FREE, Built, Handle, custom, s
 from scm_world.backends.bullet.honoured import heavy, realized, rotations
 from scm_world.backends.bullet.joints import Part, parts
 from scm_world.backends.mujoco import reading
-from scm_world.backends.mujoco.backend import realize
+from scm_world.backends.mujoco.realization import Realization
 from scm_world.backends.mujoco.trees import Couplings, disabled
 from scm_world.errors import EngineFailure, UnknownOption
 from scm_world.models.model import Model
@@ -268,8 +268,8 @@ class Client:
         if self._model != model:
             compiled = reading.compiled(model)
             self._model, self._inside = model, None
-            self._twin = realize(model, arrays(parameters))
-            self._names, self._pulled = reading.body_names(compiled), _pulled(compiled)
+            self._twin = Realization(model, arrays(parameters))
+            self._names, self._pulled = model.body_names, _pulled(compiled)
             self._usual, self._spinning = usual_friction(compiled), spinning_shares(compiled)
             trees = Couplings(compiled)
             self._dynamic = np.flatnonzero(trees.dynamic.any(axis=1)).tolist()
