@@ -10,10 +10,8 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Value, Values
-from scm_world.geometry.arrays import compact
-from scm_world.geometry.filling import overlap_fraction_kernel
+from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction_kernel
 from scm_world.geometry.hulls import Hull
-from scm_world.geometry.overlap import aabb_overlap_fraction
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.tasks.base import OVERLAP, Goal
 from scm_world.tasks.composition import Entity
@@ -220,7 +218,7 @@ def assembled(
 def _split(boxes: Floats) -> tuple[Floats, Floats, Floats]:
     rows = boxes.reshape(-1, BOX)
     parts = (rows[:, :3], rows[:, 3:6], rows[:, 6:])
-    size, position, orientation = (compact(part) for part in parts)
+    size, position, orientation = (np.array(part, order="C") for part in parts)
     return size, position, orientation
 
 
