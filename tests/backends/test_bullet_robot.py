@@ -103,7 +103,7 @@ def test_nothing_slows_a_flying_block(backend: BulletBackend) -> None:
     backend.build(scene)
     backend.apply(Difference(parameters={("world", "gravity"): np.zeros(3)}))
     backend.step(np.array(hardware.REST), 100)
-    after = backend.state()
+    after = backend.read()
     np.testing.assert_array_equal(after.linear_velocities, scene.state.linear_velocities)
     np.testing.assert_allclose(after.angular_velocities, scene.state.angular_velocities, atol=1e-14)
 
@@ -122,7 +122,7 @@ def test_a_driven_joint_reaches_its_final_speed(backend: BulletBackend) -> None:
     }
     backend.build(scene.with_(parameters={**scene.parameters, **values}))
     backend.step(np.full(9, torque), 125)
-    np.testing.assert_allclose(backend.state().joint_velocities, torque / damping, rtol=0.02)
+    np.testing.assert_allclose(backend.read().joint_velocities, torque / damping, rtol=0.02)
 
 
 # --- life -----------------------------------------------------------------------------------------

@@ -31,8 +31,6 @@ from scm_world.models.scene import (
     ParameterKey,
     Parameters,
     Scene,
-    State,
-    Structure,
     complete,
 )
 
@@ -133,11 +131,14 @@ class BulletBackend(Backend):
     """
 
     name: ClassVar[str] = "bullet"
-    capabilities: ClassVar[Capabilities] = Capabilities(snapshot="replay")
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        supports=lambda structure, key: isinstance(structure, Model) and supports(structure, key),
+        remarks=lambda backend, before: backend._now().remarks(before),
+    )
 
     def __init__(self) -> None:
         self._engine = load()
-        self._version = version()
+        self.version = version()
         self._base: Client | None = None  # holds the world of the last step, once it is needed
         self._lost = False  # whether the past must be replayed before the base is used
         self._spare: Client | None = None  # holds the canonical world, if there is one
@@ -149,15 +150,10 @@ class BulletBackend(Backend):
         self._resting: list[float] | None = None  # state of the base, once it was asked for
         self._saved: SavedState | None = None  # of the base
 
-    @property
-    def version(self) -> str:
-        """Version of pybullet."""
-        return self._version
-
-    @property
-    def structure(self) -> Structure:
-        """What was built."""
-        return (self._present or self._lived().origin).structure
+    def __getattr__(self, name: str) -> Any:
+        if name == "structure":
+            return (self._present or self._lived().origin).structure
+        raise AttributeError(name)
 
     # --- clients -------------------------------------------------------------------------------
 
@@ -301,26 +297,16 @@ class BulletBackend(Backend):
         Raises:
             UnknownOption: The scene has no such parameter.
         """
-        return self._now().parameters(known(self._described().parameters, keys))
+        return self._now().parameters(keys)
 
-    def inertia(self, body: str) -> Floats:
-        """Read the principal moments of inertia of a body, shape (3,) [kg m²].
-
-        Raises:
-            UnknownOption: There is no such body.
-        """
-        return self._now().inertia(body)
-
-    def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """Say which frictions were changed without an effect."""
-        return self._now().remarks(before)
-
-    def read(self, into: State) -> None:
-        """Write the present state into an existing vector."""
+    def read(self, into: Any = None) -> Any:
+        """Write the present state into an existing one, or a new one."""
         numbers = self._now().read(self._reported)
         if not math.isfinite(sum(numbers)):
             raise EngineFailure("Bullet produced a state that is not finite", self.name)
+        into = self.structure.empty_state() if into is None else into
         into.vector[:] = numbers
+        return into
 
     def step(self, command: Floats, substeps: int) -> None:
         """Hold a command for some physics steps.
@@ -366,10 +352,6 @@ class BulletBackend(Backend):
         """List the contact points of the last physics step."""
         return self._last().contacts()
 
-    def supports(self, structure: Structure, key: ParameterKey) -> bool:
-        """Tell whether a parameter of a structure can be set."""
-        return isinstance(structure, Model) and supports(structure, key)
-
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""
         history, resting = self._lived(), self._described_base().state
@@ -386,7 +368,7 @@ class BulletBackend(Backend):
             resting,
             self._saved,
         )
-        return self.sealed(record)
+        return EngineSnapshot.of(self, record)
 
     def restore(self, snapshot: EngineSnapshot) -> None:
         """Go back to a snapshot.
@@ -394,7 +376,7 @@ class BulletBackend(Backend):
         Raises:
             SnapshotMismatch: It was taken by another engine, or another version of it.
         """
-        record: Record = self.opened(snapshot)
+        record: Record = snapshot.opened(self)
         rows, row = record.rows[: record.length], AHEAD + record.origin.structure.n_commands
         self._history = History(record.origin, rows, list(record.edits), int(sum(rows[::row])))
         self._before = dict(record.origin.parameters)

@@ -423,18 +423,6 @@ class Client:
         """Read parameters from the arrays that the engine's numbers are made of."""
         return self._twin.parameters(keys)
 
-    def inertia(self, body: str) -> Floats:
-        """Ask the engine for principal moments of inertia, shape (3,) [kg m²].
-
-        Raises:
-            UnknownOption: There is no such body.
-        """
-        moments = self._twin.inertia(body)
-        place = self._built.bodies.get(self._names.index(body))
-        if place is None:  # it cannot move
-            return moments
-        return np.array(self.engine.getDynamicsInfo(*place, physicsClientId=self.handle)[2])
-
     def remarks(self, before: Parameters) -> tuple[str, ...]:
         """Say which frictions were changed without an effect; see ``shares``."""
         twin, found = self._twin, list[str]()
