@@ -276,11 +276,11 @@ def test_every_body_takes_part_in_contacts(backend: BulletBackend, early: bool) 
     backend.build(trifinger(("other",)).default_scene())
     for change in changes if early else reversed(changes):
         backend.apply(change)
-    client = backend._now()
+    client = backend.client()
 
     def info(body: int, link: int) -> Sequence[float]:
         found: Sequence[float] = backend._engine.getDynamicsInfo(
-            body, link, physicsClientId=client.handle
+            body, link, physicsClientId=client.engine.handle
         )
         return found
 

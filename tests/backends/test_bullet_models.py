@@ -244,11 +244,11 @@ def placed(backend: BulletBackend, model: Model, data: mujoco.MjData) -> Any:
     state.vector[places.positions] = data.qpos
     state.vector[places.velocities] = data.qvel
     backend.build(model.default_scene().with_(state=state))
-    client = backend._last()
+    client = backend.base()
     for first, second in touching(model):
         one, other = client._built.geoms[first], client._built.geoms[second]
         client.engine.setCollisionFilterPair(
-            one[0], other[0], one[1], other[1], 0, physicsClientId=client.handle
+            one[0], other[0], one[1], other[1], 0, physicsClientId=client.engine.handle
         )
     return client
 
@@ -290,11 +290,11 @@ def test_bodies_are_where_mujoco_has_them(backend: BulletBackend, name: str) -> 
     for body, (multibody, link) in client._built.bodies.items():
         if link < 0:
             pose = client.engine.getBasePositionAndOrientation(
-                multibody, physicsClientId=client.handle
+                multibody, physicsClientId=client.engine.handle
             )
         else:
             pose = client.engine.getLinkState(
-                multibody, link, computeForwardKinematics=1, physicsClientId=client.handle
+                multibody, link, computeForwardKinematics=1, physicsClientId=client.engine.handle
             )
         # The engine keeps the frames of links in single precision.
         np.testing.assert_allclose(pose[0], data.xipos[body], atol=1e-6)
