@@ -266,15 +266,18 @@ def test_a_snapshot_of_another_version_is_refused(backend: BulletBackend) -> Non
 
 
 def test_one_query_and_one_torque_call_per_physics_step(backend: BulletBackend) -> None:
-    """A physics step costs three engine calls."""
-    watched = watch(backend)
-    backend.build(busy_scene())
+    """A physics step costs three engine calls; the state is read once after the last one."""
+    watched, scene = watch(backend), busy_scene()
+    backend.build(scene)
     watched.calls.clear()
     backend.step(np.zeros(9), 10)
+    n_blocks = len(scene.structure.blocks)
     assert watched.calls == {
-        "getJointStates": 10,
+        "getJointStates": 11,
         "setJointMotorControlArray": 10,
         "stepSimulation": 10,
+        "getBasePositionAndOrientation": n_blocks,
+        "getBaseVelocity": n_blocks,
     }
 
 

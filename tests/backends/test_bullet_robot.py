@@ -153,7 +153,7 @@ def test_clients_are_given_back() -> None:
     backend = BulletBackend()
     engine = backend._engine
     backend.build(busy_scene())
-    handle = backend.base().handle
+    handle = backend.base().engine.handle
     assert engine.isConnected(handle)
     del backend
     assert not engine.isConnected(handle)

@@ -127,25 +127,26 @@ class BulletBackend(Backend):
     # --- clients -------------------------------------------------------------------------------
 
     def base(self) -> Client:
-        """Return the client that holds the world of the last step, perhaps with other parameters.
+        """Return the client that holds the last step, perhaps with what live bodies took on."""
+        history = self._history
+        self._base = self._base or Client(self._engine)
+        if self._base.holds is not history:
+            history.replay(self._base)
+            self._base.holds = history
+            if self._light:
+                self._base.edit(self._now.parameters)
+        return self._base
 
-        Where none does, what the engine has saved is loaded, or the past is replayed.
-        """
-        history, base = self._history, self._base
-        if base is not None and base.holds is history:
-            return base
-        saved = self._saved
-        both = [client for client in (self._base, self._spare) if client is not None]
-        base = next((client for client in both if saved and client.load(saved)), None)
-        if base is None:
-            base = self._base or Client(self._engine)
-            history.replay(base)
-        elif base is self._spare:
-            self._spare = self._base
-        self._base = base
-        base.edit((self._now if self._light else self._last).parameters)
-        base.holds = history
-        return base
+    def _recall(self) -> None:
+        """Spare the base a replay, if one of the clients still has the saved state."""
+        base, spare = self._base, self._spare
+        if self._saved is None or (base and base.holds is self._history):
+            return
+        if base and base.load(self._saved):
+            base.holds = self._history
+        elif spare and spare.load(self._saved):
+            spare.holds = self._history
+            self._base, self._spare = spare, base
 
     def client(self) -> Client:
         """Return the client that holds the present."""
@@ -312,9 +313,10 @@ class BulletBackend(Backend):
         self._last, self._now, self._light = record.last, record.now, record.light
         self._saved = record.saved
         try:
-            client = self.client()
+            self._recall()
             if self._light:
-                client.edit(self._now.parameters)
+                self.base().edit(record.now.parameters)
+            self.client()
         except Exception as error:
             self.close()
             raise EngineFailure(f"Bullet could not go there: {error}", self.name) from error

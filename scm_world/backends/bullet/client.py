@@ -224,7 +224,7 @@ class Client:
         if self._model != model:
             compiled = reading.compiled(model)
             self._model, self._inside = None, None
-            self._twin = realize(model, parameters)
+            self._twin, self._given = realize(model, parameters), dict(parameters)
             self._pulled = _pulled(compiled)
             self._usual, self._spinning = usual_friction(compiled), spinning_shares(compiled)
             trees = Couplings(compiled)
@@ -235,7 +235,7 @@ class Client:
             ends = zip(compiled.pair_geom1.tolist(), compiled.pair_geom2.tolist(), strict=True)
             self._paired = {geom: pair for pair, both in enumerate(ends) for geom in both}
             self._model = model
-        self._twin.edit(parameters)
+        self._take(parameters)
         if self._inside is None or not alike(self._inside, parameters, rebuilt(model)):
             self._inside, mj = None, self._twin.model
             gone = self._built.make(mj, self._shapes)
@@ -283,8 +283,14 @@ class Client:
         Raises:
             Infeasible: Nothing can move with them. Nothing has changed.
         """
-        self._twin.edit(parameters)
+        self._take(parameters)
         self._tell_all()
+
+    def _take(self, parameters: Parameters) -> None:
+        """Give MuJoCo's model what it was not given before."""
+        fresh = {k: v for k, v in parameters.items() if self._given.get(k) is not v}
+        self._twin.edit(fresh)
+        self._given |= fresh
 
     def _tell_all(self) -> None:
         """Tell the engine what differs from what it was told before."""
