@@ -44,7 +44,8 @@ def unsupported(model: Model) -> tuple[str, ...]:
     """List everything in a model that the engine cannot honour."""
     mj = reading.compiled(realized(model))
     names, trees, tables = fields.element_names(mj), Couplings(mj), list[tuple[str, Any, str]]()
-    touching, dynamic = trees.touches.any(axis=1), trees.dynamic.any(axis=1)
+    touching: NDArray[np.bool_] = np.asarray(trees.touches.any(axis=1))
+    dynamic: NDArray[np.bool_] = np.asarray(trees.dynamic.any(axis=1))
     kinds, dofs = mj.jnt_type, mj.jnt_dofadr
     loss, odd = mj.dof_frictionloss[dofs] != 0.0, ~np.isin(mj.geom_type, list(SHAPES))
     working = np.array([works(mj, actuator) for actuator in range(mj.nactuator)], dtype=np.bool_)
