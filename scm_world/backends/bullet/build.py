@@ -29,14 +29,17 @@ STRONGEST = 1e9  # [N m] or [N] of a coupling
 
 FREE, BALL, SLIDE, HINGE = range(4)
 """Kinds of joints, as MuJoCo numbers them (``mjtJoint``)."""
+JOINTS = {HINGE: "JOINT_REVOLUTE", SLIDE: "JOINT_PRISMATIC", BALL: "JOINT_SPHERICAL"}
+"""Their names in the engine."""
 
+MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 SHAPES = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): "GEOM_PLANE",
     int(mujoco.mjtGeom.mjGEOM_SPHERE): "GEOM_SPHERE",
     int(mujoco.mjtGeom.mjGEOM_CAPSULE): "GEOM_CAPSULE",
     int(mujoco.mjtGeom.mjGEOM_CYLINDER): "GEOM_CYLINDER",
     int(mujoco.mjtGeom.mjGEOM_BOX): "GEOM_BOX",
-    int(mujoco.mjtGeom.mjGEOM_MESH): "GEOM_MESH",
+    MESH: "GEOM_MESH",
 }
 """The shapes that the engine has, by the kinds of MuJoCo's."""
 
@@ -60,7 +63,7 @@ LINK = (
 @final
 @dataclass
 class Unit:
-    """A multibody, or a body that cannot move.
+    """A multibody, or a body that cannot move. Equal ones need not be made again.
 
     Attributes:
         bodies: The numbers of its bodies in the compiled model.
@@ -69,15 +72,37 @@ class Unit:
         multibody: Its number in the engine.
         links: The links of each body, of each joint and of each shape, in the order above; that of
             a body carries its mass, and that of a free joint is -1.
-        made_of: Everything that cannot be changed while it is there.
+        base: Arguments of ``createMultiBody`` for the base.
+        rows: Those for each link, see ``LINK``. Masses are 1 or 0 until they are told.
+        shapes: Of each shape, the arguments of ``createCollisionShape`` and its margin [m].
+        gears: Of each coupling, two joints, an offset and a ratio.
+        rest: What else cannot be changed while it is there.
     """
 
-    bodies: list[int]
-    joints: list[int]
-    geoms: list[int]
-    multibody: int = -1
-    links: tuple[list[int], list[int], list[int]] = field(default_factory=lambda: ([], [], []))
-    made_of: tuple[Any, ...] = ()
+    bodies: list[int] = field(compare=False)
+    joints: list[int] = field(compare=False)
+    geoms: list[int] = field(compare=False)
+    multibody: int = field(default=-1, compare=False)
+    links: tuple[list[int], list[int], list[int]] = ([], [], [])
+    base: dict[str, Any] = field(default_factory=dict)
+    rows: list[list[Any]] = field(default_factory=list)
+    shapes: list[tuple[dict[str, Any], float]] = field(default_factory=list)
+    gears: list[tuple[int, int, float, float]] = field(default_factory=list)
+    rest: tuple[bytes, ...] = ()
+
+    def add(
+        self,
+        parent: int,
+        position: Floats,
+        turn: Floats,
+        kind: str = "JOINT_FIXED",
+        axis: Sequence[float] = (0.0, 0.0, 1.0),
+    ) -> int:
+        """Add a link without mass whose frame is given in that of its parent."""
+        frame = [position.tolist(), plain(turn), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+        # The engine counts parents from the base.
+        self.rows.append([0.0, -1, -1, *frame, parent + 1, kind, list(axis)])
+        return len(self.rows) - 1
 
 
 @final
@@ -110,214 +135,61 @@ class Built:
         Returns:
             The multibodies that are gone.
         """
-        self._mj, self._data = mj, mujoco.MjData(mj)
-        mujoco.mj_kinematics(mj, self._data)
+        data, engine, kept = mujoco.MjData(mj), self._engine, 0
+        mujoco.mj_kinematics(mj, data)
         units = list(_units(mj, touching))
         for unit in units:
-            unit.made_of = self._made_of(unit)
-        kept = 0
+            _describe(unit, mj, data)
         for old, new in zip(self._units, units, strict=False):
-            if old.made_of != new.made_of:
+            if old != new:
                 break
-            new.multibody, new.links = old.multibody, old.links
-            kept += 1
+            new.multibody, kept = old.multibody, kept + 1
         gone = [unit.multibody for unit in self._units[kept:]]
         for multibody in reversed(gone):
-            self._engine.removeBody(multibody)
+            engine.removeBody(multibody)
         self._units = units[:kept]
         for unit in units[kept:]:
-            (self._make_tree if unit.bodies else self._make_fixed)(unit)
+            self._create(unit, custom(mj, "bullet_damping", -1 in unit.links[1]))
             self._units.append(unit)
-        self.bodies, self.joints, self.geoms = {}, {}, {}
-        for unit in units:
-            numbers = unit.bodies, unit.joints, unit.geoms
-            for table, own, links in zip(
-                (self.bodies, self.joints, self.geoms), numbers, unit.links, strict=True
-            ):
-                table |= {n: (unit.multibody, link) for n, link in zip(own, links, strict=True)}
+        numbers = [(unit, (unit.bodies, unit.joints, unit.geoms)) for unit in units]
+        self.bodies, self.joints, self.geoms = (
+            {
+                number: (unit.multibody, link)
+                for unit, own in numbers
+                for number, link in zip(own[kind], unit.links[kind], strict=True)
+            }
+            for kind in range(3)
+        )
         return set(gone)
 
-    def _made_of(self, unit: Unit) -> tuple[Any, ...]:
-        """List everything in a unit that cannot be changed while it is there."""
-        mj, data = self._mj, self._data
-        bodies, joints, geoms = unit.bodies, unit.joints, unit.geoms
-        place = {body: index for index, body in enumerate(bodies)}
-        found: list[Any] = [
-            *(len(bodies), len(joints), mj.opt.disableflags, mj.jnt_limited[joints]),
-            *(mj.numeric_data, mj.geom_margin[geoms]),
-            np.isin(geoms, [mj.pair_geom1, mj.pair_geom2]),
-            *(mj.geom_type[geoms], mj.geom_size[geoms]),
-            *(_corners(mj, geom) for geom in geoms),
-        ]
-        if not bodies:
-            found += [data.geom_xpos[geoms], data.geom_xmat[geoms]]
-        else:
-            free = int(mj.jnt_type[joints[0]] == FREE)
-            parents = mj.body_parentid[bodies].tolist()
-            fixed = [parent for parent in parents if parent not in place]
-            found += [
-                tuple(place.get(parent, -1) for parent in parents),
-                tuple(place[body] for body in mj.geom_bodyid[geoms].tolist()),
-                *(mj.body_ipos[bodies], mj.body_jntnum[bodies]),
-                *(solid(mj, body)[1] for body in bodies),
-                *(mj.body_pos[bodies[free:]], mj.body_quat[bodies[free:]]),
-                *(data.xpos[fixed], data.xquat[fixed]),
-                *(mj.jnt_type[joints], mj.jnt_pos[joints], mj.jnt_axis[joints]),
-                *(mj.geom_pos[geoms], mj.geom_quat[geoms]),
-                *(mj.eq_data[equality, :2] for equality in couplings(mj, joints)),
-            ]
-        return tuple(part.tobytes() if isinstance(part, np.ndarray) else part for part in found)
-
-    def _make_fixed(self, unit: Unit) -> None:
-        """Make a shape that cannot move."""
-        mj, data, (geom,) = self._mj, self._data, unit.geoms
-        place, turn = data.geom_xpos[geom], np.empty(4)
-        mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
-        origin = None
-        if SHAPES[int(mj.geom_type[geom])] == "GEOM_MESH":  # in the frame of the body, as drawn
-            body = int(mj.geom_bodyid[geom])
-            place, turn, origin = data.xpos[body], data.xquat[body], ORIGIN
-        unit.multibody = self._engine.createMultiBody(
-            0,
-            self._shape(geom, origin),
-            basePosition=place.tolist(),
-            baseOrientation=plain(turn),
-            useMaximalCoordinates=True,
-        )
-        unit.links = [], [], [-1]
-        self._set_margins(unit)
-
-    def _make_tree(self, unit: Unit) -> None:
-        """Make a multibody of bodies that can move, without motors, damping and sleep."""
-        mj, data, engine = self._mj, self._data, self._engine
-        kinds = {
-            HINGE: engine.JOINT_REVOLUTE,
-            SLIDE: engine.JOINT_PRISMATIC,
-            BALL: engine.JOINT_SPHERICAL,
-        }
-        rows: list[list[Any]] = []  # the arguments of each link; see LINK
-        base: dict[str, Any] = {"baseMass": 0.0}
-        carrier: dict[int, int] = {}  # the link whose frame moves with a body
-        origin: dict[int, Floats] = {}  # of that frame, in the frame of the body
-        hinges: dict[int, int] = {}
-        shapes: dict[int, int] = {}
-
-        def add(
-            parent: int,
-            position: Floats,
-            turn: Floats,
-            shape: int = -1,
-            kind: int = engine.JOINT_FIXED,
-            axis: Sequence[float] = (0.0, 0.0, 1.0),
-        ) -> int:
-            """Add a link without mass whose frame is given in that of its parent."""
-            frame = [position.tolist(), plain(turn), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-            # The engine counts parents from the base.
-            rows.append([0.0, shape, -1, *frame, parent + 1, kind, list(axis)])
-            return len(rows) - 1
-
-        for body in unit.bodies:
-            joints, parent = joints_of(mj, body), int(mj.body_parentid[body])
-            mass, center, axes = float(mj.body_mass[body]), mj.body_ipos[body], solid(mj, body)[1]
-            if joints and mj.jnt_type[joints[0]] == FREE:
-                base = {
-                    "baseMass": mass,
-                    "baseInertialFramePosition": center.tolist(),
-                    "baseInertialFrameOrientation": plain(axes),
-                }
-                carrier[body], origin[body], hinges[joints[0]] = -1, ORIGIN, -1
+    def _create(self, unit: Unit, damping: float) -> None:
+        """Make a unit, without what the engine does by itself: motors, sleep, a highest speed."""
+        engine, base, rows = self._engine, dict(unit.base), [list(row) for row in unit.rows]
+        for (shape, _), link in zip(unit.shapes, unit.links[2], strict=True):
+            kind = getattr(engine, shape["shapeType"])
+            number = engine.createCollisionShape(**{**shape, "shapeType": kind})
+            if link < 0:
+                base["baseCollisionShapeIndex"] = number
             else:
-                start, turn = mj.body_pos[body], mj.body_quat[body]
-                if parent in carrier:
-                    link, start = carrier[parent], start - origin[parent]
-                else:  # the parent cannot move
-                    link, start = -1, data.xpos[parent] + rotated(data.xquat[parent], start)
-                    turn = composed(data.xquat[parent], turn)
-                at = ORIGIN
-                for joint in joints:
-                    kind, axis = kinds[int(mj.jnt_type[joint])], mj.jnt_axis[joint].tolist()
-                    anchor = mj.jnt_pos[joint]
-                    position = start + rotated(turn, anchor - at)
-                    hinges[joint] = link = add(link, position, turn, kind=kind, axis=axis)
-                    start, turn, at = ORIGIN, UNTURNED, anchor
-                if not joints:
-                    link = add(link, start, turn)
-                rows[link][0] = mass
-                rows[link][5:7] = (center - at).tolist(), plain(axes)
-                carrier[body], origin[body] = link, at
-            own = [geom for geom in unit.geoms if mj.geom_bodyid[geom] == body]
-            for geom in own[:1]:
-                shape = self._shape(geom, origin[body])
-                shapes[geom] = link = carrier[body]
-                if link < 0:
-                    base["baseCollisionShapeIndex"] = shape
-                else:
-                    rows[link][1] = shape
-            for geom in own[1:]:
-                shape = self._shape(geom, origin[body])
-                shapes[geom] = add(carrier[body], ORIGIN, UNTURNED, shape)
+                rows[link][1] = number
+        for row in rows:
+            row[8] = getattr(engine, row[8])
         # What touches what is said by pairs alone, also within the multibody.
         flags = engine.URDF_USE_SELF_COLLISION | engine.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
         columns = dict(zip(LINK, map(list, zip(*rows, strict=True)), strict=bool(rows)))
-        unit.multibody = engine.createMultiBody(flags=flags, **base, **columns)
-        unit.links = (
-            [carrier[body] for body in unit.bodies],
-            [hinges[joint] for joint in unit.joints],
-            [shapes[geom] for geom in unit.geoms],
-        )
-        self._calm(unit.multibody, hinges)
-        for equality in couplings(mj, unit.joints):
-            self._couple(unit.multibody, equality, hinges)
-        self._set_margins(unit)
-
-    def _set_margins(self, unit: Unit) -> None:
-        """Set by how much meshes are inflated."""
-        for geom, link in zip(unit.geoms, unit.links[2], strict=True):
-            if SHAPES[int(self._mj.geom_type[geom])] == "GEOM_MESH":
-                margin = max(HULL_MARGIN, float(self._mj.geom_margin[geom]))
-                self._engine.changeDynamics(unit.multibody, link, collisionMargin=margin)
-
-    def _shape(self, geom: int, origin: Floats | None) -> int:
-        """Make a collision shape.
-
-        Args:
-            geom: The shape.
-            origin: Of the frame that it is made in, which is turned like the body, in the frame of
-                the body [m]; in its own frame if None.
-        """
-        mj, options = self._mj, dict[str, Any]()
-        radius, half, _ = size = mj.geom_size[geom].tolist()
-        kind = SHAPES[int(mj.geom_type[geom])]
-        match kind:
-            case "GEOM_PLANE":
-                options = {"planeNormal": [0.0, 0.0, 1.0]}
-            case "GEOM_SPHERE":
-                options = {"radius": radius}
-            case "GEOM_CAPSULE" | "GEOM_CYLINDER":
-                options = {"radius": radius, "height": 2.0 * half}
-            case "GEOM_BOX":
-                options = {"halfExtents": size}
-            case _:
-                options = {"vertices": _kept(_corners(mj, geom, origin))}
-        if origin is not None and kind != "GEOM_MESH":
-            place, turn = mj.geom_pos[geom] - origin, mj.geom_quat[geom]
-            if place.any() or turn[0] != 1.0:  # a frame of its own, which has a price
-                options |= {"collisionFramePosition": place.tolist()}
-                options |= {"collisionFrameOrientation": plain(turn)}
-        shape: int = self._engine.createCollisionShape(getattr(self._engine, kind), **options)
-        return shape
-
-    def _calm(self, made: int, joints: dict[int, int]) -> None:
-        """Switch off what the engine does by itself: damping, motors, sleep, a highest speed."""
-        engine, damping = self._engine, custom(self._mj, "bullet_damping", -1 in joints.values())
-        # One property a call: beside damping or maxJointVelocity, others would land on the base.
-        engine.changeDynamics(made, -1, linearDamping=damping)
-        engine.changeDynamics(made, -1, angularDamping=damping)
-        engine.changeDynamics(made, -1, maxJointVelocity=FASTEST)
-        awake = engine.ACTIVATION_STATE_DISABLE_SLEEPING
-        engine.changeDynamics(made, -1, activationState=awake)
-        for joint, link in joints.items():
-            if self._mj.jnt_type[joint] == BALL:
+        made = engine.createMultiBody(flags=flags if unit.bodies else 0, **base, **columns)
+        unit.multibody = made
+        if unit.bodies:
+            # One property a call: beside damping or maxJointVelocity, others land on the base.
+            awake = engine.ACTIVATION_STATE_DISABLE_SLEEPING
+            engine.changeDynamics(made, -1, linearDamping=damping)
+            engine.changeDynamics(made, -1, angularDamping=damping)
+            engine.changeDynamics(made, -1, maxJointVelocity=FASTEST)
+            engine.changeDynamics(made, -1, activationState=awake)
+        for link in unit.links[1]:
+            if link < 0:
+                continue
+            if unit.rows[link][8] == "JOINT_SPHERICAL":
                 engine.setJointMotorControlMultiDof(
                     made,
                     link,
@@ -327,25 +199,113 @@ class Built:
                     velocityGain=0.0,
                     force=[0.0, 0.0, 0.0],
                 )
-            elif link >= 0:
+            else:
                 engine.setJointMotorControl2(made, link, engine.VELOCITY_CONTROL, force=0.0)
+        zero = [0.0, 0.0, 0.0]
+        for first, other, offset, ratio in unit.gears:
+            ends, axis = (made, first, made, other), [1.0, 0.0, 0.0]
+            gear = engine.createConstraint(*ends, engine.JOINT_GEAR, axis, zero, zero)
+            engine.changeConstraint(
+                gear,
+                gearRatio=-ratio,
+                relativePositionTarget=offset,
+                erp=GEAR_ERP,
+                maxForce=STRONGEST,
+            )
+        for (shape, margin), link in zip(unit.shapes, unit.links[2], strict=True):
+            if shape["shapeType"] == "GEOM_MESH":
+                engine.changeDynamics(made, link, collisionMargin=max(HULL_MARGIN, margin))
 
-    def _couple(self, made: int, equality: int, links: dict[int, int]) -> None:
-        """Let a joint follow another one in proportion."""
-        mj, engine, zero = self._mj, self._engine, [0.0, 0.0, 0.0]
-        offset, ratio = mj.eq_data[equality, :2].tolist()
-        first = made, links[int(mj.eq_obj1id[equality])]
-        other = made, links[int(mj.eq_obj2id[equality])]
-        gear = engine.createConstraint(
-            *first, *other, engine.JOINT_GEAR, [1.0, 0.0, 0.0], zero, zero
-        )
-        engine.changeConstraint(
-            gear,
-            gearRatio=-ratio,
-            relativePositionTarget=offset,
-            erp=GEAR_ERP,
-            maxForce=STRONGEST,
-        )
+
+def _describe(unit: Unit, mj: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Fill in what a unit is made of."""
+    carrier: dict[int, int] = {}  # the link whose frame moves with a body
+    origin: dict[int, Floats | None] = {}  # of that frame, in the frame of the body
+    hinges: dict[int, int] = {}
+    shapes: dict[int, int] = {}
+    for body in unit.bodies:
+        joints, parent = joints_of(mj, body), int(mj.body_parentid[body])
+        mass, center = float(mj.body_mass[body] > 0.0), mj.body_ipos[body]
+        axes = plain(solid(mj, body)[1])
+        if joints and mj.jnt_type[joints[0]] == FREE:
+            unit.base["baseMass"] = mass
+            unit.base["baseInertialFramePosition"] = center.tolist()
+            unit.base["baseInertialFrameOrientation"] = axes
+            carrier[body], origin[body], hinges[joints[0]] = -1, ORIGIN, -1
+        else:
+            start, turn = mj.body_pos[body], mj.body_quat[body]
+            if parent in carrier:
+                link, start = carrier[parent], start - origin[parent]
+            else:  # the parent cannot move
+                link, start = -1, data.xpos[parent] + rotated(data.xquat[parent], start)
+                turn = composed(data.xquat[parent], turn)
+            at = ORIGIN
+            for joint in joints:
+                anchor, axis = mj.jnt_pos[joint], mj.jnt_axis[joint].tolist()
+                position = start + rotated(turn, anchor - at)
+                link = unit.add(link, position, turn, JOINTS[int(mj.jnt_type[joint])], axis)
+                hinges[joint], start, turn, at = link, ORIGIN, UNTURNED, anchor
+            if not joints:
+                link = unit.add(link, start, turn)
+            unit.rows[link][0], unit.rows[link][5:7] = mass, ((center - at).tolist(), axes)
+            carrier[body], origin[body] = link, at
+        own = [geom for geom in unit.geoms if mj.geom_bodyid[geom] == body]
+        for number, geom in enumerate(own):
+            link = unit.add(carrier[body], ORIGIN, UNTURNED) if number else carrier[body]
+            shapes[geom] = link
+    if not unit.bodies:
+        (geom,), place, turn = unit.geoms, data.geom_xpos[unit.geoms[0]], np.empty(4)
+        mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
+        body, shapes[geom] = int(mj.geom_bodyid[geom]), -1
+        origin[body] = None
+        if mj.geom_type[geom] == MESH:  # in the frame of the body, as it was drawn
+            place, turn, origin[body] = data.xpos[body], data.xquat[body], ORIGIN
+        unit.base = {"baseMass": 0.0, "useMaximalCoordinates": True}
+        unit.base |= {"basePosition": place.tolist(), "baseOrientation": plain(turn)}
+    unit.links = (
+        [carrier[body] for body in unit.bodies],
+        [hinges[joint] for joint in unit.joints],
+        [shapes[geom] for geom in unit.geoms],
+    )
+    for geom in unit.geoms:
+        shape = _shape(mj, geom, origin[int(mj.geom_bodyid[geom])])
+        unit.shapes.append((shape, float(mj.geom_margin[geom])))
+    for equality in couplings(mj, unit.joints):
+        ends = hinges[int(mj.eq_obj1id[equality])], hinges[int(mj.eq_obj2id[equality])]
+        unit.gears.append((*ends, *mj.eq_data[equality, :2].tolist()))
+    paired = np.isin(unit.geoms, [mj.pair_geom1, mj.pair_geom2])
+    rest = (mj.jnt_limited[unit.joints], paired, mj.numeric_data, np.array(mj.opt.disableflags))
+    unit.rest = tuple(part.tobytes() for part in rest)
+
+
+def _shape(mj: mujoco.MjModel, geom: int, origin: Floats | None) -> dict[str, Any]:
+    """Return the arguments that make a collision shape.
+
+    Args:
+        mj: The model.
+        geom: The shape.
+        origin: Of the frame that it is made in, which is turned like the body, in the frame of the
+            body [m]; in its own frame if None.
+    """
+    radius, half, _ = size = mj.geom_size[geom].tolist()
+    found: dict[str, Any] = {"shapeType": SHAPES[int(mj.geom_type[geom])]}
+    match found["shapeType"]:
+        case "GEOM_PLANE":
+            found["planeNormal"] = [0.0, 0.0, 1.0]
+        case "GEOM_SPHERE":
+            found["radius"] = radius
+        case "GEOM_CAPSULE" | "GEOM_CYLINDER":
+            found |= {"radius": radius, "height": 2.0 * half}
+        case "GEOM_BOX":
+            found["halfExtents"] = size
+        case _:
+            return found | {"vertices": _kept(_corners(mj, geom, origin))}
+    if origin is not None:
+        place, turn = mj.geom_pos[geom] - origin, mj.geom_quat[geom]
+        if place.any() or turn[0] != 1.0:  # a frame of its own, which has a price
+            found["collisionFramePosition"] = place.tolist()
+            found["collisionFrameOrientation"] = plain(turn)
+    return found
 
 
 def _units(mj: mujoco.MjModel, touching: list[int]) -> Iterator[Unit]:
@@ -422,10 +382,8 @@ def couplings(mj: mujoco.MjModel, joints: Sequence[int]) -> Iterator[int]:
             yield equality
 
 
-def _corners(mj: mujoco.MjModel, geom: int, origin: Floats | None = None) -> bytes:
-    """Return the corners of the convex hull of a mesh [m], see ``_shape``; else nothing."""
-    if SHAPES[int(mj.geom_type[geom])] != "GEOM_MESH":
-        return b""
+def _corners(mj: mujoco.MjModel, geom: int, origin: Floats | None) -> bytes:
+    """Return the corners of the convex hull of a mesh [m], see ``_shape``."""
     mesh = int(mj.geom_dataid[geom])
     first, count = int(mj.mesh_vertadr[mesh]), int(mj.mesh_vertnum[mesh])
     vertices = mj.mesh_vert[first : first + count]

@@ -11,7 +11,6 @@ from typing import Any, final
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import ContactPoint
@@ -93,42 +92,6 @@ def usual_friction(mj: mujoco.MjModel) -> float:
     shapes = Couplings(mj).touches.any(axis=1) & (mj.body_treeid[mj.geom_bodyid] >= 0)
     found = np.where(mj.geom_condim == 1, 0.0, mj.geom_friction[:, 0])[shapes]
     return float(statistics.median_low(found.tolist() or [0.0]))
-
-
-MOST_GROUPS = 31
-"""As many bits the engine has."""
-
-
-def groups(touches: NDArray[np.bool_]) -> dict[int, tuple[int, int]]:
-    """Give each shape that touches something a group and a mask of those it touches.
-
-    Shapes that touch the same others, and each other or not, are one group.
-
-    Args:
-        touches: Which shapes may touch, shape (ngeom, ngeom).
-
-    Returns:
-        Nothing if there are more groups than the engine has.
-    """
-    members: list[list[int]] = []
-    for geom in np.flatnonzero(touches.any(axis=1)).tolist():
-        for group in members:
-            among = touches[np.ix_([*group, geom], [*group, geom])]
-            inside = among[~np.eye(len(among), dtype=np.bool_)]
-            apart = np.delete(touches[[group[0], geom]], [*group, geom], axis=1)
-            if (apart[0] == apart[1]).all() and (inside == inside[0]).all():
-                group.append(geom)
-                break
-        else:
-            members.append([geom])
-    if len(members) > MOST_GROUPS:
-        return {}
-    number = {geom: index for index, group in enumerate(members) for geom in group}
-    found = {}
-    for geom, index in number.items():
-        others = {number[other] for other in np.flatnonzero(touches[geom]).tolist()}
-        found[geom] = 1 << index, sum(1 << other for other in others)
-    return found
 
 
 def spinning_shares(mj: mujoco.MjModel) -> dict[int, float]:
@@ -214,8 +177,8 @@ class Client:
         self._twin.place(instant.state)
         for part in self._parts:
             part.put(self._twin.data)
-        for place in self._built.geoms.values():
-            self.engine.setCollisionFilterGroupMask(*place, *self._filters[place])
+        for place in self._built.geoms.values():  # what touches what is said by pairs
+            self.engine.setCollisionFilterGroupMask(*place, 0, 0)
         self._check(instant.state)
 
     def _construct(self, model: Model, parameters: Parameters) -> None:
@@ -230,7 +193,6 @@ class Client:
             trees = Couplings(compiled)
             self._dynamic = np.flatnonzero(trees.dynamic.any(axis=1)).tolist()
             self._touching = np.argwhere(np.triu(trees.touches)).tolist()
-            self._groups = groups(trees.touches)
             self._shapes = np.flatnonzero(trees.touches.any(axis=1)).tolist()
             ends = zip(compiled.pair_geom1.tolist(), compiled.pair_geom2.tolist(), strict=True)
             self._paired = {geom: pair for pair, both in enumerate(ends) for geom in both}
@@ -247,18 +209,13 @@ class Client:
         self._tell_all()
 
     def _connect(self) -> None:
-        """Say which shapes may touch: by groups, or pair by pair if these are too many."""
-        geoms, engine = self._built.geoms, self.engine
-        self._filters = {geoms[geom]: both for geom, both in self._groups.items()}
+        """Say which shapes may touch, pair by pair."""
+        geoms = self._built.geoms
         wanted = {(*geoms[first], *geoms[second]) for first, second in self._touching}
-        if not self._groups:
-            self._ruled |= wanted  # this holds as long as the client
-            self._filters = dict.fromkeys(geoms.values(), (0, 0))
+        self._ruled |= wanted  # this holds as long as the client
         for body, link, other, its in sorted(self._ruled):
             enabled = int((body, link, other, its) in wanted)
-            engine.setCollisionFilterPair(body, other, link, its, enabled)
-        for place, both in self._filters.items():
-            engine.setCollisionFilterGroupMask(*place, *both)
+            self.engine.setCollisionFilterPair(body, other, link, its, enabled)
 
     def _check(self, state: Floats) -> None:
         """Make sure that the engine took the state, up to rounding and the sign of a quaternion.
