@@ -11,6 +11,7 @@ from scm_world.tasks.base import TIME, Conventions, Goal, Observation, Observed,
 from scm_world.tasks.model import ModelTask, model_task
 from scm_world.tasks.rewards import Common, term
 from scm_world.tasks.step import StepTask
+from scm_world.tasks.trifinger import platform as _platform  # noqa: F401 # registers its backend
 from scm_world.tasks.trifinger.base import HEAD, TriFingerTask
 from scm_world.tasks.trifinger.conventions import CONVENTIONS
 from scm_world.tasks.trifinger.general import General

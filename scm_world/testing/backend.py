@@ -78,7 +78,7 @@ def play(backend: Backend, commands: Floats, substeps: int) -> Floats:
     rows = []
     for command in commands:
         backend.step(command, substeps)
-        rows.append(backend.state().vector)
+        rows.append(backend.read().vector)
     return np.array(rows)
 
 
@@ -119,7 +119,9 @@ class BackendConformance(ABC):
     def busy(self) -> Scene:
         """Describe a scene in which bodies touch: the default one of the model."""
         model, backend = read_model(self.model), self.make()
-        kept = tuple(row for row in model.parameters if backend.supports(model, row.key))
+        kept = tuple(
+            row for row in model.parameters if backend.capabilities.supports(model, row.key)
+        )
         backend.close()
         return replace(model, parameters=kept).default_scene()
 
@@ -257,7 +259,7 @@ class BackendConformance(ABC):
 
     def explode(self, backend: Backend, advance: Any) -> None:
         """Set a velocity to infinity and continue."""
-        state = backend.state()
+        state = backend.read()
         state.vector[np.flatnonzero(state.layout.can_be_set)[-1]] = np.inf
         backend.apply(Difference(state=state))
         advance()
@@ -282,7 +284,7 @@ class BackendConformance(ABC):
         assert bool(contacts) == backend.capabilities.physics
         for contact in contacts:
             assert np.linalg.norm(contact.normal) == pytest.approx(1.0)
-        *_, changed = self.changed_states(backend.state())
+        *_, changed = self.changed_states(backend.read())
         backend.apply(Difference(state=changed))
         assert [c.bodies for c in backend.contacts()] == [c.bodies for c in contacts]
 
@@ -310,17 +312,17 @@ class BackendConformance(ABC):
     def test_a_parameter_changes_nothing_else(self, backend: Backend, scene: Scene) -> None:
         """Setting one parameter leaves the state and every other parameter as they were."""
         keys = tuple(scene.parameters)
-        state, before = backend.state(), backend.parameters(keys)
+        state, before = backend.read(), backend.parameters(keys)
         for key, value in self.others(scene).items():
             backend.apply(Difference(parameters={key: value}))
             now = backend.parameters(keys)
             assert [k for k in keys if k != key and not same(now[k], before[k])] == []
-            assert backend.state() == state
+            assert backend.read() == state
             backend.apply(Difference(parameters={key: scene.parameters[key]}))
 
     def test_a_change_taken_back_leaves_no_trace(self, backend: Backend, scene: Scene) -> None:
         """Each parameter and state that is changed and restored has exactly no effect."""
-        start, state = backend.snapshot(), backend.state()
+        start, state = backend.snapshot(), backend.read()
         expected, traces = self.continued(backend, start, 2), []
         for key, value in self.others(scene).items():
             backend.restore(start)
@@ -332,7 +334,7 @@ class BackendConformance(ABC):
             backend.restore(start)
             backend.apply(Difference(state=changed))
             backend.apply(Difference(state=state))
-            if backend.state() != state or not same(self.play(backend, 2), expected):
+            if backend.read() != state or not same(self.play(backend, 2), expected):
                 traces.append(f"state {number}")
         assert traces == []
 
@@ -340,7 +342,7 @@ class BackendConformance(ABC):
         self, backend: Backend, scene: Scene
     ) -> None:
         """All of these changes together have exactly no effect on a whole episode."""
-        start, state = backend.snapshot(), backend.state()
+        start, state = backend.snapshot(), backend.read()
         expected = self.continued(backend, start, self.long)
         backend.restore(start)
         for key, value in self.others(scene).items():
@@ -353,7 +355,7 @@ class BackendConformance(ABC):
     def test_the_order_of_changes_is_irrelevant(self, backend: Backend, scene: Scene) -> None:
         """All together, one by one, and with detours: the result is the same."""
         start, other = backend.snapshot(), self.others(scene)
-        *_, state = self.changed_states(backend.state())
+        *_, state = self.changed_states(backend.read())
 
         def at_once() -> None:
             backend.apply(Difference(parameters=other, state=state))
@@ -386,7 +388,7 @@ class BackendConformance(ABC):
         changed = scene.with_(parameters=other, state=state)
         with self.built(scene) as edited, self.built(changed) as new:
             edited.apply(Difference(parameters=other, state=state))
-            assert edited.state() == new.state()
+            assert edited.read() == new.read()
             assert same(self.play(edited, 20), self.play(new, 20))
 
     def test_parameters_act_where_there_is_physics(self, backend: Backend, scene: Scene) -> None:
@@ -420,24 +422,24 @@ class BackendConformance(ABC):
 
     def test_a_state_is_read_back(self, backend: Backend) -> None:
         """The engine reports the state as it was set; what it reports stays that of the step."""
-        before = backend.state()
+        before = backend.read()
         fixed = ~before.layout.can_be_set
         for changed in self.changed_states(before):
             backend.apply(Difference(state=changed))
-            read = backend.state()
+            read = backend.read()
             np.testing.assert_allclose(read.settable(), changed.settable(), rtol=0, atol=1e-12)
             assert same(read.vector[fixed], before.vector[fixed])
 
     def test_bodies_that_come_and_go_leave_no_trace(self, backend: Backend, scene: Scene) -> None:
         """Changing the structure and taking it back has exactly no effect."""
-        start, now = backend.snapshot(), backend.state()
+        start, now = backend.snapshot(), backend.read()
         expected = self.continued(backend, start, 20)
         for structure in self.other_structures(scene):
             backend.restore(start)
             backend.apply(Difference(structure=structure))
             assert backend.structure == structure
             backend.apply(Difference(scene.structure, scene.parameters, now))
-            assert backend.state() == now
+            assert backend.read() == now
             assert same(self.play(backend, 20), expected)
 
     # --- snapshots ------------------------------------------------------------------------------
@@ -447,7 +449,7 @@ class BackendConformance(ABC):
         yield backend.snapshot()
         backend.apply(Difference(parameters=self.others(scene)))
         yield backend.snapshot()
-        *_, state = self.changed_states(backend.state())
+        *_, state = self.changed_states(backend.read())
         backend.apply(Difference(state=state))
         yield backend.snapshot()
         self.play(backend, 3)
@@ -459,13 +461,13 @@ class BackendConformance(ABC):
     def test_a_snapshot_continues_bit_for_bit(self, backend: Backend, scene: Scene) -> None:
         """From a snapshot, this, another and a pickled backend continue alike, repeatedly."""
         for snapshot in self.snapshots(backend, scene):
-            state, touching = backend.state(), backend.contacts()
+            state, touching = backend.read(), backend.contacts()
             assert backend.snapshot() is not snapshot  # another one does not disturb
             copy = pickle.loads(pickle.dumps(snapshot))  # noqa: S301 # our own
             expected = self.play(backend, 15)
-            backend.apply(Difference(state=backend.state()))
+            backend.apply(Difference(state=backend.read()))
             backend.restore(snapshot)
-            assert backend.state() == state
+            assert backend.read() == state
             assert [c.bodies for c in backend.contacts()] == [c.bodies for c in touching]
             assert same(self.play(backend, 15), expected)
             with self.built(scene) as other:
@@ -475,7 +477,7 @@ class BackendConformance(ABC):
 
     def test_a_snapshot_remembers_how_to_undo(self, backend: Backend) -> None:
         """A change that was made before a snapshot can be taken back after it, without a trace."""
-        start, now = backend.snapshot(), backend.state()
+        start, now = backend.snapshot(), backend.read()
         expected = self.continued(backend, start, 10)
         for changed in self.changed_states(now):
             backend.restore(start)
@@ -486,10 +488,10 @@ class BackendConformance(ABC):
 
     def test_snapshots_of_another_engine_are_refused(self, backend: Backend) -> None:
         """A snapshot of an engine that does not exist cannot be restored."""
-        state = backend.state()
+        state = backend.read()
         with pytest.raises(SnapshotMismatch):
             backend.restore(EngineSnapshot("no engine 0", None))
-        assert backend.state() == state
+        assert backend.read() == state
 
     # --- batches --------------------------------------------------------------------------------
 
@@ -526,12 +528,12 @@ class BackendConformance(ABC):
             batch.step(which, rows, self.substeps, into)
             for index in which.tolist():
                 play(alone[index], rows[index][None], self.substeps)
-                vector = alone[index].state().vector
+                vector = alone[index].read().vector
                 np.testing.assert_array_equal(into[index, : vector.size], vector)
             for number, backends in enumerate((alone, many)):
                 self._change_one(backends[1], step, saved[1][number])
             for one, other in zip(alone, many, strict=True):
-                np.testing.assert_array_equal(other.state().vector, one.state().vector)
+                np.testing.assert_array_equal(other.read().vector, one.read().vector)
             first, second = alone[step % COUNT].contacts(), many[step % COUNT].contacts()
             assert [(c.bodies, c.force) for c in first] == [(c.bodies, c.force) for c in second]
 
@@ -539,7 +541,7 @@ class BackendConformance(ABC):
         """Change one of the scenes by itself, each time in another way."""
         match step % 4:
             case 0:
-                *_, state = self.changed_states(backend.state())
+                *_, state = self.changed_states(backend.read())
                 backend.apply(Difference(state=state))
             case 1:
                 self.play(backend, 1)

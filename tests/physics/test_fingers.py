@@ -104,7 +104,7 @@ def test_torques_and_weight_accelerate_the_fingers(lab, seed: int) -> None:
     lab.place([1.0, 0.0, 0.5], parameters, joints=joints, torques=True)
     torques = random.uniform(-0.2, 0.2, 9)
     lab.backend.step(torques, 1)
-    found = lab.backend.state().joint_velocities / lab.preset.timestep
+    found = lab.backend.read().joint_velocities / lab.preset.timestep
     expected = [
         acceleration(k, joints[3 * k : 3 * k + 3], masses[k], torques[3 * k : 3 * k + 3], gravity)
         for k in range(3)

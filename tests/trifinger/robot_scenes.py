@@ -127,7 +127,7 @@ def play(
     if structure.torques is not torques:
         backend.apply(Difference(structure.with_(torques=torques)))
     center = np.zeros(9) if torques else np.array(hardware.REST)
-    state = backend.state()
+    state = backend.read()
     states = np.empty((steps, state.vector.size))
     for row in states:
         command = center + generator.uniform(-0.3, 0.3, 9)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, final
 
@@ -25,7 +25,6 @@ from scm_world.models.scene import (
     ParameterKey,
     Parameters,
     Scene,
-    State,
     Structure,
     complete,
 )
@@ -58,7 +57,11 @@ class MujocoBackend(Backend):
     """MuJoCo, with one compiled model per structure and everything else edited in place."""
 
     name: ClassVar[str] = "mujoco"
-    capabilities: ClassVar[Capabilities] = Capabilities(batch=True)
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        remarks=lambda backend, before: backend.realization.remarks(before)
+    )
+    batch: ClassVar[type[EngineBatch]] = MujocoBatch
+    version = str(mujoco.__version__)
 
     _now: Realization
     _touches: Touches | None
@@ -67,18 +70,9 @@ class MujocoBackend(Backend):
     def __getattr__(self, name: str) -> Any:
         if name == "_now":
             raise EngineFailure("there is no scene; call build() first", self.name)
+        if name == "structure":
+            return self._now.structure
         raise AttributeError(name)
-
-    @property
-    def version(self) -> str:
-        """Version of the engine."""
-        return str(mujoco.__version__)
-
-    @property
-    def structure(self) -> Structure:
-        """What was compiled."""
-        found: Structure = self._now.structure
-        return found
 
     def build(self, scene: Scene) -> None:
         """Realise a scene from nothing; where the structure is the same, that costs little."""
@@ -102,7 +96,7 @@ class MujocoBackend(Backend):
             now.edit(difference.parameters)
         else:
             record = self._last_touches()
-            scene = Scene(now.structure, now.kept, self.state())
+            scene = Scene(now.structure, now.kept, self.read())
             difference = complete(scene, structure, difference)
             self._now = self._realized(structure, difference.parameters)
             if self._now is not now:
@@ -119,23 +113,13 @@ class MujocoBackend(Backend):
         """
         return self._now.parameters(keys)
 
-    def inertia(self, body: str) -> Floats:
-        """Read the principal moments of inertia of a body, shape (3,) [kg m²].
-
-        Raises:
-            UnknownOption: There is no such body.
-        """
-        return self._now.inertia(body)
-
-    def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """List with which shapes a friction that was changed has no effect."""
-        return self._now.remarks(before)
-
-    def read(self, into: State) -> None:
-        """Write the present state into an existing vector."""
+    def read(self, into: Any = None) -> Any:
+        """Write the present state into an existing one, or a new one."""
         if self.slot is not None:
             self._return()
+        into = self._now.structure.empty_state() if into is None else into
         self._now.read(into.vector)
+        return into
 
     def step(self, command: Floats, substeps: int) -> None:
         """Hold a command for some physics steps.
@@ -175,7 +159,8 @@ class MujocoBackend(Backend):
         touches = self._touches if now.replay is not None else self._last_touches()
         replay = now.replay if touches is None else None
         state = now.numbers(), now.memory()
-        return self.sealed(Payload(now.structure, dict(now.kept), *state, touches, replay))
+        payload = Payload(now.structure, dict(now.kept), *state, touches, replay)
+        return EngineSnapshot.of(self, payload)
 
     def restore(self, snapshot: EngineSnapshot) -> None:
         """Go back to a snapshot.
@@ -183,7 +168,7 @@ class MujocoBackend(Backend):
         Raises:
             SnapshotMismatch: It was taken by another engine, or another version of this one.
         """
-        payload: Payload = self.opened(snapshot)
+        payload: Payload = snapshot.opened(self)
         now: Realization | None = vars(self).get("_now")
         if now is None or now.applied is not payload.parameters:
             now = self._realized(payload.structure, payload.parameters)
@@ -191,12 +176,6 @@ class MujocoBackend(Backend):
         now.recall(payload.numbers, payload.memory)
         now.replay = payload.replay
         self._now, self.slot, self._touches = now, None, payload.touches
-
-    @classmethod
-    def batch(cls, backends: Sequence[Backend], threads: int) -> EngineBatch:
-        """Return what steps several scenes in one call, with C threads."""
-        members = [backend for backend in backends if isinstance(backend, MujocoBackend)]
-        return MujocoBatch(members, threads)
 
     @property
     def realization(self) -> Realization:

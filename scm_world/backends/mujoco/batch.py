@@ -89,8 +89,8 @@ class MujocoBatch(EngineBatch):
         threads: That step them; the results do not depend on how many.
     """
 
-    def __init__(self, backends: Sequence[MujocoBackend], threads: int) -> None:
-        self._backends = tuple(backends)
+    def __init__(self, backends: Sequence[MujocoBackend], threads: int = 1) -> None:
+        super().__init__(backends, threads)
         self._threads = max(1, min(threads, len(self._backends)))
         self._groups: dict[Any, Simulations] = {}
         self._slots: list[Slot | None] = [None] * len(self._backends)

@@ -262,17 +262,6 @@ class Realization:
 
     # --- model ---------------------------------------------------------------------------------
 
-    def inertia(self, body: str) -> Floats:
-        """Copy the principal moments of inertia of a body, shape (3,) [kg m²].
-
-        Raises:
-            UnknownOption: There is no such body.
-        """
-        if body not in self._bodies:
-            raise UnknownOption("body", body, self._bodies)
-        moments: Floats = self.model.body_inertia[self._bodies.index(body)].copy()
-        return moments
-
     @cached_property
     def _dynamic(self) -> NDArray[np.bool_]:
         """Which shapes touch with coefficients of their own, shape (ngeom, ngeom)."""
@@ -317,10 +306,15 @@ class Realization:
                 raise UnknownOption("parameter", ".".join(key), map(".".join, self._slots))
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Read parameters back from the arrays of the model."""
-        keys = tuple(keys)
-        self.check(keys)
-        return {key: self._slots[key].read() for key in keys}
+        """Read parameters and moments of inertia back from the arrays of the model."""
+        found: dict[ParameterKey, Floats] = {}
+        for key in keys:
+            if key not in self._slots and key[1] == "inertia" and key[0] in self._bodies:
+                found[key] = self.model.body_inertia[self._bodies.index(key[0])].copy()
+            else:
+                self.check([key])
+                found[key] = self._slots[key].read()
+        return found
 
     def edit(self, parameters: Parameters) -> None:
         """Write parameters, then all numbers that follow from them; unchanged ones cost nothing.
