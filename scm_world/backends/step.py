@@ -90,6 +90,8 @@ class StepModel:
     vectorized: bool = False
     signature: Literal["dicts", "arrays"] = "dicts"
 
+    bodies: ClassVar[tuple[str, ...]] = ()
+
     @cached_property
     def digest(self) -> str:
         """Hash of the function and the tables."""

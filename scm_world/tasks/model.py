@@ -6,8 +6,7 @@ import dataclasses
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
-from functools import cached_property
-from typing import Any, Self, final
+from typing import Any, Self
 
 import numpy as np
 from numba import njit
@@ -17,8 +16,7 @@ from scm_world.backends import Backend, read_model
 from scm_world.errors import UnknownOption, blamed
 from scm_world.geometry import chains
 from scm_world.graph import SCM
-from scm_world.models import Model, ParameterKey, Readout, Row, State
-from scm_world.models.scene import TOLERANCE, Overlap, Scene
+from scm_world.models import Model, Readout, Row
 from scm_world.tasks.base import Goal, Observation, Observed, Task, Timing
 from scm_world.tasks.composition import Clock, Composition
 from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
@@ -52,73 +50,6 @@ _OVERRIDES = ("a", "b", "bounds", "default", "distribution", "doc")
 def same_value(value: Any) -> Any:
     """Give the value itself."""
     return value
-
-
-@final
-class ModelComposition(Composition):
-    """What the variables of a model mean to a backend: rows of its tables.
-
-    Args:
-        model: The system.
-    """
-
-    def __init__(self, model: Model) -> None:
-        self._model = model
-
-    @cached_property
-    def _meant(self) -> frozenset[tuple[int, int]]:
-        """The shapes that lie in one another in the pose of the file: they are meant to."""
-        from scm_world.backends.mujoco.overlaps import touching
-
-        return touching(self._model.default_scene(), TOLERANCE)
-
-    def overlaps(
-        self,
-        scene: Scene,
-        tolerance: float | None = None,
-        asked: Iterable[str] = (),
-        enough: float = math.inf,
-    ) -> tuple[Overlap, ...]:
-        """List the bodies that lie deeper in one another than a tolerance [m].
-
-        Not listed are shapes that do so in the pose of the file. Nothing is listed of a model that
-        describes no bodies.
-        """
-        if not self._model.bodies:
-            return ()
-        from scm_world.backends.mujoco.overlaps import overlaps
-
-        tolerance = TOLERANCE if tolerance is None else tolerance
-        return overlaps(scene, tolerance, self._meant, max(enough, tolerance))
-
-    def structure(self, values: Mapping[str, Any]) -> Model:
-        """Give the model: it is compiled once."""
-        return self._model
-
-    def parameters(self) -> Mapping[str, ParameterKey]:
-        """Say which variable sets which physical parameter."""
-        return {row.name: row.key for row in self._model.parameters}
-
-    def slices(self) -> Mapping[str, slice]:
-        """Say where each state stands in the state vector."""
-        return self._model.layout.slices
-
-    def empty_state(self) -> State:
-        """Give a state to read into."""
-        return self._model.empty_state()
-
-    def touched(self) -> Mapping[str, tuple[str, ...]]:
-        """Map each body to the states of its tree; none if the model describes no bodies."""
-        model, states = self._model, dict[int, list[str]]()
-        for row in model.states:
-            for tree in row.trees:
-                states.setdefault(tree, []).append(row.name)
-        return {body.name: (*states.get(body.tree, ()),) for body in model.bodies}
-
-    def shaped(self) -> Mapping[str, str]:
-        """Map the parameters of bodies and shapes to the body."""
-        names = self._model.body_names
-        return {row.name: names[row.body] for row in self._model.parameters if row.body >= 0}
 
 
 class DeclaredTask(Task):
@@ -376,7 +307,7 @@ class ModelTask(DeclaredTask):
             *self.counted(),
         ]  # fmt: skip
         check_observed(self.observe, variables)
-        return ModelComposition(system), variables
+        return Composition(system), variables
 
     def _fields(self, row: Row, kind: str = "real") -> dict[str, Any]:
         """Give what all kinds of declarations have in common, with what was asked for."""

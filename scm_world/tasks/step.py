@@ -12,7 +12,6 @@ from scm_world.backends import Backend
 from scm_world.backends.step import Quantity, StepModel
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import NoiseKey
-from scm_world.models import ParameterKey, State
 from scm_world.tasks.base import Timing
 from scm_world.tasks.composition import Clock, Commands, Composition
 from scm_world.tasks.model import DeclaredTask, _numbers, beginning, check_observed
@@ -46,10 +45,6 @@ class ProcessNoise(Commands):
     ) -> None:
         self._drawn = [(name, source, shapes[name]) for name, source in sources.items()]
 
-    def applies(self, values: Values) -> bool:
-        """Tell that it is always needed."""
-        return True
-
     def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
         """Give the action and the noise of a control step, shape (n_commands,)."""
         drawn = [
@@ -57,35 +52,6 @@ class ProcessNoise(Commands):
             for name, source, shape in self._drawn
         ]
         return np.concatenate([action, *drawn])
-
-
-@final
-class StepComposition(Composition):
-    """What the variables of a step function mean to the backend: each one itself.
-
-    Args:
-        system: With the function.
-        noise: What draws the noise, if there is some.
-    """
-
-    def __init__(self, system: StepModel, noise: ProcessNoise | None) -> None:
-        self._system, self.commands = system, noise
-
-    def structure(self, values: Values) -> StepModel:
-        """Give the system, which is always the same."""
-        return self._system
-
-    def parameters(self) -> Mapping[str, ParameterKey]:
-        """Say which variable sets which parameter."""
-        return {quantity.name: quantity.key for quantity in self._system.parameters}
-
-    def slices(self) -> Mapping[str, slice]:
-        """Say where each state stands in the state vector."""
-        return self._system.layout.slices
-
-    def empty_state(self) -> State:
-        """Give a state to read into."""
-        return self._system.empty_state()
 
 
 class StepTask(DeclaredTask):
@@ -266,12 +232,11 @@ class StepTask(DeclaredTask):
         clock: Variable = next(iter(Clock(timing.steps, timing.control_period).variables()))
         if self._drawn is not None:  # noise goes by the control step: setting that is no cause
             clock = clock.model_copy(update={"settable_state": False, "parents": ()})
-        composition = StepComposition(self.system, self._drawn)
         variables = [
             *self.parameters, *self.actions, *states, clock, *self.outcomes, *self.counted(),
         ]  # fmt: skip
         check_observed(self.observe, variables)
-        return composition, variables
+        return Composition(self.system, self._drawn), variables
 
     def _state(self, state: Measured, given: Iterable[str]) -> Iterable[Variable]:
         """Complete the declaration of a state, and declare what its beginning is drawn as."""

@@ -129,10 +129,7 @@ def report(
             if not same(old, new):
                 followed[name] = (_typed(old, new), np.array(new))
     engine = {f"{body}.inertia": (old, backend.inertia(body)) for body, old in inertia.items()}
-    there, were = (
-        {*one.compiled.composition.blocks, *one.compiled.composition.obstacles}
-        for one in (now, before)
-    )
+    there, were = ({*one.compiled.composition.bodies} for one in (now, before))
     came, went = sorted(there - were), sorted(were - there)
     remarks: tuple[str, ...] = ()
     if change.structure is None and any(what.endswith("friction") for _, what in change.parameters):

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, final
 
 from scm_world._types import Floats, Values
 from scm_world.geometry.hulls import Hull
-from scm_world.models import GoalRegion, Light, ParameterKey, Scene
-from scm_world.models.scene import Overlap, State
+from scm_world.models import ParameterKey, Scene
+from scm_world.models.scene import Overlap
 from scm_world.tasks.composition import Commands, Composition, Entity
-from scm_world.tasks.model import ModelComposition, causes_of
+from scm_world.tasks.model import causes_of
 from scm_world.tasks.trifinger.conventions import CONVENTIONS, TriFingerConventions
 from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
 from scm_world.tasks.trifinger.hardware import (
@@ -23,6 +23,7 @@ from scm_world.tasks.trifinger.hardware import (
     preset,
 )
 from scm_world.variables import Variable
+from scm_world.variables.kinds import Coupled
 from scm_world.variables.reserved import PRESET
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class BlockWorld(Composition):
         unchecked: What makes an intervention accepted however deep it puts bodies.
     """
 
-    entities: tuple[Entity, ...]
+    entities: tuple[Entity, ...] = ()
     shared: tuple[Variable, ...] = ()
     deciding: tuple[str, ...] = ()
     torques: bool = False
@@ -57,20 +58,28 @@ class BlockWorld(Composition):
     blocks: tuple[str, ...] = field(init=False)
     obstacles: tuple[str, ...] = field(init=False)
     hulls: tuple[tuple[str, Hull], ...] = field(init=False)
+    bodies: tuple[str, ...] = field(init=False)
+    hides_goals: bool = field(init=False)
     commands: Commands | None = field(init=False)
+    system: TriFinger = field(init=False)
     _systems: dict[str, TriFinger] = field(init=False, default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
-        blocks = [entity for entity in self.entities if entity.is_block]
+        removable: list[Any] = [entity for entity in self.entities if entity.removable]
+        blocks = [entity for entity in removable if entity.declared[1]]  # it has states
+        fixed = (e.name for e in removable if e not in blocks and e.parameters())
         commands = (entity.commands() for entity in self.entities)
-        found = {
+        found: dict[str, Any] = {
             "blocks": tuple(entity.name for entity in blocks),
-            "obstacles": tuple(entity.name for entity in self.entities if entity.is_obstacle),
+            "obstacles": tuple(fixed),
             "hulls": tuple((e.name, e.hull) for e in blocks if e.hull is not None),
             "commands": next((one for one in commands if one is not None), None),
         }
+        found["bodies"] = (*found["blocks"], *found["obstacles"])
+        found["hides_goals"] = bool(found["obstacles"])
         for name, value in found.items():
             object.__setattr__(self, name, value)
+        object.__setattr__(self, "system", self._system(PRESET_NAMES[0]))
 
     def structure(self, values: Values) -> TriFinger:
         """Return the model of the bodies, with the settings that a preset stands for."""
@@ -120,7 +129,7 @@ class BlockWorld(Composition):
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable; edges into states follow from the kinematic trees."""
-        system = self._system(PRESET_NAMES[0])
+        system = self.system
         trees = {row.name: row.trees for row in system.states}
         every = frozenset(range(len(system.trees)))
         rows = {row.key: row for row in system.parameters}
@@ -143,20 +152,14 @@ class BlockWorld(Composition):
         for entity in self.entities:
             variables, states = entity.declared
             declared.extend(variables)
-            declared.extend(state.declare(*causes[trees[state.name]]) for state in states)
+            for state in states:
+                parents = Coupled(*causes[trees[state.name]], state.parents)
+                declared.append(state.model_copy(update={"parents": parents}))
         return tuple(declared)
 
     def parameters(self) -> dict[str, ParameterKey]:
-        """Say which variable sets which physical parameter."""
+        """Map variables to the physical parameters that they set."""
         return {k: v for entity in self.entities for k, v in entity.parameters().items()}
-
-    def slices(self) -> Mapping[str, slice]:
-        """Say where each state stands in the state vector."""
-        return self._system(PRESET_NAMES[0]).layout.slices
-
-    def empty_state(self) -> State:
-        """Return a state to read into."""
-        return self._system(PRESET_NAMES[0]).empty_state()
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         """List goals that lie in an obstacle."""
@@ -166,23 +169,9 @@ class BlockWorld(Composition):
         """Name the fingers, then the blocks. The bases of fingers are fixed."""
         return (*(f"robot_finger_{finger}" for finger in FINGERS), *self.blocks)
 
-    def touched(self) -> Mapping[str, tuple[str, ...]]:
-        """Map links and blocks to the states of their trees; what is fixed has none."""
-        return ModelComposition(self._system(PRESET_NAMES[0])).touched()
-
     def shaped(self) -> Mapping[str, str]:
         """Map parameters to the body that they are a property of."""
         return {name: key[0] for name, key in self.parameters().items() if key[0] in self.touched()}
-
-    def goals(self, values: Values) -> tuple[GoalRegion, ...]:
-        """Describe all goals."""
-        goals = (entity.goal(values) for entity in self.entities)
-        return tuple(goal for goal in goals if goal is not None)
-
-    def light(self, values: Values) -> Light:
-        """Describe the light of pictures."""
-        lights = (entity.light(values) for entity in self.entities)
-        return next((light for light in lights if light is not None), Light())
 
 
 def lowest_point(size: Floats, orientation: Floats) -> float:
