@@ -5,34 +5,108 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, final
 
 from numba import njit
 
 from scm_world._types import Floats, Value, Values
+from scm_world.geometry.hulls import Hull
 from scm_world.geometry.scalars import scalar
 from scm_world.graph import NoiseKey
-from scm_world.models import GoalRegion, Light, ParameterKey, Scene
+from scm_world.models import (
+    GoalRegion,
+    Light,
+    ParameterKey,
+    Scene,
+)
 from scm_world.models.camera import Camera
 from scm_world.models.scene import TOLERANCE, Overlap
-from scm_world.variables import Box, Function, Integers, Measured, Parent, Variable
+from scm_world.variables import Box, Function, Integers, Measured, Parent, Space, Variable
+from scm_world.variables.kinds import Coupled, parent_of
 from scm_world.variables.reserved import CONTROL_INDEX
 
+Numbers = float | tuple[float, ...]
 
-class Entity:
-    """Something in the world: it declares its variables and what they mean physically.
+
+@final
+@dataclass(frozen=True)
+class StateDeclaration:
+    """A quantity that physics moves.
 
     Attributes:
-        name: Prefix of its variables.
-        removable: Whether an intervention can take it away.
+        name: ``"<entity>.<quantity>"``.
+        unit: SI unit.
+        shape: Of one value.
+        bounds: What is possible.
+        default: At the start of an episode.
+        doc: One sentence.
+        on_set: Parameters and states that move it when they are set.
+        start: Its value at the start, a function of ``on_set``.
+        carry: Its value after one of ``on_set`` was set: a function of the present value, of
+            ``on_set`` before and of ``on_set`` after.
+        restart: Those of ``on_set`` that, when set, put it where it would be at the start.
+        settable: False for what the engine reports only.
+        a: Space A.
+        b: Space B.
     """
 
     name: str
-    removable: bool = False
+    unit: str
+    shape: tuple[int, ...]
+    bounds: Space
+    default: Numbers
+    doc: str
+    on_set: tuple[str, ...] = ()
+    start: Function | None = None
+    carry: Function | None = None
+    restart: tuple[str, ...] = ()
+    settable: bool = True
+    a: Space | None = None
+    b: Space | None = None
+
+    def declare(self, always: tuple[Parent, ...], others: Mapping[str, Parent]) -> Measured:
+        """Write the declaration.
+
+        Args:
+            always: Causes of lag 1 that act at every control step.
+            others: Causes of lag 1 of many states, by name, as edges that hold while there is
+                contact.
+        """
+        on_set = tuple(parent_of(name, 0, "set") for name in self.on_set)
+        return self._alone.model_copy(update={"parents": Coupled(always, others, on_set)})
 
     @cached_property
-    def declared(self) -> tuple[tuple[Variable, ...], tuple[Measured, ...]]:
+    def _alone(self) -> Measured:
+        """The declaration without what acts by contact: bodies come and go, the rest stays."""
+        return Measured(
+            name=self.name,
+            unit=self.unit,
+            shape=self.shape,
+            bounds=self.bounds,
+            a=self.a,
+            b=self.b,
+            default=self.default,
+            doc=self.doc,
+            start=self.start,
+            carry=self.carry,
+            restart=self.restart,
+            settable_state=self.settable,
+        )
+
+
+class Entity(ABC):  # every hook has a sensible empty default
+    """Something in the world: it declares its variables and says what they mean physically.
+
+    Attributes:
+        name: Prefix of its variables.
+    """
+
+    name: str
+
+    @cached_property
+    def declared(self) -> tuple[tuple[Variable, ...], tuple[StateDeclaration, ...]]:
         """Its variables and its states, which are the same in every structure that it is in."""
         return tuple(self.variables()), tuple(self.states())
 
@@ -40,8 +114,8 @@ class Entity:
         """Declare everything but the states."""
         return ()
 
-    def states(self) -> Iterable[Measured]:
-        """Declare what physics moves. Of its causes, only those with ``when="set"`` are listed."""
+    def states(self) -> Iterable[StateDeclaration]:
+        """Declare what physics moves."""
         return ()
 
     def actions(self) -> Mapping[str, tuple[str, ...]]:
@@ -49,23 +123,38 @@ class Entity:
         return {}
 
     def parameters(self) -> Mapping[str, ParameterKey]:
-        """Map variables to the physical parameters that they set."""
+        """Say which variable sets which physical parameter."""
         return {}
 
+    @property
+    def is_block(self) -> bool:
+        """Whether it is a movable block."""
+        return False
+
+    @property
+    def is_obstacle(self) -> bool:
+        """Whether it is a box that nothing moves."""
+        return False
+
+    @property
+    def hull(self) -> Hull | None:
+        """The shape of a block that is no box."""
+        return None
+
     def goal(self, values: Values) -> GoalRegion | None:
-        """Return the goal that this entity is, if it is one."""
+        """Describe the goal that this entity is, if it is one."""
         return None
 
     def light(self, values: Values) -> Light | None:
-        """Return the light that this entity is, if it is one."""
+        """Describe the light that this entity is, if it is one."""
         return None
 
     def cameras(self, values: Values) -> tuple[Camera, ...]:
-        """Return the cameras that this entity is."""
+        """Describe the cameras that this entity is."""
         return ()
 
     def commands(self) -> Commands | None:
-        """Return the conversion of actions into commands, if this entity has one."""
+        """Give what turns actions into commands, if this entity does."""
         return None
 
 
@@ -188,17 +277,15 @@ class Composition:
         return {row.name: names[row.body] for row in self.system.parameters if row.body >= 0}
 
     def goals(self, values: Values) -> tuple[GoalRegion, ...]:
-        """Return all goals."""
-        goals = (entity.goal(values) for entity in self.entities)
-        return tuple(goal for goal in goals if goal is not None)
+        """Describe all goals."""
+        return ()
 
     def light(self, values: Values) -> Light:
-        """Return the light of pictures."""
-        lights = (entity.light(values) for entity in self.entities)
-        return next((light for light in lights if light is not None), Light())
+        """Describe the light of pictures."""
+        return Light()
 
     def cameras(self, values: Values) -> tuple[Camera, ...]:
-        """Return the cameras whose places are variables."""
+        """Describe the cameras whose places are variables."""
         return tuple(camera for entity in self.entities for camera in entity.cameras(values))
 
 
@@ -220,7 +307,8 @@ class Clock(Entity):
     name = "clock"
 
     def __init__(self, steps: int, seconds_per_step: float) -> None:
-        self._steps, self._seconds_per_step = steps, seconds_per_step
+        self._steps = steps
+        self._seconds_per_step = seconds_per_step
 
     def variables(self) -> Iterable[Variable]:
         """Declare the counter and the time that is left."""
@@ -233,12 +321,17 @@ class Clock(Entity):
             default=0,
             doc="Control steps since the start of the episode.",
         )
-        numbers = {"steps": float(self._steps), "seconds_per_step": self._seconds_per_step}
         yield Measured(
             name="time_left_for_task",
             unit="s",
             bounds=Box(0.0, self._steps * self._seconds_per_step),
             parents=(CONTROL_INDEX,),
-            mechanism=Function(remaining, constants=numbers),
+            mechanism=Function(
+                remaining,
+                constants={
+                    "steps": float(self._steps),
+                    "seconds_per_step": self._seconds_per_step,
+                },
+            ),
             doc="Time until the episode is cut off.",
         )

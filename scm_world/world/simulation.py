@@ -545,12 +545,10 @@ class Simulation(WorldAttributes):
             raise
 
     def _inertia(self, change: Difference) -> dict[str, Value]:
-        movers = self.composition.movers()
-        if change.structure is not None or not movers:
+        if change.structure is not None or not self.composition.movers():
             return {}
-        bodies = {
-            b for b, what in change.parameters if what == "mass" or (what == "size" and b in movers)
-        }
+        bodies = {body for body, what in change.parameters if what in ("mass", "size")}
+        bodies -= {*self.composition.bodies}.difference(self.composition.movers())
         return {body: self.backend.inertia(body) for body in sorted(bodies)}
 
     def _applied(self, change: Difference) -> Parameters:

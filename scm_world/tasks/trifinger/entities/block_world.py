@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, final
 
 from scm_world._types import Floats, Values
 from scm_world.geometry.hulls import Hull
-from scm_world.models import ParameterKey, Scene
+from scm_world.models import GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.scene import Overlap
 from scm_world.tasks.composition import Commands, Composition, Entity
 from scm_world.tasks.model import causes_of
@@ -23,7 +23,6 @@ from scm_world.tasks.trifinger.hardware import (
     preset,
 )
 from scm_world.variables import Variable
-from scm_world.variables.kinds import Coupled
 from scm_world.variables.reserved import PRESET
 
 if TYPE_CHECKING:
@@ -65,13 +64,11 @@ class BlockWorld(Composition):
     _systems: dict[str, TriFinger] = field(init=False, default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
-        removable: list[Any] = [entity for entity in self.entities if entity.removable]
-        blocks = [entity for entity in removable if entity.declared[1]]  # it has states
-        fixed = (e.name for e in removable if e not in blocks and e.parameters())
+        blocks = [entity for entity in self.entities if entity.is_block]
         commands = (entity.commands() for entity in self.entities)
         found: dict[str, Any] = {
             "blocks": tuple(entity.name for entity in blocks),
-            "obstacles": tuple(fixed),
+            "obstacles": tuple(entity.name for entity in self.entities if entity.is_obstacle),
             "hulls": tuple((e.name, e.hull) for e in blocks if e.hull is not None),
             "commands": next((one for one in commands if one is not None), None),
         }
@@ -152,13 +149,11 @@ class BlockWorld(Composition):
         for entity in self.entities:
             variables, states = entity.declared
             declared.extend(variables)
-            for state in states:
-                parents = Coupled(*causes[trees[state.name]], state.parents)
-                declared.append(state.model_copy(update={"parents": parents}))
+            declared.extend(state.declare(*causes[trees[state.name]]) for state in states)
         return tuple(declared)
 
     def parameters(self) -> dict[str, ParameterKey]:
-        """Map variables to the physical parameters that they set."""
+        """Say which variable sets which physical parameter."""
         return {k: v for entity in self.entities for k, v in entity.parameters().items()}
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
@@ -172,6 +167,16 @@ class BlockWorld(Composition):
     def shaped(self) -> Mapping[str, str]:
         """Map parameters to the body that they are a property of."""
         return {name: key[0] for name, key in self.parameters().items() if key[0] in self.touched()}
+
+    def goals(self, values: Values) -> tuple[GoalRegion, ...]:
+        """Describe all goals."""
+        goals = (entity.goal(values) for entity in self.entities)
+        return tuple(goal for goal in goals if goal is not None)
+
+    def light(self, values: Values) -> Light:
+        """Describe the light of pictures."""
+        lights = (entity.light(values) for entity in self.entities)
+        return next((light for light in lights if light is not None), Light())
 
 
 def lowest_point(size: Floats, orientation: Floats) -> float:

@@ -13,11 +13,10 @@ from scm_world.geometry.coordinates import from_cylindrical, to_cylindrical
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import from_rotation_vector, to_rotation_vector
 from scm_world.models import ParameterKey
-from scm_world.tasks.composition import Entity
+from scm_world.tasks.composition import Entity, StateDeclaration
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
-from scm_world.variables import Box, Derived, Exogenous, Fixed, Function, Measured, Parent, Variable
-from scm_world.variables.kinds import parent_of
+from scm_world.variables import Box, Derived, Exogenous, Fixed, Function, Variable
 
 CUBOID = 1  # the published type ids
 MESH = 2
@@ -105,10 +104,6 @@ def coordinates(
         )
 
 
-def _set_by(*names: str) -> tuple[Parent, ...]:
-    return tuple(parent_of(name, 0, "set") for name in names)
-
-
 @final
 class ToolBlock(Entity):
     """A block that the robot may move.
@@ -131,8 +126,6 @@ class ToolBlock(Entity):
         carry: Instead of keeping the lowest point of a box: where its center goes as it is turned
             or changes its size.
     """
-
-    removable = True
 
     def __init__(
         self,
@@ -157,14 +150,24 @@ class ToolBlock(Entity):
         self._restart = (*spawn_from, self._v("size")) if spawn_again else spawn_from
         self._again = self._restart if spawn_again else ()
         self._a, self._b = a, b
-        self.hull, self._turn, self._carry = hull, orientation, carry or _KEEP
+        self._hull, self._orientation, self._carry = hull, orientation, carry or _KEEP
+
+    @property
+    def is_block(self) -> bool:
+        """A block it is."""
+        return True
+
+    @property
+    def hull(self) -> Hull | None:
+        """The shape of a block that is no box."""
+        return self._hull
 
     def _v(self, quantity: str) -> str:
         return f"{self.name}.{quantity}"
 
     def variables(self) -> Iterable[Variable]:
         """Declare type, size, mass, friction, color and the other coordinates of the pose."""
-        yield object_type(self._v("type"), CUBOID if self.hull is None else MESH)
+        yield object_type(self._v("type"), CUBOID if self._hull is None else MESH)
         yield self._size
         yield self._mass
         yield numbers.BLOCK_FRICTIONS.root(
@@ -175,51 +178,60 @@ class ToolBlock(Entity):
         yield color(self._v("color"), numbers.BLOCK_COLOR)
         yield from coordinates(self.name, a=self._a, b=self._b)
 
-    def states(self) -> Iterable[Measured]:
+    def states(self) -> Iterable[StateDeclaration]:
         """Declare pose and velocities."""
-        still = (0.0, 0.0, 0.0)
-        yield Measured(
-            name=self._v("cartesian_position"),
-            unit="m",
-            shape=(3,),
-            bounds=numbers.POSITION_BOUNDS,
-            default=still,
-            doc="Position of the center.",
-            parents=_set_by(self._v("size"), self._v("orientation"), *self._spawn_from),
+        position, orientation = self._v("cartesian_position"), self._v("orientation")
+        linear, angular = self._v("linear_velocity"), self._v("angular_velocity")
+        yield StateDeclaration(
+            position,
+            "m",
+            (3,),
+            numbers.POSITION_BOUNDS,
+            (0.0, 0.0, 0.0),
+            "Position of the center.",
+            on_set=(self._v("size"), orientation, *self._spawn_from),
             start=self._spawn,
             carry=self._carry,
             restart=self._restart,
-            settable_state=True,
         )
-        turn = "Orientation as a unit quaternion (x, y, z, w) with w >= 0."
-        spin = "Angular velocity in the world frame."
-        moving, turning = numbers.LINEAR_VELOCITY_BOUNDS, numbers.ANGULAR_VELOCITY_BOUNDS
-        for quantity, unit, bounds, default, again, doc in (
-            ("orientation", "1", numbers.QUATERNION_BOUNDS, self._turn, numbers.IDENTITY, turn),
-            ("linear_velocity", "m/s", moving, still, still, "Velocity of the center."),
-            ("angular_velocity", "rad/s", turning, still, still, spin),
-        ):
-            yield Measured(
-                name=self._v(quantity),
-                unit=unit,
-                shape=(len(default),),
-                bounds=bounds,
-                default=default,
-                doc=doc,
-                settable_state=True,
-                **self._respawn(again),
-            )
+        yield StateDeclaration(
+            orientation,
+            "1",
+            (4,),
+            numbers.QUATERNION_BOUNDS,
+            self._orientation,
+            "Orientation as a unit quaternion (x, y, z, w) with w >= 0.",
+            **self._respawn(numbers.IDENTITY),
+        )
+        yield StateDeclaration(
+            linear,
+            "m/s",
+            (3,),
+            numbers.LINEAR_VELOCITY_BOUNDS,
+            (0.0, 0.0, 0.0),
+            "Velocity of the center.",
+            **self._respawn((0.0, 0.0, 0.0)),
+        )
+        yield StateDeclaration(
+            angular,
+            "rad/s",
+            (3,),
+            numbers.ANGULAR_VELOCITY_BOUNDS,
+            (0.0, 0.0, 0.0),
+            "Angular velocity in the world frame.",
+            **self._respawn((0.0, 0.0, 0.0)),
+        )
 
     def _respawn(self, value: tuple[float, ...]) -> dict[str, Any]:
-        """Return the fields of a state that is at its start when the block is put there again."""
+        """Say that a state is as it was at the start when the block is put there again."""
         if not self._again:
             return {}
         start = Function(constantly, constants={"value": value})
-        return {"parents": _set_by(*self._again), "start": start, "restart": self._again}
+        return {"on_set": self._again, "start": start, "restart": self._again}
 
     def parameters(self) -> Mapping[str, ParameterKey]:
         """Say which variable sets which physical parameter."""
-        own = ("mass", "friction", "color") if self.hull else ("mass", "size", "friction", "color")
+        own = ("mass", "friction", "color") if self._hull else ("mass", "size", "friction", "color")
         return {self._v(quantity): (self.name, quantity) for quantity in own}
 
 

@@ -99,8 +99,6 @@ def polar(name: str, default: tuple[float, float], *, a: Box, b: Box) -> Exogeno
 class _Goal(Entity):
     """What boxes, hulls and spheres have in common."""
 
-    removable = True
-
     def _v(self, quantity: str) -> str:
         return f"{self.name}.{quantity}"
 

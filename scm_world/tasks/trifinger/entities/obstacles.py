@@ -35,11 +35,14 @@ class Obstacle(Entity):
         position: Of ``<name>.cartesian_position``: a root, or where a mechanism puts it [m].
     """
 
-    removable = True
-
     def __init__(self, name: str, *, size: Variable, position: Variable) -> None:
         self.name = name
         self._size, self._position = size, position
+
+    @property
+    def is_obstacle(self) -> bool:
+        """An obstacle it is."""
+        return True
 
     def _v(self, quantity: str) -> str:
         return f"{self.name}.{quantity}"

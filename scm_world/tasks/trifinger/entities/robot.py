@@ -12,7 +12,7 @@ from scm_world._types import Floats, Value, Values
 from scm_world.geometry.scalars import scalar
 from scm_world.graph import NoiseKey
 from scm_world.models import ParameterKey
-from scm_world.tasks.composition import Commands, Entity
+from scm_world.tasks.composition import Commands, Entity, StateDeclaration
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.entities.blocks import color
@@ -195,7 +195,7 @@ class Robot(Entity):
         """Put together what moves, under the names of the whole robot."""
         parts = [list(self._quantities(joints)) for joints in self._joints]
         for index, whole in enumerate(Robot(self.action_mode, self._start).states()):
-            states = [quantities[index] for quantities in parts]
+            states = [quantities[index].declare((), {}) for quantities in parts]
             fields = {"bounds": whole.bounds, "a": whole.a, "b": whole.b, "doc": whole.doc}
             yield bundle(whole.name, states, **fields)
 
@@ -250,43 +250,42 @@ class Robot(Entity):
             "Standard deviation of a command, as a fraction of half the range of an action.",
         )
 
-    def states(self) -> Iterable[Measured]:
+    def states(self) -> Iterable[StateDeclaration]:
         """Declare joint positions, velocities and the torques the engine reports."""
         of_each = [list(self._quantities(joints)) for joints in self._joints]
         yield from (states[index] for index in range(len(QUANTITIES)) for states in of_each)
 
-    def _quantities(self, joints: JointGroup) -> Iterable[Measured]:
+    def _quantities(self, joints: JointGroup) -> Iterable[StateDeclaration]:
         """Declare what moves of some joints: position, velocity and torque."""
         start = self._start[joints.where]
         still = (0.0,) * len(start)
         position, velocity, torque = joints.names
-        yield Measured(
-            name=position,
-            unit="rad",
-            shape=joints.shape,
-            bounds=joints.cut(numbers.JOINT_BOUNDS),
+        yield StateDeclaration(
+            position,
+            "rad",
+            joints.shape,
+            joints.cut(numbers.JOINT_BOUNDS),
+            start if joints.shape else start[0],
+            f"Angles of the joints of {joints.of}." if joints.shape else f"Angle of {joints.of}.",
             a=joints.cut(numbers.JOINTS_A),
             b=joints.cut(numbers.JOINTS_B),
-            default=start if joints.shape else start[0],
-            doc=f"Angle{'s of the joints' if joints.shape else ''} of {joints.of}.",
-            settable_state=True,
         )
-        yield Measured(
-            name=velocity,
-            unit="rad/s",
-            shape=joints.shape,
-            bounds=numbers.JOINT_VELOCITY_BOUNDS,
-            default=still if joints.shape else 0.0,
-            doc="Angular velocities of the joints.",
-            settable_state=True,
+        yield StateDeclaration(
+            velocity,
+            "rad/s",
+            joints.shape,
+            numbers.JOINT_VELOCITY_BOUNDS,
+            still if joints.shape else 0.0,
+            "Angular velocities of the joints.",
         )
-        yield Measured(
-            name=torque,
-            unit="N m",
-            shape=joints.shape,
-            bounds=Box(-1.0, 1.0),
-            default=still if joints.shape else 0.0,
-            doc="Torques of the last physics step.",
+        yield StateDeclaration(
+            torque,
+            "N m",
+            joints.shape,
+            Box(-1.0, 1.0),
+            still if joints.shape else 0.0,
+            "Torques of the last physics step.",
+            settable=False,
         )
 
     def actions(self) -> Mapping[str, tuple[str, ...]]:
