@@ -131,27 +131,31 @@ def story(world: Simulation) -> bytes:
     return b"".join(seen)
 
 
-def _digests(world: Simulation, snapshot: Any) -> str:
+def digests(world: Simulation, snapshot: Any) -> str:
     """Hash the future of a snapshot, and the story of the world."""
     world.restore(snapshot)
     parts = (trajectory(world, actions(world, 20, 7)).tobytes(), story(world))
     return " ".join(hashlib.sha256(part).hexdigest() for part in parts)
 
 
-def serve() -> None:
-    """Answer with digests, in another process, until there are no more questions."""
-    with contextlib.suppress(EOFError):
-        while True:
-            module, question = pickle.load(sys.stdin.buffer)  # noqa: S301 # from our parent
-            importlib.import_module(module)
-            world, snapshot = pickle.loads(question)  # noqa: S301 # likewise
-            print(f"\n{_LINE}{_digests(world, snapshot)}", flush=True)  # noqa: T201 # the answer
-            world.close()
+def elsewhere(function: Callable[..., str], *arguments: Any, module: str = __name__) -> str:
+    """Call a function in another process, which lives as long as this one.
+
+    Args:
+        function: What it returns has no line break.
+        arguments: They are pickled.
+        module: It is imported there before.
+    """
+    child: Any = _child()
+    pickle.dump((module, pickle.dumps((function, arguments))), child.stdin)
+    child.stdin.flush()
+    lines = iter(child.stdout.readline, b"")
+    found = next((line.decode() for line in lines if line.startswith(_LINE.encode())), _LINE)
+    return found.removeprefix(_LINE).strip()
 
 
 @cache
-def _elsewhere() -> subprocess.Popen[bytes]:
-    """Start the other process, which lives as long as this one."""
+def _child() -> subprocess.Popen[bytes]:
     child = subprocess.Popen(  # our own interpreter, our own code
         [sys.executable, "-c", "from scm_world.testing.model import serve; serve()"],
         stdin=subprocess.PIPE,
@@ -160,6 +164,16 @@ def _elsewhere() -> subprocess.Popen[bytes]:
     )
     atexit.register(child.communicate)
     return child
+
+
+def serve() -> None:
+    """Answer ``elsewhere``, until there are no more questions."""
+    with contextlib.suppress(EOFError):
+        while True:
+            module, question = pickle.load(sys.stdin.buffer)  # noqa: S301 # from our parent
+            importlib.import_module(module)
+            function, arguments = pickle.loads(question)  # noqa: S301 # likewise
+            print(f"\n{_LINE}{function(*arguments)}", flush=True)  # noqa: T201 # the answer
 
 
 # --- checks -----------------------------------------------------------------------------------
@@ -244,14 +258,10 @@ def check_future(world: Simulation, module: str = __name__) -> None:
     world.reset(seed=2)
     trajectory(world, actions(world, 5, 3))
     snapshot = world.snapshot()
-    here = _digests(world, snapshot)
-    assert _digests(world, pickle.loads(pickle.dumps(snapshot))) == here  # noqa: S301 # our own
-    child: Any = _elsewhere()
-    pickle.dump((module, pickle.dumps((world, snapshot))), child.stdin)
-    child.stdin.flush()
-    lines = iter(child.stdout.readline, b"")
-    found = next((line.decode() for line in lines if line.startswith(_LINE.encode())), _LINE)
-    assert found.removeprefix(_LINE).strip() == here, "another process has another future"
+    here = digests(world, snapshot)
+    assert digests(world, pickle.loads(pickle.dumps(snapshot))) == here  # noqa: S301 # our own
+    there = elsewhere(digests, world, snapshot, module=module)
+    assert there == here, "another process has another future"
 
 
 def check_batch(
