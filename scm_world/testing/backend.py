@@ -186,9 +186,13 @@ class BackendConformance(ABC):
         """Apply random commands; return the state after each one."""
         return play(backend, self.commands(backend.structure, steps, seed), self.substeps)
 
-    def continued(self, backend: Backend, start: EngineSnapshot, steps: int = 10) -> Floats:
-        """Continue from a snapshot."""
+    def continued(
+        self, backend: Backend, start: EngineSnapshot, *changes: Difference, steps: int = 20
+    ) -> Floats:
+        """Continue from a snapshot with some changes."""
         backend.restore(start)
+        for change in changes:
+            backend.apply(change)
         return self.play(backend, steps)
 
     def others(self, scene: Scene) -> dict[ParameterKey, Floats]:
@@ -300,7 +304,7 @@ class BackendConformance(ABC):
     ) -> None:
         """It has exactly no effect, also where a snapshot was restored in between."""
         start, state, traces = backend.snapshot(), backend.state(), []
-        expected = self.continued(backend, start, 20)
+        expected = self.continued(backend, start)
         for number, (change, back) in enumerate(self.changes(scene, state)):
             if saved and change.parameters:
                 continue
@@ -318,36 +322,25 @@ class BackendConformance(ABC):
     def test_only_the_result_of_changes_counts(self, backend: Backend, scene: Scene) -> None:
         """Together, one by one, or with detours; all taken back, nothing is left for long."""
         start, before, other = backend.snapshot(), backend.state(), self.others(scene)
-        expected = self.continued(backend, start, self.long)
         *_, state = self.changed_states(before)
-
-        def together() -> None:
-            backend.apply(Difference(parameters=other, state=state))
-
-        def state_first() -> None:
-            backend.apply(Difference(state=state))
-            for key in sorted(other):
-                backend.apply(Difference(parameters={key: other[key]}))
-
-        def with_detours() -> None:
-            for key in sorted(other, reverse=True):
-                for value in (other[key], scene.parameters[key], other[key]):
-                    backend.apply(Difference(parameters={key: value}))
-            for detour in self.changed_states(state):
-                backend.apply(Difference(state=detour))
-            backend.apply(Difference(state=state))
-
-        results = []
-        for path in (together, state_first, with_detours):
-            backend.restore(start)
-            path()
-            results.append(self.play(backend, 20))
-            backend.restore(start)
-            path()
-            backend.apply(Difference(parameters=scene.parameters, state=before))
-            assert same(self.play(backend, self.long), expected)
-        assert same(results[0], results[1])
-        assert same(results[0], results[2])
+        alone = {key: Difference(parameters={key: value}) for key, value in other.items()}
+        undone = {key: Difference(parameters={key: scene.parameters[key]}) for key in other}
+        detours = (Difference(state=detour) for detour in self.changed_states(state))
+        keys, end = sorted(other), Difference(state=state)
+        paths = (
+            (Difference(parameters=other, state=state),),
+            (end, *(alone[key] for key in keys)),
+            (
+                *(change for key in keys[::-1] for change in (alone[key], undone[key], alone[key])),
+                *(*detours, end),
+            ),
+        )
+        back = Difference(parameters=scene.parameters, state=before)
+        expected = self.continued(backend, start, steps=self.long)
+        found = [self.continued(backend, start, *path) for path in paths]
+        assert same(found[0], found[1])
+        assert same(found[0], found[2])
+        assert same(self.continued(backend, start, *paths[2], back, steps=self.long), expected)
 
     def test_changes_equal_a_scene_built_so(self, scene: Scene) -> None:
         """Before the first step, changing a scene and building the changed one are the same."""
@@ -367,15 +360,13 @@ class BackendConformance(ABC):
             mine[where] = name.startswith(self.apart)
         with self.built(scene) as backend:
             start = backend.snapshot()
-            expected = self.play(backend, 40)
+            expected = self.continued(backend, start, steps=40)
             for key, value in self.others(scene).items():
-                if key[0] in self.everywhere:
-                    continue
-                backend.restore(start)
-                backend.apply(Difference(parameters={key: value}))
+                change = Difference(parameters={key: value})
                 untouched = ~mine if key[0].startswith(self.apart) else mine
-                if not same(self.play(backend, 40)[:, untouched], expected[:, untouched]):
-                    leaks.append(".".join(key))
+                found = self.continued(backend, start, change, steps=40)
+                if key[0] not in self.everywhere and (found != expected)[:, untouched].any():
+                    leaks.append(key)
         assert leaks == []
 
     # --- snapshots and batches -------------------------------------------------------------------
@@ -410,7 +401,7 @@ class BackendConformance(ABC):
             with self.built(scene) as other:
                 self.play(other, 2)
                 copy = pickle.loads(pickle.dumps(snapshot))  # noqa: S301 # our own
-                assert same(self.continued(other, copy, 15), expected)
+                assert same(self.continued(other, copy, steps=15), expected)
             backend.restore(snapshot)
 
     @pytest.fixture
