@@ -91,6 +91,8 @@ class StepModel:
     signature: Literal["dicts", "arrays"] = "dicts"
 
     bodies: ClassVar[tuple[str, ...]] = ()
+    readouts: ClassVar[tuple[str, ...]] = ()
+    refused: ClassVar[tuple[str, ...]] = ()
 
     @cached_property
     def digest(self) -> str:

@@ -20,6 +20,7 @@ from scm_world.models import (
     Light,
     ParameterKey,
     Scene,
+    Structure,
 )
 from scm_world.models.camera import Camera
 from scm_world.models.scene import TOLERANCE, Overlap
@@ -206,9 +207,10 @@ class Composition:
     def __init__(self, system: Any, commands: Commands | None = None) -> None:
         self.system, self.commands = system, commands
 
-    def structure(self, values: Values) -> Any:
+    def structure(self, values: Values) -> Structure:
         """Return what the backend has to compile; equal values give the same object."""
-        return self.system
+        found: Structure = self.system
+        return found
 
     def parameters(self) -> Mapping[str, ParameterKey]:
         """Map variables to the physical parameters that they set."""

@@ -308,7 +308,8 @@ class CompiledTask(ActionVector):
 
     def view(self, name: str, state: State) -> Value:
         """Give one state, as a view of a vector."""
-        return state.vector[self.slices[name]].reshape(self.model.declared(name).shape)
+        found: Value = state.vector[self.slices[name]].reshape(self.model.declared(name).shape)
+        return found
 
     def in_coordinates(self, name: str, *values: Value) -> Value:
         """Give a value of a quantity in other coordinates, or values of the parts of a bundle."""
