@@ -25,20 +25,17 @@ def is_model(source: str) -> bool:
 
 
 def load_factory(reference: str) -> Callable[..., Any]:
-    """Import a function; of a causal model, return one that returns it.
-
-    Arguments and errors are those of ``load_named``.
+    """Import a function, as ``load_named`` does; for a causal model, return one that returns it.
 
     Raises:
         UnknownOption: It is neither.
     """
-    found = load_named(reference, "task")
+    found: Any = load_named(reference, "task")
     if isinstance(found, SCM):
         return lambda: found
     if not callable(found):
         raise UnknownOption("task", reference, ("a function or an SCM",))
-    made: Callable[..., Any] = found
-    return made
+    return found
 
 
 def load_named(reference: str, what: str) -> Any:

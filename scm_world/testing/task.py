@@ -94,7 +94,9 @@ class TaskConformance(ABC):
         values, noise, model = world.values(), Noise(SEED), world.model
         for variable in model.variables:
             source = variable.space(space)
-            for episode in range(0 if source is None else 20):
+            if source is None:
+                continue
+            for episode in range(20):
                 drawn = noise.draw(source, variable.name, variable.shape, values, episode=episode)
                 assert variable.in_space(drawn[0], space, values), variable.name
                 targets = model.targets(variable.name)
