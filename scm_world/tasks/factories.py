@@ -30,12 +30,13 @@ def load_factory(reference: str) -> Callable[..., Any]:
     Raises:
         UnknownOption: It is neither.
     """
-    found: Any = load_named(reference, "task")
+    found = load_named(reference, "task")
     if isinstance(found, SCM):
         return lambda: found
     if not callable(found):
         raise UnknownOption("task", reference, ("a function or an SCM",))
-    return found
+    made: Callable[..., Any] = found
+    return made
 
 
 def load_named(reference: str, what: str) -> Any:
