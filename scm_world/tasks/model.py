@@ -20,7 +20,7 @@ from scm_world.graph import SCM
 from scm_world.models import Model, ParameterKey, Readout, Row, State
 from scm_world.models.scene import TOLERANCE, Overlap, Scene
 from scm_world.tasks.base import Goal, Observation, Observed, Task, Timing
-from scm_world.tasks.composition import Clock, Composition
+from scm_world.tasks.composition import Composition, clock
 from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
 from scm_world.variables import (
     Action,
@@ -368,11 +368,11 @@ class ModelTask(DeclaredTask):
         states: list[Variable] = []
         for row in system.states:
             states += self._state(row, causes[row.trees])
-        clock = next(iter(Clock(timing.steps, timing.control_period).variables()))
+        index, _ = clock(timing.steps, timing.control_period)
         readouts = [_readout(row) for row in system.readouts]
         own = [one for one in self.outcomes if not isinstance(one, str)]
         variables = [
-            *ties.values(), *parameters, *actions, *together, *states, clock, *readouts, *own,
+            *ties.values(), *parameters, *actions, *together, *states, index, *readouts, *own,
             *self.counted(),
         ]  # fmt: skip
         check_observed(self.observe, variables)

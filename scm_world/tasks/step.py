@@ -14,7 +14,7 @@ from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import NoiseKey
 from scm_world.models import ParameterKey, State
 from scm_world.tasks.base import Timing
-from scm_world.tasks.composition import Clock, Commands, Composition
+from scm_world.tasks.composition import Commands, Composition, clock
 from scm_world.tasks.model import DeclaredTask, _numbers, beginning, check_observed
 from scm_world.variables import (
     Action,
@@ -263,12 +263,12 @@ class StepTask(DeclaredTask):
             raise UnknownOption("frame_skip", calls, ("1: a control step is one call of step",))
         given = [v.name for v in (*self.parameters, *self.states, *self.actions)]
         states = [one for state in self.states for one in self._state(state, given)]
-        clock: Variable = next(iter(Clock(timing.steps, timing.control_period).variables()))
+        index, _ = clock(timing.steps, timing.control_period)
         if self._drawn is not None:  # noise goes by the control step: setting that is no cause
-            clock = clock.model_copy(update={"settable_state": False, "parents": ()})
+            index = index.model_copy(update={"settable_state": False, "parents": ()})
         composition = StepComposition(self.system, self._drawn)
         variables = [
-            *self.parameters, *self.actions, *states, clock, *self.outcomes, *self.counted(),
+            *self.parameters, *self.actions, *states, index, *self.outcomes, *self.counted(),
         ]  # fmt: skip
         check_observed(self.observe, variables)
         return composition, variables

@@ -11,8 +11,15 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal, final
 
-from scm_world.variables import Derived, Exogenous, Function
+from scm_world._types import Floats
+from scm_world.tasks.base import checked
+from scm_world.variables import Derived, Exogenous, Function, Variable
 from scm_world.variables.spaces import Affine, Bound, Box, Categories, Integers, Rotations
+
+
+def same(parent: Floats) -> Floats:
+    """Copy the value of the parent."""
+    return parent
 
 
 @final
@@ -36,15 +43,28 @@ class Range:
     shape: tuple[int, ...] = ()
     dtype: Literal["real", "integer", "categorical"] = "real"
 
-    def root(self, name: str, default: Any, doc: str) -> Exogenous:
-        """Declare an exogenous variable of this kind."""
-        return Exogenous(name=name, default=default, doc=doc, **vars(self))
+    def declare(
+        self,
+        name: str,
+        default: Any,
+        doc: str,
+        parents: tuple[str, ...] = (),
+        mechanism: Function | None = None,
+    ) -> Variable:
+        """Declare a variable of this kind: a root, or a function of parents, by default a copy."""
+        fields = {"name": name, "doc": doc, **vars(self)}
+        if not parents:
+            return Exogenous(default=default, **fields)
+        return Derived(parents=parents, mechanism=mechanism or Function(same), **fields)
 
-    def derived(
-        self, name: str, parents: tuple[str, ...], mechanism: Function, doc: str
-    ) -> Derived:
-        """Declare a derived variable of this kind."""
-        return Derived(name=name, parents=parents, mechanism=mechanism, doc=doc, **vars(self))
+    def option(self, name: str, value: Any, doc: str, option: str = "") -> Variable:
+        """Declare a root whose default is an option of the task, by default of the same name.
+
+        Raises:
+            UnknownOption: It is out of bounds.
+        """
+        default = checked(option or name, value, self.bounds, shape=self.shape)
+        return self.declare(name, default, doc)
 
 
 # --- what is physically possible -----------------------------------------------------------------
@@ -73,16 +93,12 @@ POLAR_B = Box((RADIUS_B[0], -math.pi), (RADIUS_B[1], math.pi))
 
 
 def half_height(size: str) -> Affine:
-    """Give the height of the center of an object that stands on the floor.
-
-    Args:
-        size: Name of the variable that holds its edge lengths.
-    """
+    """Return the height of the center of an object on the floor; ``size`` holds its edges."""
     return Affine(parent=size, index=2, scale=0.5)
 
 
 def cylindrical(radii: tuple[float, float], low: Bound, high: Bound) -> Box:
-    """Give the space of cylindrical positions between two radii and two heights [m, rad, m]."""
+    """Return the space of cylindrical positions between two radii and two heights [m, rad, m]."""
     return Box((radii[0], -math.pi, low), (radii[1], math.pi, high))
 
 
@@ -159,3 +175,9 @@ OBSTACLE_SIZE = (0.01, 0.01, 0.01)  # [m]
 FINGER_FRICTION = 0.5
 SPINNING_FRICTION = 0.001
 IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion (x, y, z, w)
+
+
+def color(name: str, default: tuple[float, float, float]) -> Variable:
+    """Declare a color. Space A is dark and B is bright, as in the paper."""
+    doc = "Red, green and blue; nothing physical depends on it."
+    return COLOR.declare(name, default, doc)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Unpack, final
 
 import numpy as np
@@ -14,9 +15,9 @@ from scm_world.tasks.rewards import FRACTION, term
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shapes, shaping
 from scm_world.tasks.trifinger.base import TriFingerTask
-from scm_world.tasks.trifinger.conventions import TriFingerConventions
+from scm_world.tasks.trifinger.entities.blocks import stand
 from scm_world.tasks.trifinger.entities.goals import goal_position, polar, turned_on_the_floor
-from scm_world.tasks.trifinger.entities.obstacles import Obstacle, obstacle_size, wall_on_the_floor
+from scm_world.tasks.trifinger.entities.obstacles import obstacle
 from scm_world.tasks.trifinger.shapes import Place
 from scm_world.tasks.trifinger.single import (
     GOAL,
@@ -41,12 +42,7 @@ ANGLES = (math.pi / 6, 5 * math.pi / 6)  # [rad] on the side where y > 0
 
 
 def mirrored(polar_position: Floats, side: Value) -> Floats:
-    """Reflect a radius and an angle at the wall where the sides are exchanged, shape (..., 2).
-
-    Args:
-        polar_position: Radius [m] and angle [rad], shape (..., 2).
-        side: 0 or 1, shape (...).
-    """
+    """Reflect a radius [m] and an angle [rad] at the wall where the side is 1, shape (..., 2)."""
     sign = 1.0 - 2.0 * np.asarray(side)
     return polar_position * np.stack([np.ones_like(sign), sign], axis=-1)
 
@@ -66,15 +62,16 @@ def hull_across(
 def stand_across(size: Floats, orientation: Floats, *causes: Value, place: Floats) -> Floats:
     """Stand a body on its side of the wall, shape (3,) [m].
 
-    Args:
-        size: Edge lengths of a box, shape (3,) [m].
-        orientation: Quaternion (x, y, z, w).
-        causes: Corners of a hull, shape (n, 3) [m], if it is one; the side, 0 or 1.
-        place: Where it stands on side 0: x, y and the height of its lowest point, shape (3,) [m].
+    The last of ``causes`` is the side; ``place`` is where it stands on side 0, see ``stand``.
     """
     *corners, side = causes
     sign = 1.0 - 2.0 * float(side)
-    return shapes.stand(size, orientation, *corners, place=place * [1.0, sign, 1.0])
+    return stand(size, orientation, *corners, place=place * [1.0, sign, 1.0])
+
+
+def wall_on_the_floor(size: Floats) -> Floats:
+    """Put a box on the floor in the middle of the arena: its center, shape (..., 3) [m]."""
+    return np.asarray(size * [0.0, 0.0, 0.5])
 
 
 @final
@@ -84,15 +81,6 @@ class PickAndPlace(TriFingerTask):
     The blocks share the parents ``block.size`` and ``wall_side``. Which side the block begins
     on decides where the goal is, so that the wall is always between them; the wall stands on the
     floor however high it is.
-
-    Reward terms:
-        reward.tips_to_block: How much nearer the three fingertips came to the block [m].
-        reward.block_to_goal: How much nearer the block came to the goal, seen from above [m].
-        reward.block_to_height: How much nearer it came to 0.15 m, or to the floor on the side of
-            the goal [m].
-        reward.orientation: By how much the angle between block and goal shrank [rad].
-        reward.smoothness: Minus the change of the joint velocities [rad/s].
-        fractional_success: How much of the goal the block fills.
 
     Args:
         tool_block_position: Where the center of the block begins while ``wall_side`` is 0: x and
@@ -145,16 +133,22 @@ class PickAndPlace(TriFingerTask):
             ),
             spaces=self._sector(GOAL, sign=1.0),
         )
-        size = obstacle_size(f"{WALL}.size", WALL_SIZE, a=WALL_A, b=WALL_B)
-        yield Obstacle(WALL, size=size, position=_wall_position(self.conventions))
+        sizes = replace(numbers.OBSTACLE_SIZES, a=WALL_A, b=WALL_B)
+        size = sizes.declare(f"{WALL}.size", WALL_SIZE, "Full edge lengths.")
+        center = (0.0, 0.0, WALL_SIZE[2] / 2.0)
+        position = goal_position(WALL, default=center)  # in the predecessor it keeps its center
+        if not self.conventions.published_spaces:
+            position = numbers.POSITIONS.declare(
+                f"{WALL}.cartesian_position",
+                None,
+                "Position of the center; it stands on the floor in the middle.",
+                (size.name,),
+                Function(wall_on_the_floor),
+            )
+        yield obstacle(WALL, size=size, position=position)
 
     def _sector(self, name: str, *, sign: float) -> tuple[Box, Box]:
-        """Give the cylindrical positions on one side of the wall.
-
-        Args:
-            name: Of block or goal.
-            sign: Of y while the side is 0.
-        """
+        """Return the cylindrical positions on one side of the wall; ``sign`` of y on side 0."""
         height = self.block.level(name)
         near, far = ANGLES if sign > 0.0 else (-ANGLES[1], -ANGLES[0])
         low = Switch(parent=SIDE, below=near, above=-far)
@@ -168,7 +162,7 @@ class PickAndPlace(TriFingerTask):
     def shared(self) -> Iterable[Variable]:
         """One size for both, and on which side of the wall they are."""
         yield from self.block.shared()
-        yield numbers.SIDES.root(
+        yield numbers.SIDES.declare(
             SIDE,
             0,
             "Where the block begins: 0 is at negative y, 1 at positive y; the goal is across.",
@@ -192,13 +186,3 @@ class PickAndPlace(TriFingerTask):
         )
         yield turned()
         yield smoothness()
-
-
-def _wall_position(conventions: TriFingerConventions) -> Variable:
-    """Stand the wall on the floor; the predecessor's keeps its center when its size changes."""
-    name = f"{WALL}.cartesian_position"
-    if conventions.published_spaces:
-        center = (0.0, 0.0, WALL_SIZE[2] / 2.0)
-        return numbers.POSITIONS.root(name, center, "Position of the center.")
-    doc = "Position of the center; it stands on the floor in the middle."
-    return numbers.POSITIONS.derived(name, (f"{WALL}.size",), Function(wall_on_the_floor), doc)

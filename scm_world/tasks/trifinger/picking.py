@@ -17,7 +17,7 @@ from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shaping
 from scm_world.tasks.trifinger.base import TriFingerTask
 from scm_world.tasks.trifinger.entities.goals import goal_position
-from scm_world.tasks.trifinger.shapes import Place
+from scm_world.tasks.trifinger.shapes import Place, block_spaces
 from scm_world.tasks.trifinger.single import GOAL, TOOL, Alike, OneBlock, smoothness, tips_to_block
 from scm_world.variables import Box, Exogenous, Function, Parent, Variable
 
@@ -28,12 +28,7 @@ HEIGHT_B = (0.2, 0.25)
 
 
 def lifted(height: Value, *, place: Floats) -> Floats:
-    """Put something at a height above a place, shape (..., 3) [m].
-
-    Args:
-        height: Shape (...) [m].
-        place: x and y, shape (2,) [m].
-    """
+    """Put something at a height above a place (x and y), shape (..., 3) [m]."""
     at = np.broadcast_to(place, (*np.shape(height), 2))
     return np.concatenate([at, np.asarray(height)[..., None]], axis=-1)
 
@@ -47,13 +42,10 @@ def put(*parents: Floats, center: Floats) -> Floats:
 
 
 def above_the_center(cylindrical: Floats) -> Floats:
-    """Put a goal above the centre of the arena, at the height of a cylindrical position.
+    """Put a goal above the centre of the arena, at the height of a cylindrical position [m].
 
     Source: CausalWorld 1.2, ``task_generators/picking.py``,
-    ``_handle_contradictory_interventions``.
-
-    Args:
-        cylindrical: Radius [m] and azimuth [rad], both ignored, and height [m]; shape (..., 3).
+    ``_handle_contradictory_interventions``; radius and azimuth are ignored.
     """
     return np.asarray(cylindrical, dtype=np.float64) * (0.0, 0.0, 1.0)
 
@@ -63,17 +55,6 @@ class Picking(TriFingerTask):
     """A block on the floor, and a goal of the same size in the air above its place.
 
     The blocks share the parent ``block.size``. How high the goal is does not depend on it.
-
-    Reward terms:
-        reward.block_to_height: How much nearer the block came to the height of the goal [m].
-        reward.height_error: Minus the difference of their heights [m].
-        reward.block_to_center: How much nearer the block came to the axis of the arena [m].
-        reward.center_distance: Minus its distance from there [m].
-        reward.tips_to_block: How much nearer the three fingertips came to the block [m].
-        reward.tips_distance: Minus their distance from it [m].
-        reward.grasp: Minus how far the two nearest fingertips are from the block [m].
-        reward.smoothness: Minus the change of the joint velocities [rad/s].
-        fractional_success: How much of the goal the block fills.
 
     Args:
         tool_block_position: Where the center of the block begins: x and y if it stands on the
@@ -115,7 +96,7 @@ class Picking(TriFingerTask):
         published = self.conventions.published_spaces
         center = (*self.block.place[:2], self.block.place[2] + self.block.below(TOOL))
         yield self.block.tool(
-            spaces=self.block.spaces(TOOL, airborne=published),
+            spaces=block_spaces(self.block.level(TOOL), airborne=published),
             start=Function(put, constants={"center": center}) if published else None,
         )
         yield self.block.goal(
@@ -138,7 +119,7 @@ class Picking(TriFingerTask):
         )
 
     def _above(self) -> tuple[Box, Box]:
-        """Give the cylindrical positions above the block's place; at radius 0 any angle will do.
+        """Return the cylindrical positions above the block's place; at radius 0 any angle will do.
 
         The predecessor publishes wider spaces, and moves every value that is drawn or set above the
         centre of the arena; see ``above_the_center``.

@@ -23,12 +23,6 @@ class Pushing(TriFingerTask):
     The blocks share the parent ``block.size``. An intervention on it keeps them alike; one on
     the pose of one leaves the other where it is.
 
-    Reward terms:
-        reward.tips_to_block: How much nearer the three fingertips came to the block [m].
-        reward.block_to_goal: How much nearer the block came to the goal [m].
-        reward.orientation: By how much the angle between block and goal shrank [rad].
-        fractional_success: How much of the goal the block fills.
-
     Args:
         tool_block_position: Where the center of the block begins: x and y if it stands on the
             floor, or x, y and z [m].

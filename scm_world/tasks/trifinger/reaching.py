@@ -16,10 +16,15 @@ from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, term
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware, kernels, shaping
-from scm_world.tasks.trifinger.base import TriFingerTask, observe_obstacle, observe_position
-from scm_world.tasks.trifinger.entities.goals import GoalSphere
+from scm_world.tasks.trifinger.base import TriFingerTask, observe, observe_position
+from scm_world.tasks.trifinger.entities.goals import goal_sphere
+from scm_world.tasks.trifinger.entities.obstacles import (
+    COUNT,
+    obstacle_names,
+    scattered,
+    scattering,
+)
 from scm_world.tasks.trifinger.kinematics import inverse
-from scm_world.tasks.trifinger.scattered import COUNT, MOST, obstacle_names, scattered, scattering
 from scm_world.variables import Cylinder, Draw, Function, Integers, Measured, Parent, Variable
 from scm_world.variables.kinds import SpaceName
 
@@ -68,13 +73,6 @@ def minus_change(now: Floats, before: Floats) -> float:
 class Reaching(TriFingerTask):
     """Three points in the air, one for each fingertip.
 
-    Reward terms:
-        reward.tips_to_goals: How much nearer the tips came to their goals [m].
-        reward.distance: Minus the distance of the tips from their goals [m].
-        reward.torque: Minus the norm of the joint torques [N m].
-        reward.smoothness: Minus the change of the joint velocities [rad/s].
-        fractional_success: 1 within a centimeter, 0 beyond three.
-
     Args:
         default_goal_60: Default goal of the first finger [m].
         default_goal_120: Default goal of the second finger [m].
@@ -111,8 +109,7 @@ class Reaching(TriFingerTask):
             checked(f"default_goal_{finger}", place, numbers.POSITION_BOUNDS, shape=(3,))
             for finger, place in given.items()
         )
-        allowed = Integers(0, MOST)
-        self._count = checked(COUNT, number_of_obstacles, allowed)
+        self.roots = (*scattering(number_of_obstacles),)
 
     @property
     def seconds(self) -> float:
@@ -123,18 +120,11 @@ class Reaching(TriFingerTask):
         """Count the obstacles."""
         return int(values[COUNT])
 
-    def shared(self) -> Iterable[Variable]:
-        """Obstacles."""
-        return scattering(self._count)
-
-    def _obstacles(self) -> int:
-        return self.plan if isinstance(self.plan, int) else self._count
-
     def entities(self) -> Iterable[Entity]:
         """Three goals, and obstacles."""
         for name, place, tint in zip(GOALS, self._places, _TINTS, strict=True):
-            yield GoalSphere(name, position=place, radius=0.015, tint=tint)
-        yield from scattered(self._obstacles())
+            yield goal_sphere(name, place, tint)
+        yield from scattered(self.arranged)
 
     def readouts(self) -> Iterable[Variable]:
         """Declare reward terms and success."""
@@ -184,10 +174,9 @@ class Reaching(TriFingerTask):
 
     def observed(self) -> Iterable[Observed]:
         """Observe the three goals and the obstacles."""
-        for name in GOALS:
-            yield from observe_position(name)
-        for name in obstacle_names(self._obstacles()):
-            yield from observe_obstacle(name)
+        yield from map(observe_position, GOALS)
+        for name in obstacle_names(self.arranged):
+            yield from observe(name, 10)
 
     @property
     def goal(self) -> Goal:

@@ -16,8 +16,14 @@ from scm_world.tasks.rewards import FRACTION, Common, term
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shapes
 from scm_world.tasks.trifinger.base import TriFingerTask
-from scm_world.tasks.trifinger.entities.block_world import lowest_point
-from scm_world.tasks.trifinger.entities.blocks import ToolBlock, block_mass, block_size, coordinates
+from scm_world.tasks.trifinger.entities.blocks import (
+    ToolBlock,
+    block_mass,
+    block_size,
+    coordinates,
+    lowest_point,
+    stand,
+)
 from scm_world.tasks.trifinger.entities.goals import (
     GoalBlock,
     goal_orientation,
@@ -36,27 +42,14 @@ GAP = 0.005  # [m] at least between the blocks at the start
 
 
 def tower_center(polar_position: Floats, size: Floats, orientation: Floats) -> Floats:
-    """Put a tower of two blocks on the floor: its lowest point touches it.
-
-    Args:
-        polar_position: Radius [m] and angle [rad], shape (..., 2).
-        size: Edge lengths of a block, shape (..., 3) [m].
-        orientation: Of the tower: quaternion (x, y, z, w), shape (..., 4).
-
-    Returns:
-        The center of the tower, shape (..., 3) [m].
-    """
+    """Put a tower of two blocks of a size on the floor: compute its center, shape (..., 3) [m]."""
     return turned_on_the_floor(polar_position, size * [1.0, 1.0, 2.0], orientation)
 
 
 def floor_of_tower(center: Floats, size: Floats, orientation: Floats, *, side: float) -> Floats:
-    """Find the center of a block of the tower, shape (..., 3) [m].
+    """Compute the center of a block of the tower, shape (..., 3) [m].
 
-    Args:
-        center: Of the tower, shape (..., 3) [m].
-        size: Edge lengths of a block, shape (..., 3) [m].
-        orientation: Of the tower: quaternion (x, y, z, w), shape (..., 4).
-        side: -1 for the lower block, 1 for the upper one.
+    ``side`` is -1 for the lower block, 1 for the upper one.
     """
     upwards = rotation_matrix(orientation)[..., :, 2]
     return np.asarray(center + (0.5 * side) * size[..., 2:] * upwards)
@@ -82,32 +75,17 @@ def beside(size: Floats, orientation: Floats, *, place: Floats, other: Floats) -
     return np.array([x, y, place[2] + lowest_point(size, orientation)])
 
 
-@final
-class GoalTower(Entity):
-    """The place of a tower of two blocks.
-
-    Args:
-        place: Default radius [m] and angle [rad].
-        orientation: Default orientation: quaternion (x, y, z, w).
-    """
-
-    name = TOWER
-
-    def __init__(self, place: tuple[float, float], orientation: Quaternion) -> None:
-        self._place, self._orientation = place, orientation
-
-    def variables(self) -> Iterable[Variable]:
-        """Declare position and orientation, in all coordinates."""
-        yield polar(TOWER, self._place, a=numbers.POLAR_A, b=numbers.POLAR_B)
-        causes = (f"{TOWER}.polar", SIZE, f"{TOWER}.orientation")
-        yield goal_position(TOWER, parents=causes, mechanism=Function(tower_center))
-        yield goal_orientation(TOWER, default=self._orientation)
-        height = Affine(parent=SIZE, index=2)
-        yield from coordinates(
-            TOWER,
-            a=numbers.cylindrical(numbers.RADIUS_A, height, height),
-            b=numbers.cylindrical(numbers.RADIUS_B, height, height),
-        )
+def goal_tower(place: tuple[float, float], orientation: Quaternion) -> Entity:
+    """Describe the place of a tower of two blocks: its default radius and angle, and quaternion."""
+    causes = (f"{TOWER}.polar", SIZE, f"{TOWER}.orientation")
+    a, b = shapes.block_spaces(Affine(parent=SIZE, index=2), airborne=False)
+    variables = (
+        polar(TOWER, place, a=numbers.POLAR_A, b=numbers.POLAR_B),
+        goal_position(TOWER, parents=causes, mechanism=Function(tower_center)),
+        goal_orientation(TOWER, default=orientation),
+        *coordinates(TOWER, a=a, b=b),
+    )
+    return Entity(TOWER, variables)
 
 
 @final
@@ -116,17 +94,6 @@ class Stacking2(TriFingerTask):
 
     All four share the parent ``block.size``. The goals follow ``goal_tower``, whose center is as
     high as a block.
-
-    Reward terms:
-        reward.tips_to_block: How much nearer the three fingertips came to the first block, and to
-            the second one once the first is at its goal [m].
-        reward.block_to_goal: How much nearer the first block came to its goal [m].
-        reward.block_to_height: How much nearer the second block came to the height of its goal
-            afterwards [m].
-        reward.block_to_block: How much nearer it came to the first one, seen from above, while it
-            is higher than its goal [m].
-        reward.smoothness: Minus the change of the joint velocities [rad/s].
-        fractional_success: How much of the two goals the blocks fill.
 
     Args:
         tool_block_mass: Default mass of a block [kg].
@@ -181,8 +148,7 @@ class Stacking2(TriFingerTask):
         self._tower_turn = shapes.unit_quaternion("goal_orientation", goal_orientation)
         size, turn = np.array(self._size), np.array(self._tower_turn)
         lower = floor_of_tower(tower_center(np.zeros(2), size, turn), size, turn, side=-1.0)
-        x, y = shapes.floor_place("goal_position", goal_position, float(lower[2]))
-        self._tower = math.hypot(x, y), math.atan2(y, x)
+        self._tower = shapes.floor_place("goal_position", goal_position, float(lower[2]))
 
     def _start(
         self, tool: str, place: Place, orientation: Quaternion
@@ -198,9 +164,9 @@ class Stacking2(TriFingerTask):
     def entities(self) -> Iterable[Entity]:
         """Two blocks, a tower, and its two floors."""
         first, second = self._places
-        yield self._tool(0, Function(shapes.stand, constants={"place": first}))
+        yield self._tool(0, Function(stand, constants={"place": first}))
         yield self._tool(1, Function(beside, constants={"place": second, "other": first}))
-        yield GoalTower(self._tower, self._tower_turn)
+        yield goal_tower(self._tower, self._tower_turn)
         causes = (f"{TOWER}.cartesian_position", SIZE, f"{TOWER}.orientation")
         for name, side in zip(GOALS, (-1.0, 1.0), strict=True):
             center = Function(floor_of_tower, constants={"side": side})
@@ -215,11 +181,12 @@ class Stacking2(TriFingerTask):
             )
 
     def _tool(self, index: int, start: Function) -> Entity:
-        name, size = TOOLS[index], f"{TOOLS[index]}.size"
-        a, b = shapes.block_spaces(size, airborne=self.conventions.published_spaces)
+        name, size = TOOLS[index], block_size(f"{TOOLS[index]}.size", SIZE, spaces=False)
+        low, airborne = numbers.half_height(size.name), self.conventions.published_spaces
+        a, b = shapes.block_spaces(low, airborne=airborne)
         return ToolBlock(
             name,
-            size=block_size(size, SIZE, spaces=False),
+            size=size,
             mass=block_mass(f"{name}.mass", default=self._mass),
             spawn=start,
             a=a,
