@@ -104,6 +104,7 @@ class TriFingerTask(Task):
         default_weights: Weight of every dense reward term, in order, and of
             ``fractional_success``.
         paper_weights: Weights of the published training runs, where they differ.
+        dense_terms: The terms that ``dense`` declares by default.
         ready_terms: Further reward terms, by name in the option ``terms``.
         terms: The further reward terms that were asked for.
         options: The options that every task of this kind has; ``Common``, or a subclass of it.
@@ -130,6 +131,7 @@ class TriFingerTask(Task):
     goal_causes: tuple[str, ...] = ()
     default_weights: ClassVar[Mapping[str, float]]
     paper_weights: ClassVar[Mapping[str, float]] = {}
+    dense_terms: ClassVar[tuple[Measured, ...]] = ()
     ready_terms: ClassVar[tuple[Measured, ...]] = shaping.ROBOT
     terms: tuple[Measured, ...] = ()
     options: ClassVar[type] = Common
@@ -219,13 +221,12 @@ class TriFingerTask(Task):
 
     def dense(self) -> Iterable[Variable]:
         """Declare the dense reward terms."""
-        return ()
+        return self.dense_terms
 
     def readouts(self) -> Iterable[Variable]:
         """Declare reward terms, fractional success and success."""
         yield from self.dense()
-        published = self.conventions.aligned_boxes
-        yield building.fractional_success(self.tools, self.targets, self.shape, published=published)
+        yield building.fractional_success(self)
         yield succeeded()
         yield from self.terms
         yield reward(self.weights)
@@ -239,10 +240,7 @@ class TriFingerTask(Task):
     @property
     def goal(self) -> Goal:
         """The blocks should fill the goals."""
-        return building.goal(
-            *(self.tools, self.targets, self.goal_causes, self.shape),
-            published=self.conventions.aligned_boxes,
-        )
+        return building.goal(self)
 
     def observed(self) -> Iterable[Observed]:
         """List the rows of blocks, goals and obstacles."""

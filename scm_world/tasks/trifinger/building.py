@@ -6,14 +6,13 @@ import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.geometry.filling import overlap_fraction_kernel
-from scm_world.geometry.hulls import Hull
 from scm_world.geometry.overlap import aabb_overlap_fraction
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.tasks.base import OVERLAP, Goal
@@ -26,6 +25,9 @@ from scm_world.tasks.trifinger.feasibility import fingers_reach
 from scm_world.tasks.trifinger.views import SIZE, view
 from scm_world.variables import Function, Measured, Variable
 from scm_world.variables.mechanisms import Stacked
+
+if TYPE_CHECKING:
+    from scm_world.tasks.trifinger.base import TriFingerTask
 
 MASS = "blocks_mass"
 BOX = 10  # numbers of a box in a goal vector: size (3), position (3), quaternion (4)
@@ -64,17 +66,10 @@ def aligned(numbers: Floats, tools: float) -> float:
     return aabb_overlap_fraction(*(part[:of] for part in parts), *(part[of:] for part in parts))
 
 
-def fractional_success(
-    tools: tuple[str, ...], targets: Mapping[str, str], shape: Hull | None, *, published: bool
-) -> Measured:
-    """Declare the fraction of the goals that is filled.
-
-    Args:
-        tools: Names of the blocks.
-        targets: Names of the goals.
-        shape: Shape of block and goal, where that is not a box.
-        published: Whether the overlap is that of the axis-aligned hulls, as in the predecessor.
-    """
+def fractional_success(task: TriFingerTask) -> Measured:
+    """Declare the fraction of the goals of a task that its blocks fill."""
+    tools, targets, shape = task.tools, task.targets, task.shape
+    published = task.conventions.aligned_boxes
     parts = _POSE
     if shape is not None:
         mechanism = Function(shapes.hull_aligned if published else shapes.hull_filled)
@@ -93,28 +88,17 @@ def fractional_success(
     )
 
 
-def goal(
-    tools: tuple[str, ...],
-    targets: Mapping[str, str],
-    causes: tuple[str, ...],
-    shape: Hull | None,
-    *,
-    published: bool,
-) -> Goal:
-    """Return the goal of blocks that should fill others: size, position and quaternion of each.
-
-    Args:
-        tools: Names of the blocks.
-        targets: Names of the goals, each with the block that its solution puts there.
-        causes: The variables that a new goal is drawn for.
-        shape: Shape of block and goal, where that is not a box.
-        published: Whether the overlap is that of the axis-aligned hulls, as in the predecessor.
-    """
+def goal(task: TriFingerTask) -> Goal:
+    """Return the goal of blocks that should fill others: size, position and quaternion of each."""
+    targets, shape = task.targets, task.shape
     have, want = (
         tuple(f"{name}.{part}" for name in names for part in _POSE)
         for names in (targets.values(), targets)
     )
-    vertices = np.array(() if shape is None else shape.vertices)
+    usual, vertices = (
+        task.conventions.aligned_boxes,
+        np.array(() if shape is None else shape.vertices),
+    )
 
     def one(mine: Floats, its: Floats, published: bool) -> float:
         if shape is None:
@@ -125,21 +109,21 @@ def goal(
 
     vectorized = np.vectorize(one, signature="(n),(n),()->()", otypes=[float])
 
-    def fraction(achieved: ArrayLike, desired: ArrayLike, published: bool = published) -> Floats:
+    def fraction(achieved: ArrayLike, desired: ArrayLike, published: bool = usual) -> Floats:
         """Compute how much of the desired boxes, or of the desired hull, is filled, shape (...)."""
         return np.asarray(vectorized(np.asarray(achieved), np.asarray(desired), published))
 
     return Goal(
         achieved=have,
         desired=want,
-        causes=causes,
+        causes=task.goal_causes,
         measures={
             FRACTION: fraction,
             SUCCESS: lambda mine, its: fraction(mine, its) > FULFILLED,
             OVERLAP: partial(fraction, published=True),
         },
         closeness=((TIPS, *have, *want), boxes_apart),
-        tools=tools,
+        tools=task.tools,
         targets=targets,
     )
 

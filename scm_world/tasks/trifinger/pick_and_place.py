@@ -20,15 +20,17 @@ from scm_world.tasks.trifinger.entities.goals import goal_position, polar, turne
 from scm_world.tasks.trifinger.entities.obstacles import obstacle
 from scm_world.tasks.trifinger.shapes import Place
 from scm_world.tasks.trifinger.single import (
+    BLOCK,
     GOAL,
+    TARGET,
+    TIPS_TO_BLOCK,
     TOOL,
+    TURNED,
+    WAS,
     Alike,
     OneBlock,
-    smoothness,
-    tips_to_block,
-    turned,
 )
-from scm_world.variables import Box, Function, Parent, Switch, Variable
+from scm_world.variables import Box, Function, Switch, Variable
 
 WALL = "obstacle"
 SIDE = "wall_side"
@@ -99,6 +101,23 @@ class PickAndPlace(TriFingerTask):
         FRACTION: 0.0,
     }
     paper_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
+    dense_terms = (
+        TIPS_TO_BLOCK,
+        term(
+            "reward.block_to_goal",
+            kernels.horizontal_progress,
+            (BLOCK, WAS, TARGET),
+            "How much nearer the block came to the goal, seen from above [m].",
+        ),
+        term(
+            "reward.block_to_height",
+            kernels.crossing_progress,
+            (BLOCK, WAS, TARGET, f"{GOAL}.size"),
+            "How much nearer the block came to 0.15 m, or to the floor on the goal's side [m].",
+        ),
+        TURNED,
+        shaping.SMOOTHNESS,
+    )
     options = Alike
     obstacles = (WALL,)
     ready_terms = shaping.ONE_BLOCK
@@ -167,22 +186,3 @@ class PickAndPlace(TriFingerTask):
             0,
             "Where the block begins: 0 is at negative y, 1 at positive y; the goal is across.",
         )
-
-    def dense(self) -> Iterable[Variable]:
-        """Declare how block and fingers come nearer, and how steady they are."""
-        block, goal = f"{TOOL}.cartesian_position", f"{GOAL}.cartesian_position"
-        yield tips_to_block()
-        yield term(
-            "reward.block_to_goal",
-            kernels.horizontal_progress,
-            (block, Parent(block, 1), goal),
-            "How much nearer the block came to the goal, seen from above [m].",
-        )
-        yield term(
-            "reward.block_to_height",
-            kernels.crossing_progress,
-            (block, Parent(block, 1), goal, f"{GOAL}.size"),
-            "How much nearer the block came to 0.15 m, or to the floor on the goal's side [m].",
-        )
-        yield turned()
-        yield smoothness()

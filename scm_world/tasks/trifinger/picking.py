@@ -10,7 +10,6 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.geometry.coordinates import from_cylindrical
-from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, term
 from scm_world.tasks.trifinger import catalogue as numbers
@@ -18,13 +17,22 @@ from scm_world.tasks.trifinger import kernels, shaping
 from scm_world.tasks.trifinger.base import TriFingerTask
 from scm_world.tasks.trifinger.entities.goals import goal_position
 from scm_world.tasks.trifinger.shapes import Place, block_spaces
-from scm_world.tasks.trifinger.single import GOAL, TOOL, Alike, OneBlock, smoothness, tips_to_block
-from scm_world.variables import Box, Exogenous, Function, Parent, Variable
+from scm_world.tasks.trifinger.single import (
+    BLOCK,
+    GOAL,
+    TARGET,
+    TIPS_TO_BLOCK,
+    TOOL,
+    WAS,
+    Alike,
+    OneBlock,
+)
+from scm_world.variables import Box, Function
 
 HEIGHT = f"{GOAL}.height"
-HEIGHT_BOUNDS = Box(0.0, 0.5)  # [m] of the center of the goal
-HEIGHT_A = (0.08, 0.2)  # [m]
+HEIGHT_A = (0.08, 0.2)  # [m] of the center of the goal
 HEIGHT_B = (0.2, 0.25)
+HEIGHTS = numbers.Range(Box(0.0, 0.5), Box(*HEIGHT_A), Box(*HEIGHT_B), "m")
 
 
 def lifted(height: Value, *, place: Floats) -> Floats:
@@ -75,6 +83,46 @@ class Picking(TriFingerTask):
         "reward.smoothness": 0.005,
         FRACTION: 1.0,
     }
+    dense_terms = (
+        term(
+            "reward.block_to_height",
+            kernels.height_progress,
+            (BLOCK, WAS, TARGET),
+            "How much nearer the block came to the height of the goal [m].",
+        ),
+        term(
+            "reward.height_error",
+            kernels.minus_height_error,
+            (BLOCK, TARGET),
+            "Minus the difference of the heights of block and goal [m].",
+        ),
+        term(
+            "reward.block_to_center",
+            kernels.centering_progress,
+            (BLOCK, WAS),
+            "How much nearer the block came to the axis of the arena [m].",
+        ),
+        term(
+            "reward.center_distance",
+            kernels.minus_eccentricity,
+            (BLOCK,),
+            "Minus the distance of the block from the axis of the arena [m].",
+        ),
+        TIPS_TO_BLOCK,
+        term(
+            "reward.tips_distance",
+            kernels.minus_tips_distance,
+            (shaping.TIPS, BLOCK),
+            "Minus the distance of the fingertips from the block [m].",
+        ),
+        term(
+            "reward.grasp",
+            kernels.minus_grasp_distance,
+            (shaping.TIPS, BLOCK, f"{TOOL}.size"),
+            "Minus how far the two nearest fingertips are from the block [m].",
+        ),
+        shaping.SMOOTHNESS,
+    )
     options = Alike
     ready_terms = shaping.ONE_BLOCK
     goal_causes: tuple[str, ...] = (HEIGHT,)
@@ -89,7 +137,7 @@ class Picking(TriFingerTask):
         self.block = OneBlock(tool_block_position, options)
         super().__init__(**self.block.common)
         self.goal_causes = self.block.causes(self.goal_causes)
-        self._height = checked("goal_height", goal_height, HEIGHT_BOUNDS)
+        self._height = HEIGHTS.option(HEIGHT, goal_height, "Height of its center.", "goal_height")
 
     def entities(self) -> Iterable[Entity]:
         """A block and its goal."""
@@ -100,15 +148,7 @@ class Picking(TriFingerTask):
             start=Function(put, constants={"center": center}) if published else None,
         )
         yield self.block.goal(
-            Exogenous(
-                name=HEIGHT,
-                unit="m",
-                bounds=HEIGHT_BOUNDS,
-                a=Box(*HEIGHT_A),
-                b=Box(*HEIGHT_B),
-                default=self._height,
-                doc="Height of its center.",
-            ),
+            self._height,
             goal_position(
                 GOAL,
                 parents=(HEIGHT,),
@@ -136,46 +176,3 @@ class Picking(TriFingerTask):
             Box((radius, low, bottom), (radius, high, top)) for bottom, top in (HEIGHT_A, HEIGHT_B)
         )
         return a, b
-
-    def dense(self) -> Iterable[Variable]:
-        """Declare how block and fingers come nearer, and how steady they are."""
-        block, goal = f"{TOOL}.cartesian_position", f"{GOAL}.cartesian_position"
-        tips, was = "end_effector_positions", Parent(f"{TOOL}.cartesian_position", 1)
-        yield term(
-            "reward.block_to_height",
-            kernels.height_progress,
-            (block, was, goal),
-            "How much nearer the block came to the height of the goal [m].",
-        )
-        yield term(
-            "reward.height_error",
-            kernels.minus_height_error,
-            (block, goal),
-            "Minus the difference of the heights of block and goal [m].",
-        )
-        yield term(
-            "reward.block_to_center",
-            kernels.centering_progress,
-            (block, was),
-            "How much nearer the block came to the axis of the arena [m].",
-        )
-        yield term(
-            "reward.center_distance",
-            kernels.minus_eccentricity,
-            (block,),
-            "Minus the distance of the block from the axis of the arena [m].",
-        )
-        yield tips_to_block()
-        yield term(
-            "reward.tips_distance",
-            kernels.minus_tips_distance,
-            (tips, block),
-            "Minus the distance of the fingertips from the block [m].",
-        )
-        yield term(
-            "reward.grasp",
-            kernels.minus_grasp_distance,
-            (tips, block, f"{TOOL}.size"),
-            "Minus how far the two nearest fingertips are from the block [m].",
-        )
-        yield smoothness()

@@ -12,8 +12,17 @@ from scm_world.tasks.trifinger import kernels, shapes, shaping
 from scm_world.tasks.trifinger.base import TriFingerTask
 from scm_world.tasks.trifinger.entities.goals import goal_position, polar, turned_on_the_floor
 from scm_world.tasks.trifinger.shapes import Place
-from scm_world.tasks.trifinger.single import GOAL, TOOL, Alike, OneBlock, tips_to_block, turned
-from scm_world.variables import Function, Parent, Variable
+from scm_world.tasks.trifinger.single import (
+    BLOCK,
+    GOAL,
+    TARGET,
+    TIPS_TO_BLOCK,
+    TURNED,
+    WAS,
+    Alike,
+    OneBlock,
+)
+from scm_world.variables import Function
 
 
 @final
@@ -38,6 +47,16 @@ class Pushing(TriFingerTask):
         "fractional_success": 1.0,
     }
     paper_weights = {"reward.orientation": 0.0}  # noqa: RUF012 # a constant
+    dense_terms = (
+        TIPS_TO_BLOCK,
+        term(
+            "reward.block_to_goal",
+            kernels.block_progress,
+            (BLOCK, WAS, TARGET),
+            "How much nearer the block came to the goal [m].",
+        ),
+        TURNED,
+    )
     options = Alike
     ready_terms = shaping.ONE_BLOCK
     goal_causes: tuple[str, ...] = ("goal_block.polar", "goal_block.euler_orientation")
@@ -64,15 +83,3 @@ class Pushing(TriFingerTask):
                 GOAL, parents=(f"{GOAL}.polar", *self.block.form(GOAL)), mechanism=Function(rests)
             ),
         )
-
-    def dense(self) -> Iterable[Variable]:
-        """Declare how the fingers and the block come nearer."""
-        block = f"{TOOL}.cartesian_position"
-        yield tips_to_block()
-        yield term(
-            "reward.block_to_goal",
-            kernels.block_progress,
-            (block, Parent(block, 1), f"{GOAL}.cartesian_position"),
-            "How much nearer the block came to the goal [m].",
-        )
-        yield turned()

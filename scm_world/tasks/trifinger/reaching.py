@@ -25,6 +25,7 @@ from scm_world.tasks.trifinger.entities.obstacles import (
     scattering,
 )
 from scm_world.tasks.trifinger.kinematics import inverse
+from scm_world.tasks.trifinger.shaping import TIPS
 from scm_world.variables import Cylinder, Draw, Function, Integers, Measured, Parent, Variable
 from scm_world.variables.kinds import SpaceName
 
@@ -32,6 +33,7 @@ REACHED = 0.01  # [m] mean error of a coordinate that counts as success
 FAR = 0.03  # [m] mean error at which the fractional success is zero
 
 GOALS = tuple(f"goal_{finger}" for finger in hardware.FINGERS)
+PLACES = tuple(f"{name}.cartesian_position" for name in GOALS)
 _TINTS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -63,12 +65,6 @@ def minus_distance(tips: Floats, goal_60: Floats, goal_120: Floats, goal_300: Fl
     return -kernels.reach_distance(tips, goal_60, goal_120, goal_300)
 
 
-@njit(cache=True)
-def minus_change(now: Floats, before: Floats) -> float:
-    """Compute the negative norm of a difference."""
-    return -kernels.distance(now, before)
-
-
 @final
 class Reaching(TriFingerTask):
     """Three points in the air, one for each fingertip.
@@ -90,6 +86,27 @@ class Reaching(TriFingerTask):
         FRACTION: 1.0,
     }
     paper_weights = {FRACTION: 0.0}  # noqa: RUF012 # a constant
+    dense_terms = (
+        term(
+            "reward.tips_to_goals",
+            kernels.reach_progress,
+            (TIPS, Parent(TIPS, 1), *PLACES),
+            "How much nearer the tips came to their goals [m].",
+        ),
+        term(
+            "reward.distance",
+            minus_distance,
+            (TIPS, *PLACES),
+            "Minus the distance of the tips from their goals [m].",
+        ),
+        term(
+            "reward.torque",
+            minus_norm,
+            ("joint_torques",),
+            "Minus the norm of the joint torques [N m].",
+        ),
+        shaping.SMOOTHNESS,
+    )
     ready_terms = shaping.REACHING
     decided_by = (COUNT,)
     goal_causes = tuple(f"{name}.cylindrical_position" for name in GOALS)
@@ -128,11 +145,11 @@ class Reaching(TriFingerTask):
 
     def readouts(self) -> Iterable[Variable]:
         """Declare reward terms and success."""
-        yield from self._terms()
+        yield from self.dense_terms
         yield Measured(
             name="reach_error",
             unit="m",
-            parents=("end_effector_positions", *_positions()),
+            parents=(TIPS, *PLACES),
             mechanism=Function(kernels.reach_error),
             doc="Mean absolute error of the nine tip coordinates.",
         )
@@ -157,21 +174,6 @@ class Reaching(TriFingerTask):
             weights["reach_error"] = weights.pop(FRACTION)
         yield reward(weights)
 
-    def _terms(self) -> Iterable[Variable]:
-        tips, goals, speeds = "end_effector_positions", _positions(), "joint_velocities"
-        yield term(
-            "reward.tips_to_goals",
-            kernels.reach_progress,
-            (tips, Parent(tips, 1), *goals),
-            "How much nearer the tips came to their goals [m].",
-        )
-        far = "Minus the distance of the tips from their goals [m]."
-        yield term("reward.distance", minus_distance, (tips, *goals), far)
-        torque = "Minus the norm of the joint torques [N m]."
-        yield term("reward.torque", minus_norm, ("joint_torques",), torque)
-        change = "Minus the change of the joint velocities [rad/s]."
-        yield term("reward.smoothness", minus_change, (speeds, Parent(speeds, 1)), change)
-
     def observed(self) -> Iterable[Observed]:
         """Observe the three goals and the obstacles."""
         yield from map(observe_position, GOALS)
@@ -182,8 +184,8 @@ class Reaching(TriFingerTask):
     def goal(self) -> Goal:
         """The tips should be at their goals, nine numbers each [m]."""
         return Goal(
-            achieved=("end_effector_positions",),
-            desired=_positions(),
+            achieved=(TIPS,),
+            desired=PLACES,
             causes=self.goal_causes,
             measures={
                 "reach_error": error_of,
@@ -223,7 +225,3 @@ def fraction_of(tips: ArrayLike, goals: ArrayLike) -> Floats:
     return np.asarray(
         1.0 - (np.clip(error_of(tips, goals), REACHED, FAR) - REACHED) / (FAR - REACHED)
     )
-
-
-def _positions() -> tuple[str, ...]:
-    return tuple(f"{name}.cartesian_position" for name in GOALS)

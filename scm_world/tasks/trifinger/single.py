@@ -25,9 +25,9 @@ from scm_world.tasks.trifinger.entities.blocks import (
     stand,
 )
 from scm_world.tasks.trifinger.entities.goals import GoalBlock, goal_orientation
-from scm_world.tasks.trifinger.reaching import minus_change
 from scm_world.tasks.trifinger.shapes import Place, Quaternion
-from scm_world.variables import Box, Exogenous, Fixed, Function, Measured, Parent, Variable
+from scm_world.tasks.trifinger.shaping import TIPS
+from scm_world.variables import Box, Exogenous, Fixed, Function, Parent, Variable
 from scm_world.variables.spaces import Bound
 
 SIZE = "block.size"
@@ -208,34 +208,19 @@ class OneBlock:
         )
 
 
-def tips_to_block() -> Measured:
-    """Declare the term for fingertips that come nearer."""
-    tips, place = "end_effector_positions", f"{TOOL}.cartesian_position"
-    return term(
-        "reward.tips_to_block",
-        kernels.tips_progress,
-        (tips, Parent(tips, 1), place, Parent(place, 1)),
-        "How much nearer the fingertips came to the block [m].",
-    )
+BLOCK, TARGET = f"{TOOL}.cartesian_position", f"{GOAL}.cartesian_position"
+WAS = Parent(BLOCK, 1)
 
-
-def turned() -> Measured:
-    """Declare the term for a block that turns towards its goal."""
-    turn = f"{TOOL}.orientation"
-    return term(
-        "reward.orientation",
-        kernels.turn_progress,
-        (turn, Parent(turn, 1), f"{GOAL}.orientation"),
-        "By how much the angle between block and goal shrank [rad].",
-    )
-
-
-def smoothness() -> Measured:
-    """Declare the term for joints that change their velocities."""
-    speeds = "joint_velocities"
-    return term(
-        "reward.smoothness",
-        minus_change,
-        (speeds, Parent(speeds, 1)),
-        "Minus the change of the joint velocities [rad/s].",
-    )
+TIPS_TO_BLOCK = term(
+    "reward.tips_to_block",
+    kernels.tips_progress,
+    (TIPS, Parent(TIPS, 1), BLOCK, WAS),
+    "How much nearer the fingertips came to the block [m].",
+)
+TURNED = term(
+    "reward.orientation",
+    kernels.turn_progress,
+    (f"{TOOL}.orientation", Parent(f"{TOOL}.orientation", 1), f"{GOAL}.orientation"),
+    "By how much the angle between block and goal shrank [rad].",
+)
+"""Reward terms of several tasks with one block."""

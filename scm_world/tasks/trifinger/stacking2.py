@@ -32,12 +32,14 @@ from scm_world.tasks.trifinger.entities.goals import (
     turned_on_the_floor,
 )
 from scm_world.tasks.trifinger.shapes import Place, Quaternion
-from scm_world.tasks.trifinger.single import SIZE, smoothness
-from scm_world.variables import Affine, Function, Parent, Variable
+from scm_world.tasks.trifinger.shaping import SMOOTHNESS, TIPS
+from scm_world.tasks.trifinger.single import SIZE
+from scm_world.variables import Affine, Function, Parent
 
 TOWER = "goal_tower"
 TOOLS = ("tool_block_1", "tool_block_2")
 GOALS = ("goal_block_1", "goal_block_2")
+FIRST, SECOND, LOWER, UPPER = (f"{name}.cartesian_position" for name in (*TOOLS, *GOALS))
 GAP = 0.005  # [m] at least between the blocks at the start
 
 
@@ -118,6 +120,33 @@ class Stacking2(TriFingerTask):
         "reward.smoothness": 0.005,
         FRACTION: 1.0,
     }
+    dense_terms = (
+        term(
+            "reward.tips_to_block",
+            kernels.stacking_tips_progress,
+            (TIPS, Parent(TIPS, 1), FIRST, Parent(FIRST, 1), SECOND, Parent(SECOND, 1), LOWER),
+            "How much nearer the fingertips came to the block whose turn it is [m].",
+        ),
+        term(
+            "reward.block_to_goal",
+            kernels.placing_progress,
+            (FIRST, Parent(FIRST, 1), LOWER),
+            "How much nearer the first block came to its goal [m].",
+        ),
+        term(
+            "reward.block_to_height",
+            kernels.lifting_progress,
+            (FIRST, LOWER, SECOND, Parent(SECOND, 1), UPPER),
+            "How much nearer the second block came to the height of its goal [m].",
+        ),
+        term(
+            "reward.block_to_block",
+            kernels.stacking_progress,
+            (FIRST, Parent(FIRST, 1), LOWER, SECOND, Parent(SECOND, 1), UPPER),
+            "How much nearer the second block came to the first one, seen from above [m].",
+        ),
+        SMOOTHNESS,
+    )
     goal_causes = (f"{TOWER}.polar", f"{TOWER}.euler_orientation")
     tools, targets = TOOLS, dict(zip(GOALS, TOOLS, strict=True))  # the lower one first
     unchecked = (TOWER,)
@@ -139,6 +168,7 @@ class Stacking2(TriFingerTask):
         self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASSES.bounds)
         edge = checked("tool_block_size", tool_block_size, numbers.BLOCK_SIZES.bounds)
         self._size = (edge, edge, edge)
+        self.roots = (block_size(SIZE, default=self._size),)  # one for all
         given = (
             (tool_block_1_position, tool_block_1_orientation),
             (tool_block_2_position, tool_block_2_orientation),
@@ -156,10 +186,6 @@ class Stacking2(TriFingerTask):
         turn = shapes.unit_quaternion(f"{tool}_orientation", orientation)
         below = lowest_point(np.array(self._size), np.array(turn))
         return shapes.start_place(f"{tool}_position", place, below), turn
-
-    def shared(self) -> Iterable[Variable]:
-        """One size for all."""
-        yield block_size(SIZE, default=self._size)
 
     def entities(self) -> Iterable[Entity]:
         """Two blocks, a tower, and its two floors."""
@@ -193,33 +219,3 @@ class Stacking2(TriFingerTask):
             b=b,
             orientation=self._turns[index],
         )
-
-    def dense(self) -> Iterable[Variable]:
-        """Declare how blocks and fingers come nearer, and how steady they are."""
-        tips = "end_effector_positions"
-        first, second, goal, top = (f"{name}.cartesian_position" for name in (*TOOLS, *GOALS))
-        yield term(
-            "reward.tips_to_block",
-            kernels.stacking_tips_progress,
-            (tips, Parent(tips, 1), first, Parent(first, 1), second, Parent(second, 1), goal),
-            "How much nearer the fingertips came to the block whose turn it is [m].",
-        )
-        yield term(
-            "reward.block_to_goal",
-            kernels.placing_progress,
-            (first, Parent(first, 1), goal),
-            "How much nearer the first block came to its goal [m].",
-        )
-        yield term(
-            "reward.block_to_height",
-            kernels.lifting_progress,
-            (first, goal, second, Parent(second, 1), top),
-            "How much nearer the second block came to the height of its goal [m].",
-        )
-        yield term(
-            "reward.block_to_block",
-            kernels.stacking_progress,
-            (first, Parent(first, 1), goal, second, Parent(second, 1), top),
-            "How much nearer the second block came to the first one, seen from above [m].",
-        )
-        yield smoothness()
