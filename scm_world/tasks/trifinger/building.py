@@ -206,7 +206,7 @@ def bodies(
         numbers.PART_SIZES.declare(f"{body}.size", None, "Full edge lengths.", *made.size)
         for body in (tool, goal)
     ]
-    a, b = shapes.block_spaces(numbers.half_height(f"{tool}.size"), airborne=airborne)
+    a, b = numbers.places(numbers.half_height(f"{tool}.size"), airborne=airborne)
     block = ToolBlock(
         tool,
         size=sizes[0],

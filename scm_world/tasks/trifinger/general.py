@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any, Unpack, final
+from typing import Unpack, final
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from scm_world.tasks.trifinger import piles
 from scm_world.tasks.trifinger.base import Building
 from scm_world.tasks.trifinger.building import MASS, Part, Piece, blocks_mass
 from scm_world.tasks.trifinger.entities.blocks import lowest_point
-from scm_world.variables import Box, Derived, Exogenous, Function, Variable
+from scm_world.variables import Box, Derived, Function, Variable
 
 COUNT = "nums_objects"
 SIZE = "tool_block_size"
@@ -131,27 +131,18 @@ class General(Building):
 
 def _drops() -> Iterable[Variable]:
     """Declare what the predecessor takes from a global generator."""
-    region, turns = Box(*numbers.DROP_REGION), Box(0.0, 2.0 * math.pi)
-    common: dict[str, Any] = {"shape": (piles.MOST, 3)}
-    yield Exogenous(
-        name=PLACES,
-        unit="m",
-        bounds=_repeated(numbers.POSITION_BOUNDS),
-        a=_repeated(region),
-        b=_repeated(region),
-        default=tuple(x for i in range(piles.MOST) for x in DROPS[i % len(DROPS)]),
-        doc="Where the center of each block is let go, or above it if something is there.",
-        **common,
+    region, turns = _repeated(Box(*numbers.DROP_REGION)), Box(0.0, 2.0 * math.pi)
+    bounds, shape = _repeated(numbers.POSITION_BOUNDS), (piles.MOST, 3)
+    yield numbers.Range(bounds, region, region, "m", shape).declare(
+        PLACES,
+        tuple(x for i in range(piles.MOST) for x in DROPS[i % len(DROPS)]),
+        "Where the center of each block is let go, or above it if something is there.",
     )
-    yield Exogenous(
-        name=TURNS,
-        unit="rad",
-        bounds=Box(-2.0 * math.pi, 2.0 * math.pi),
-        a=turns,
-        b=turns,
-        default=(0.0,) * (3 * piles.MOST),
-        doc="How each block is turned when it is let go, as a rotation vector.",
-        **common,
+    bounds = Box(-2.0 * math.pi, 2.0 * math.pi)
+    yield numbers.Range(bounds, turns, turns, "rad", shape).declare(
+        TURNS,
+        (0.0,) * (3 * piles.MOST),
+        "How each block is turned when it is let go, as a rotation vector.",
     )
 
 

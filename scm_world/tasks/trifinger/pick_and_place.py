@@ -144,7 +144,7 @@ class PickAndPlace(TriFingerTask):
         )
         a, b = (Box((near, ANGLES[0]), (far, ANGLES[1])) for near, far in (RADIUS_A, RADIUS_B))
         yield self.block.goal(
-            polar(GOAL, self._polar, a=a, b=b),
+            polar(GOAL, self._polar, (a, b)),
             goal_position(
                 GOAL,
                 parents=(SIDE, f"{GOAL}.polar", *self.block.form(GOAL)),

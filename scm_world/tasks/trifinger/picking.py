@@ -16,7 +16,7 @@ from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shaping
 from scm_world.tasks.trifinger.base import TriFingerTask
 from scm_world.tasks.trifinger.entities.goals import goal_position
-from scm_world.tasks.trifinger.shapes import Place, block_spaces
+from scm_world.tasks.trifinger.shapes import Place
 from scm_world.tasks.trifinger.single import (
     BLOCK,
     GOAL,
@@ -144,7 +144,7 @@ class Picking(TriFingerTask):
         published = self.conventions.published_spaces
         center = (*self.block.place[:2], self.block.place[2] + self.block.below(TOOL))
         yield self.block.tool(
-            spaces=block_spaces(self.block.level(TOOL), airborne=published),
+            spaces=numbers.places(self.block.level(TOOL), airborne=published),
             start=Function(put, constants={"center": center}) if published else None,
         )
         yield self.block.goal(

@@ -7,7 +7,6 @@ from typing import Unpack, final
 
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import term
-from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shapes, shaping
 from scm_world.tasks.trifinger.base import TriFingerTask
 from scm_world.tasks.trifinger.entities.goals import goal_position, polar, turned_on_the_floor
@@ -78,7 +77,7 @@ class Pushing(TriFingerTask):
         yield self.block.tool()
         rests = turned_on_the_floor if self.shape is None else shapes.hull_on_the_floor
         yield self.block.goal(
-            polar(GOAL, self._polar, a=numbers.POLAR_A, b=numbers.POLAR_B),
+            polar(GOAL, self._polar),
             goal_position(
                 GOAL, parents=(f"{GOAL}.polar", *self.block.form(GOAL)), mechanism=Function(rests)
             ),

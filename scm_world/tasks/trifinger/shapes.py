@@ -20,8 +20,6 @@ from scm_world.geometry.hulls import Hull, hull_of, hull_overlap
 from scm_world.tasks.base import finite_numbers
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.entities.goals import on_the_floor
-from scm_world.variables import Box
-from scm_world.variables.spaces import Bound
 
 Place = tuple[float, float] | tuple[float, float, float]
 """x and y of a center on the floor, or x, y and z [m]."""
@@ -90,21 +88,6 @@ def hull_aligned(*poses: Floats) -> float:
         low, high = turned.min(axis=0), turned.max(axis=0)
         boxes += [high - low, position + (low + high) / 2.0, np.array(numbers.IDENTITY)]
     return aabb_overlap_fraction(*(box[None] for box in boxes))
-
-
-def block_spaces(low: Bound, *, airborne: bool) -> tuple[Box, Box]:
-    """Return the spaces A and B of the cylindrical position of a block.
-
-    Args:
-        low: Height of its center on the floor [m].
-        airborne: Whether blocks may begin in the air, as in the predecessor.
-    """
-    tops = (numbers.HEIGHT_A, numbers.HEIGHT_B) if airborne else (low, low)
-    a, b = (
-        numbers.cylindrical(radii, low, top)
-        for radii, top in zip((numbers.RADIUS_A, numbers.RADIUS_B), tops, strict=True)
-    )
-    return a, b
 
 
 def start_place(option: str, place: Place, below: float) -> tuple[float, float, float]:

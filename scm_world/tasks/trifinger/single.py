@@ -27,7 +27,7 @@ from scm_world.tasks.trifinger.entities.blocks import (
 from scm_world.tasks.trifinger.entities.goals import GoalBlock, goal_orientation
 from scm_world.tasks.trifinger.shapes import Place, Quaternion
 from scm_world.tasks.trifinger.shaping import TIPS
-from scm_world.variables import Box, Exogenous, Fixed, Function, Parent, Variable
+from scm_world.variables import Box, Fixed, Function, Parent, Variable
 from scm_world.variables.spaces import Bound
 
 SIZE = "block.size"
@@ -155,7 +155,7 @@ class OneBlock:
             causes: The further ones.
         """
         corners = () if self.shape is None else (f"{TOOL}.vertices",)
-        a, b = spaces or shapes.block_spaces(self.level(TOOL), airborne=False)
+        a, b = spaces or numbers.places(self.level(TOOL), airborne=False)
         return ToolBlock(
             TOOL,
             size=self._size(TOOL),
@@ -181,18 +181,15 @@ class OneBlock:
             spaces: A and B of its cylindrical position; those on the floor if None.
             inverse: Cartesian position where a cylindrical one is set.
         """
-        a, b = spaces or shapes.block_spaces(self.level(GOAL), airborne=False)
+        a, b = spaces or numbers.places(self.level(GOAL), airborne=False)
         rest, box = self._turns[GOAL], self.shape is None
         pose = (*place, goal_orientation(GOAL, default=rest))
         if not box:
             circle = Box(-np.pi, np.pi)
-            yaw = Exogenous(
-                name=f"{GOAL}.yaw",
-                unit="rad",
-                bounds=circle,
-                a=circle,
-                b=circle,
-                doc="How far it is turned about the vertical from the way it rests.",
+            yaw = numbers.Range(circle, circle, circle, "rad").declare(
+                f"{GOAL}.yaw",
+                0.0,
+                "How far it is turned about the vertical from the way it rests.",
             )
             turn = Function(shapes.about_z, constants={"rest": rest})
             pose = (*place, yaw, goal_orientation(GOAL, parents=(yaw.name,), mechanism=turn))

@@ -80,9 +80,9 @@ def beside(size: Floats, orientation: Floats, *, place: Floats, other: Floats) -
 def goal_tower(place: tuple[float, float], orientation: Quaternion) -> Entity:
     """Describe the place of a tower of two blocks: its default radius and angle, and quaternion."""
     causes = (f"{TOWER}.polar", SIZE, f"{TOWER}.orientation")
-    a, b = shapes.block_spaces(Affine(parent=SIZE, index=2), airborne=False)
+    a, b = numbers.places(Affine(parent=SIZE, index=2), airborne=False)
     variables = (
-        polar(TOWER, place, a=numbers.POLAR_A, b=numbers.POLAR_B),
+        polar(TOWER, place),
         goal_position(TOWER, parents=causes, mechanism=Function(tower_center)),
         goal_orientation(TOWER, default=orientation),
         *coordinates(TOWER, a=a, b=b),
@@ -209,7 +209,7 @@ class Stacking2(TriFingerTask):
     def _tool(self, index: int, start: Function) -> Entity:
         name, size = TOOLS[index], block_size(f"{TOOLS[index]}.size", SIZE, spaces=False)
         low, airborne = numbers.half_height(size.name), self.conventions.published_spaces
-        a, b = shapes.block_spaces(low, airborne=airborne)
+        a, b = numbers.places(low, airborne=airborne)
         return ToolBlock(
             name,
             size=size,

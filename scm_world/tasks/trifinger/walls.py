@@ -21,7 +21,7 @@ from scm_world.tasks.trifinger.entities.obstacles import (
     scattered,
     scattering,
 )
-from scm_world.variables import Box, Categories, Derived, Exogenous, Function, Variable
+from scm_world.variables import Box, Categories, Derived, Function, Variable
 from scm_world.variables.kinds import SpaceName
 
 LEVELS = "stack_levels"
@@ -166,25 +166,14 @@ class StackedBlocks(Building):
 
 def _noise() -> Iterable[Variable]:
     """Declare what the predecessor takes from a global generator."""
-    both = Categories((0, RANDOM))
-    yield Exogenous(
-        name=PATTERN,
-        dtype="categorical",
-        bounds=both,
-        a=both,
-        b=both,
-        default=0,
-        doc="How the blocks are laid out: 0 is regular, 1 is random.",
+    both, unit = Categories((0, RANDOM)), Box(0.0, 1.0)
+    yield numbers.Range(both, both, both, dtype="categorical").declare(
+        PATTERN, 0, "How the blocks are laid out: 0 is regular, 1 is random."
     )
-    unit = Box(0.0, 1.0)
-    yield Exogenous(
-        name=NOISE,
-        shape=(layouts.MAX_LEVELS, 3),
-        bounds=unit,
-        a=unit,
-        b=unit,
-        default=(0.5,) * (3 * layouts.MAX_LEVELS),
-        doc="What a random wall is made of: x, y and width of each level, as fractions.",
+    yield numbers.Range(unit, unit, unit, shape=(layouts.MAX_LEVELS, 3)).declare(
+        NOISE,
+        (0.5,) * (3 * layouts.MAX_LEVELS),
+        "What a random wall is made of: x, y and width of each level, as fractions.",
     )
 
 

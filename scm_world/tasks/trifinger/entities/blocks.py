@@ -14,8 +14,7 @@ from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix, to_rotation_vector
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.variables import Box, Derived, Fixed, Function, Measured, Space, Variable
-from scm_world.variables.kinds import parent_of
+from scm_world.variables import Box, Categories, Fixed, Function, Measured, Variable
 
 TYPES = {"block": (1, 2), "obstacle": (10, 10), "goal": (20, 23), "sphere": (21, 21)}
 """The published ids of kinds of objects: of boxes, and of those with another shape."""
@@ -67,25 +66,6 @@ def constantly(*_: Floats, value: Floats) -> Floats:
     return value
 
 
-def state(
-    name: str, unit: str, bounds: Space, default: Any, doc: str, *, on_set: Any = (), **how: Any
-) -> Measured:
-    """Declare what physics moves.
-
-    Args:
-        name: ``"<entity>.<quantity>"``.
-        unit: SI unit.
-        bounds: What is possible.
-        default: At the start of an episode; its shape is that of the state.
-        doc: One sentence.
-        on_set: Parameters and states that move it when they are set.
-        how: Further fields of ``Measured``, such as ``start``, ``carry`` and ``restart``.
-    """
-    parents = tuple(parent_of(cause, 0, "set") for cause in on_set)
-    fields = {"shape": np.shape(default), "settable_state": True, "parents": parents, **how}
-    return Measured(name=name, unit=unit, bounds=bounds, default=default, doc=doc, **fields)
-
-
 def looks(
     name: str, kind: str, color: tuple[float, float, float], hull: Hull | None = None
 ) -> tuple[Variable, Variable]:
@@ -93,7 +73,7 @@ def looks(
     published = Fixed(
         name=f"{name}.type",
         dtype="categorical",
-        bounds=numbers.TYPE_BOUNDS,
+        bounds=Categories((1, 2, 10, 20, 21, 23)),
         value=TYPES[kind][hull is not None],
         doc="Published id of the kind of object.",
     )
@@ -121,28 +101,21 @@ def coordinates(
         yaw: Whether A and B of the rotation vector are the turns about z, or there are none.
         inverse: Cartesian position where a cylindrical one is set.
     """
-    yield Derived(
-        name=f"{entity}.cylindrical_position",
-        unit="m, rad, m",
-        shape=(3,),
-        a=a,
-        b=b,
-        parents=(f"{entity}.cartesian_position",),
-        mechanism=_COORDINATES[0],
+    yield numbers.Range(None, a, b, "m, rad, m", (3,)).declare(
+        f"{entity}.cylindrical_position",
+        None,
+        "Position as radius, angle and height; setting it sets the Cartesian position.",
+        (f"{entity}.cartesian_position",),
+        _COORDINATES[0],
         inverse=inverse,
-        doc="Position as radius, angle and height; setting it sets the Cartesian position.",
     )
-    turns = numbers.YAW if yaw else None
-    yield Derived(
-        name=f"{entity}.euler_orientation",
-        unit="rad",
-        shape=(3,),
-        a=turns,
-        b=turns,
-        parents=(f"{entity}.orientation",),
-        mechanism=_COORDINATES[1],
+    yield (numbers.YAWS if yaw else numbers.TURNS).declare(
+        f"{entity}.euler_orientation",
+        None,
+        "Orientation as a rotation vector; setting it sets the quaternion.",
+        (f"{entity}.orientation",),
+        _COORDINATES[1],
         inverse=_FROM_VECTOR,
-        doc="Orientation as a rotation vector; setting it sets the quaternion.",
     )
 
 
@@ -181,14 +154,14 @@ class ToolBlock(Entity):
     ) -> None:
         restart = (*spawn_from, size.name) if spawn_again else spawn_from
 
-        def moving(quantity: str, unit: str, bounds: Space, default: Any, doc: str) -> Measured:
+        def moving(what: str, kind: numbers.Range, default: Any, doc: str) -> Measured:
             """Declare a state that is as at the start when the block is put there again."""
-            how: dict[str, Any] = {}
-            if spawn_again:
-                value = numbers.IDENTITY if quantity == "orientation" else default
-                start = Function(constantly, constants={"value": value})
-                how = {"on_set": restart, "start": start, "restart": restart}
-            return state(f"{name}.{quantity}", unit, bounds, default, doc, **how)
+            if not spawn_again:
+                return kind.state(f"{name}.{what}", default, doc)
+            value = numbers.IDENTITY if what == "orientation" else default
+            start = Function(constantly, constants={"value": value})
+            how = {"on_set": restart, "start": start, "restart": restart}
+            return kind.state(f"{name}.{what}", default, doc, **how)
 
         kind, paint = looks(name, "block", numbers.BLOCK_COLOR, hull)
         friction = numbers.BLOCK_FRICTIONS.declare(
@@ -196,38 +169,21 @@ class ToolBlock(Entity):
             numbers.BLOCK_FRICTION,
             "Friction of its surface; a contact has the product of two frictions.",
         )
-        place = state(
+        place = numbers.POSITIONS.state(
             f"{name}.cartesian_position",
-            "m",
-            numbers.POSITION_BOUNDS,
             ZERO,
             "Position of the center.",
-            on_set=(size.name, f"{name}.orientation", *spawn_from),
+            (size.name, f"{name}.orientation", *spawn_from),
             start=spawn or Function(stand, constants={"place": ZERO}),
             carry=Function(keep_lowest_point, constants={} if hull is None else {"form": 3.0}),
             restart=restart,
         )
-        turn = moving(
-            "orientation",
-            "1",
-            numbers.QUATERNION_BOUNDS,
-            orientation,
-            "Orientation as a unit quaternion (x, y, z, w) with w >= 0.",
-        )
-        slide = moving(
-            "linear_velocity",
-            "m/s",
-            numbers.LINEAR_VELOCITY_BOUNDS,
-            ZERO,
-            "Velocity of the center.",
-        )
-        spin = moving(
-            "angular_velocity",
-            "rad/s",
-            numbers.ANGULAR_VELOCITY_BOUNDS,
-            ZERO,
-            "Angular velocity in the world frame.",
-        )
+        doc = "Orientation as a unit quaternion (x, y, z, w) with w >= 0."
+        turn = moving("orientation", numbers.ORIENTATIONS, orientation, doc)
+        doc = "Velocity of the center."
+        slide = moving("linear_velocity", numbers.LINEAR_VELOCITIES, ZERO, doc)
+        doc = "Angular velocity in the world frame."
+        spin = moving("angular_velocity", numbers.ANGULAR_VELOCITIES, ZERO, doc)
         own = (kind, size, mass, friction, paint, *coordinates(name, a=a, b=b))
         set_by = ("mass", "friction", "color") if hull else ("mass", "size", "friction", "color")
         super().__init__(

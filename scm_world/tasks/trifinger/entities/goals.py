@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import final
 
 import numpy as np
@@ -13,7 +14,7 @@ from scm_world.geometry.hulls import Hull
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.entities.blocks import ZERO, coordinates, looks
-from scm_world.variables import Box, Exogenous, Function, Variable
+from scm_world.variables import Box, Function, Variable
 
 
 def on_the_floor(polar: Floats, height: Floats) -> Floats:
@@ -62,18 +63,13 @@ def goal_orientation(
     return numbers.ORIENTATIONS.declare(f"{name}.orientation", default, doc, parents, mechanism)
 
 
-def polar(name: str, default: tuple[float, float], *, a: Box, b: Box) -> Exogenous:
-    """Declare radius and angle of something that stands on the floor [m, rad]."""
-    return Exogenous(
-        name=f"{name}.polar",
-        unit="m, rad",
-        shape=(2,),
-        bounds=numbers.POLAR_BOUNDS,
-        a=a,
-        b=b,
-        default=default,
-        doc="Radius and angle of its center; the height follows from the size.",
-    )
+def polar(
+    name: str, default: tuple[float, float], spaces: tuple[Box, Box] | None = None
+) -> Variable:
+    """Declare radius and angle of something on the floor [m, rad], with other spaces A and B."""
+    kind = numbers.POLAR if spaces is None else replace(numbers.POLAR, a=spaces[0], b=spaces[1])
+    doc = "Radius and angle of its center; the height follows from the size."
+    return kind.declare(f"{name}.polar", default, doc)
 
 
 @final
@@ -113,23 +109,13 @@ def goal_sphere(
     name: str, position: tuple[float, float, float], tint: tuple[float, float, float]
 ) -> Entity:
     """Describe a ball of 3 cm that a fingertip should reach: its default center [m] and color."""
-    size = Exogenous(
-        name=f"{name}.size",
-        unit="m",
-        shape=(3,),
-        bounds=Box(0.005, 0.2),
-        default=(0.03,) * 3,
-        doc="Diameter, three times; only pictures and the lowest height of A and B use it.",
+    size = numbers.Range(Box(0.005, 0.2), unit="m", shape=(3,)).declare(
+        f"{name}.size",
+        (0.03,) * 3,
+        "Diameter, three times; only pictures and the lowest height of A and B use it.",
     )
     kind, paint = looks(name, "sphere", tint)
     pose = goal_position(name, default=position), goal_orientation(name)
-    low = numbers.half_height(size.name)
-    a, b = (
-        numbers.cylindrical(radii, low, top)
-        for radii, top in (
-            (numbers.RADIUS_A, numbers.HEIGHT_A),
-            (numbers.RADIUS_B, numbers.HEIGHT_B),
-        )
-    )
+    a, b = numbers.places(numbers.half_height(size.name), airborne=True)
     own = (kind, size, *pose, paint, *coordinates(name, a=a, b=b))
     return Entity(name, own, kind="goal", shape="sphere")

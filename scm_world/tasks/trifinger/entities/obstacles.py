@@ -12,7 +12,7 @@ from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.entities.blocks import ZERO, coordinates, looks
 from scm_world.tasks.trifinger.entities.goals import goal_orientation, goal_position
 from scm_world.tasks.trifinger.hardware import ARENA_HALF_WIDTH, ARENA_HEIGHT
-from scm_world.variables import Box, Exogenous, Function, Integers, Variable
+from scm_world.variables import Box, Function, Integers, Variable
 
 QUANTITIES = {
     "size": "size",
@@ -73,15 +73,11 @@ def scattering(default: int) -> Iterable[Variable]:
     x, y = radius * np.cos(_ANGLE * index), radius * np.sin(_ANGLE * index)
     inside, top = ARENA_HALF_WIDTH - 0.005, ARENA_HEIGHT - 0.005
     space = Box((-inside, -inside, 0.005) * MOST, (inside, inside, top) * MOST)
-    yield Exogenous(
-        name=PLACES,
-        unit="m",
-        shape=(MOST, 3),
-        bounds=Box((-0.24, -0.24, 0.0) * MOST, (0.24, 0.24, 0.5) * MOST),
-        a=space,
-        b=space,
-        default=tuple(np.stack([x, y, height], axis=-1).ravel().tolist()),
-        doc="Where the centers of the obstacles are.",
+    bounds = Box((-0.24, -0.24, 0.0) * MOST, (0.24, 0.24, 0.5) * MOST)
+    yield numbers.Range(bounds, space, space, "m", (MOST, 3)).declare(
+        PLACES,
+        tuple(np.stack([x, y, height], axis=-1).ravel().tolist()),
+        "Where the centers of the obstacles are.",
     )
 
 

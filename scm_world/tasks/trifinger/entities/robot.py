@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import product
 from typing import Any, final
 
@@ -15,7 +16,6 @@ from scm_world.graph import NoiseKey
 from scm_world.tasks.composition import Commands, Entity
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.entities.blocks import state
 from scm_world.tasks.trifinger.hardware import (
     FINGERS,
     N_JOINTS,
@@ -60,16 +60,12 @@ CONTROLLER = (
 SERVO = ("position_gains", "velocity_gains")
 """Those of it that have no effect where torques are commanded."""
 
-MOVES: tuple[tuple[str, str, dict[str, Box]], ...] = (
-    (
-        "rad",
-        "Angles of the joints of {}.",
-        {"bounds": numbers.JOINT_BOUNDS, "a": numbers.JOINTS_A, "b": numbers.JOINTS_B},
-    ),
-    ("rad/s", "Angular velocities of the joints.", {"bounds": numbers.JOINT_VELOCITY_BOUNDS}),
-    ("N m", "Torques of the last physics step.", {"bounds": Box(-1.0, 1.0)}),
+MOVES = (
+    (numbers.JOINTS, "Angles of the joints of {}."),
+    (numbers.Range(Box(-50.0, 50.0), unit="rad/s"), "Angular velocities of the joints."),
+    (numbers.Range(Box(-1.0, 1.0), unit="N m"), "Torques of the last physics step."),
 )
-"""Unit, sentence and spaces of each of ``QUANTITIES``; the engine only reports the last one."""
+"""Kind and sentence of each of ``QUANTITIES``; the engine only reports the last one."""
 
 
 @njit(cache=True)
@@ -184,10 +180,10 @@ def robot(
         variables.append(numbers.color(f"{link}.color", hardware.LINK_COLORS[finger]))
     variables += [*_hidden(), *_tips(groups)]
     if len(groups) > 1:
-        for index, (name, (_, doc, spaces)) in enumerate(zip(QUANTITIES, MOVES, strict=True)):
+        for index, (name, (kind, doc)) in enumerate(zip(QUANTITIES, MOVES, strict=True)):
             parts = states[index * len(groups) : (index + 1) * len(groups)]
-            fields = {"a": None, "b": None, "doc": doc.format("all fingers"), **spaces}
-            variables.append(bundle(name, parts, **fields))
+            spaces = {"bounds": kind.bounds, "a": kind.a, "b": kind.b}
+            variables.append(bundle(name, parts, doc=doc.format("all fingers"), **spaces))
     acted_on = {
         joints.action: tuple(
             name
@@ -214,19 +210,17 @@ def robot(
 
 def _moving(quantity: int, joints: JointGroup, start: tuple[float, ...]) -> Measured:
     """Declare position, velocity or torque of some joints."""
-    unit, doc, spaces = MOVES[quantity]
+    kind, doc = MOVES[quantity]
     if quantity == 0 and not joints.shape:
         doc = "Angle of {}."
     default = start[joints.where] if quantity == 0 else (0.0,) * len(start[joints.where])
-    cut = {n: box if np.ndim(box.low) == 0 else joints.cut(box) for n, box in spaces.items()}
-    return state(
+    spaces = {"bounds": kind.bounds, "a": kind.a, "b": kind.b} if quantity == 0 else {}
+    return replace(kind, shape=joints.shape).state(
         joints.names[quantity],
-        unit,
-        cut.pop("bounds"),
         default if joints.shape else default[0],
         doc.format(joints.of),
         settable_state=quantity < 2,
-        **cut,
+        **{space: joints.cut(box) for space, box in spaces.items()},
     )
 
 

@@ -12,7 +12,7 @@ from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.cameras import CAMERAS, published_poses
 from scm_world.tasks.trifinger.hardware import PRESET_NAMES
-from scm_world.variables import Box, Derived, Exogenous, Variable
+from scm_world.variables import Box, Variable
 from scm_world.variables.reserved import PRESET, SENSOR_NOISE
 
 PARAMETERS = {
@@ -75,22 +75,20 @@ _TURN = 0.02  # [rad] how far it is turned in A, about each axis
 def light_and_cameras() -> Entity:
     """Describe where the light comes from, how bright shade is, and the three cameras."""
     light = (
-        Exogenous(
-            name="light_direction",
+        numbers.Range(
+            Box((-1.0, -1.0, 0.05), (1.0, 1.0, 1.0)),
+            Box((0.0, -1.0, 0.5), (1.0, 0.0, 1.0)),
+            Box((-1.0, 0.0, 0.5), (0.0, 1.0, 1.0)),
             shape=(3,),
-            bounds=Box((-1.0, -1.0, 0.05), (1.0, 1.0, 1.0)),
-            a=Box((0.0, -1.0, 0.5), (1.0, 0.0, 1.0)),
-            b=Box((-1.0, 0.0, 0.5), (0.0, 1.0, 1.0)),
-            default=_DEFAULT.direction,
-            doc="Direction towards the light, of any length; only pictures depend on it.",
+        ).declare(
+            "light_direction",
+            _DEFAULT.direction,
+            "Direction towards the light, of any length; only pictures depend on it.",
         ),
-        Exogenous(
-            name="light_ambient",
-            bounds=Box(0.0, 1.0),
-            a=Box(0.2, 0.4),
-            b=Box(0.4, 0.7),
-            default=_DEFAULT.ambient,
-            doc="Brightness of what the light does not reach; only pictures depend on it.",
+        numbers.Range(Box(0.0, 1.0), Box(0.2, 0.4), Box(0.4, 0.7)).declare(
+            "light_ambient",
+            _DEFAULT.ambient,
+            "Brightness of what the light does not reach; only pictures depend on it.",
         ),
     )
     cameras = (variable for camera in CAMERAS for variable in _camera(camera))
@@ -102,46 +100,34 @@ def _camera(camera: Camera) -> Iterable[Variable]:
     name = f"camera_{camera.name}"
     position, orientation = (pose.tolist() for pose in published_poses()[camera.name])
     x, y, z = position
-    yield Exogenous(
-        name=f"{name}.position",
-        unit="m",
-        shape=(3,),
-        bounds=Box(-2.0, 2.0),
-        a=Box((x - _NEAR, y - _NEAR, z - _NEAR), (x + _NEAR, y + _NEAR, z + _NEAR)),
-        b=Box((x - _NEAR, y - _NEAR, z + _NEAR), (x + _NEAR, y + _NEAR, z + _FAR)),
-        default=tuple(position),
-        doc="Where the camera stands; only pictures depend on it.",
+    a = Box((x - _NEAR, y - _NEAR, z - _NEAR), (x + _NEAR, y + _NEAR, z + _NEAR))
+    b = Box((x - _NEAR, y - _NEAR, z + _NEAR), (x + _NEAR, y + _NEAR, z + _FAR))
+    yield numbers.Range(Box(-2.0, 2.0), a, b, "m", (3,)).declare(
+        f"{name}.position",
+        tuple(position),
+        "Where the camera stands; only pictures depend on it.",
     )
-    yield Exogenous(
-        name=f"{name}.orientation",
-        shape=(4,),
-        bounds=numbers.QUATERNION_BOUNDS,
-        default=tuple(orientation),
-        doc="Quaternion (x, y, z, w) of its axes right, down and forward.",
+    yield numbers.ORIENTATIONS.declare(
+        f"{name}.orientation",
+        tuple(orientation),
+        "Quaternion (x, y, z, w) of its axes right, down and forward.",
     )
     usual = to_rotation_vector(orientation)
     low, high = usual - _TURN, usual + _TURN
-    far_low, far_high = low.copy(), high.copy()
-    far_low[2], far_high[2] = high[2], usual[2] + 3.0 * _TURN
-    yield Derived(
-        name=f"{name}.euler_orientation",
-        unit="rad",
-        shape=(3,),
-        a=Box(tuple(low.tolist()), tuple(high.tolist())),
-        b=Box(tuple(far_low.tolist()), tuple(far_high.tolist())),
-        parents=(f"{name}.orientation",),
-        mechanism=to_rotation_vector,
+    far_low, far_high = (*low[:2], high[2]), (*high[:2], usual[2] + 3.0 * _TURN)
+    a, b = Box(tuple(low), tuple(high)), Box(far_low, far_high)
+    yield numbers.Range(None, a, b, "rad", (3,)).declare(
+        f"{name}.euler_orientation",
+        None,
+        "Orientation as a rotation vector; setting it sets the quaternion.",
+        (f"{name}.orientation",),
+        to_rotation_vector,
         inverse=from_rotation_vector,
-        doc="Orientation as a rotation vector; setting it sets the quaternion.",
     )
-    yield Exogenous(
-        name=f"{name}.field_of_view",
-        unit="deg",
-        bounds=Box(5.0, 150.0),
-        a=Box(50.0, 54.0),
-        b=Box(54.0, 60.0),
-        default=camera.field_of_view,
-        doc="Vertical opening angle; only pictures depend on it.",
+    yield numbers.Range(Box(5.0, 150.0), Box(50.0, 54.0), Box(54.0, 60.0), "deg").declare(
+        f"{name}.field_of_view",
+        camera.field_of_view,
+        "Vertical opening angle; only pictures depend on it.",
     )
 
 
