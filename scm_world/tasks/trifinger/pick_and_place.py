@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, term
+from scm_world.tasks.rewards import FRACTION, weighted
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shapes, shaping
 from scm_world.tasks.trifinger.base import TriFingerTask
@@ -92,32 +92,15 @@ class PickAndPlace(TriFingerTask):
     """
 
     name = "pick_and_place"
-    default_weights = {  # noqa: RUF012 # a constant
-        "reward.tips_to_block": 750.0,
-        "reward.block_to_goal": 50.0,
-        "reward.block_to_height": 250.0,
-        "reward.orientation": 0.0,
-        "reward.smoothness": 0.005,
-        FRACTION: 0.0,
-    }
-    paper_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
-    dense_terms = (
-        TIPS_TO_BLOCK,
-        term(
-            "reward.block_to_goal",
-            kernels.horizontal_progress,
-            (BLOCK, WAS, TARGET),
-            "How much nearer the block came to the goal, seen from above [m].",
-        ),
-        term(
-            "reward.block_to_height",
-            kernels.crossing_progress,
-            (BLOCK, WAS, TARGET, f"{GOAL}.size"),
-            "How much nearer the block came to 0.15 m, or to the floor on the goal's side [m].",
-        ),
-        TURNED,
-        shaping.SMOOTHNESS,
+    default_weights, dense_terms = weighted(
+        (750.0, *TIPS_TO_BLOCK),
+        (50.0, "block_to_goal", kernels.horizontal_progress, (BLOCK, WAS, TARGET)),
+        (250.0, "block_to_height", kernels.crossing_progress, (BLOCK, WAS, TARGET, f"{GOAL}.size")),
+        (0.0, *TURNED),
+        (0.005, *shaping.SMOOTHNESS),
+        fraction=0.0,
     )
+    paper_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
     options = Alike
     obstacles = (WALL,)
     ready_terms = shaping.ONE_BLOCK

@@ -11,7 +11,7 @@ import numpy as np
 from scm_world._types import Floats, Value
 from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, term
+from scm_world.tasks.rewards import weighted
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shaping
 from scm_world.tasks.trifinger.base import TriFingerTask
@@ -72,56 +72,16 @@ class Picking(TriFingerTask):
     """
 
     name = "picking"
-    default_weights = {  # noqa: RUF012 # a constant
-        "reward.block_to_height": 250.0,
-        "reward.height_error": 0.0,
-        "reward.block_to_center": 125.0,
-        "reward.center_distance": 0.0,
-        "reward.tips_to_block": 750.0,
-        "reward.tips_distance": 0.0,
-        "reward.grasp": 0.0,
-        "reward.smoothness": 0.005,
-        FRACTION: 1.0,
-    }
-    dense_terms = (
-        term(
-            "reward.block_to_height",
-            kernels.height_progress,
-            (BLOCK, WAS, TARGET),
-            "How much nearer the block came to the height of the goal [m].",
-        ),
-        term(
-            "reward.height_error",
-            kernels.minus_height_error,
-            (BLOCK, TARGET),
-            "Minus the difference of the heights of block and goal [m].",
-        ),
-        term(
-            "reward.block_to_center",
-            kernels.centering_progress,
-            (BLOCK, WAS),
-            "How much nearer the block came to the axis of the arena [m].",
-        ),
-        term(
-            "reward.center_distance",
-            kernels.minus_eccentricity,
-            (BLOCK,),
-            "Minus the distance of the block from the axis of the arena [m].",
-        ),
-        TIPS_TO_BLOCK,
-        term(
-            "reward.tips_distance",
-            kernels.minus_tips_distance,
-            (shaping.TIPS, BLOCK),
-            "Minus the distance of the fingertips from the block [m].",
-        ),
-        term(
-            "reward.grasp",
-            kernels.minus_grasp_distance,
-            (shaping.TIPS, BLOCK, f"{TOOL}.size"),
-            "Minus how far the two nearest fingertips are from the block [m].",
-        ),
-        shaping.SMOOTHNESS,
+    default_weights, dense_terms = weighted(
+        (250.0, "block_to_height", kernels.height_progress, (BLOCK, WAS, TARGET)),
+        (0.0, "height_error", kernels.minus_height_error, (BLOCK, TARGET)),
+        (125.0, "block_to_center", kernels.centering_progress, (BLOCK, WAS)),
+        (0.0, "center_distance", kernels.minus_eccentricity, (BLOCK,)),
+        (750.0, *TIPS_TO_BLOCK),
+        (0.0, "tips_distance", kernels.minus_tips_distance, (shaping.TIPS, BLOCK)),
+        (0.0, "grasp", kernels.minus_grasp_distance, (shaping.TIPS, BLOCK, f"{TOOL}.size")),
+        (0.005, *shaping.SMOOTHNESS),
+        fraction=1.0,
     )
     options = Alike
     ready_terms = shaping.ONE_BLOCK

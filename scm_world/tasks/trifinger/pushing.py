@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Unpack, final
 
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import term
+from scm_world.tasks.rewards import weighted
 from scm_world.tasks.trifinger import kernels, shapes, shaping
 from scm_world.tasks.trifinger.base import TriFingerTask
 from scm_world.tasks.trifinger.entities.goals import goal_position, polar, turned_on_the_floor
@@ -39,23 +39,13 @@ class Pushing(TriFingerTask):
     """
 
     name = "pushing"
-    default_weights = {  # noqa: RUF012 # a constant
-        "reward.tips_to_block": 750.0,
-        "reward.block_to_goal": 250.0,
-        "reward.orientation": 100.0,
-        "fractional_success": 1.0,
-    }
-    paper_weights = {"reward.orientation": 0.0}  # noqa: RUF012 # a constant
-    dense_terms = (
-        TIPS_TO_BLOCK,
-        term(
-            "reward.block_to_goal",
-            kernels.block_progress,
-            (BLOCK, WAS, TARGET),
-            "How much nearer the block came to the goal [m].",
-        ),
-        TURNED,
+    default_weights, dense_terms = weighted(
+        (750.0, *TIPS_TO_BLOCK),
+        (250.0, "block_to_goal", kernels.block_progress, (BLOCK, WAS, TARGET)),
+        (100.0, *TURNED),
+        fraction=1.0,
     )
+    paper_weights = {"reward.orientation": 0.0}  # noqa: RUF012 # a constant
     options = Alike
     ready_terms = shaping.ONE_BLOCK
     goal_causes: tuple[str, ...] = ("goal_block.polar", "goal_block.euler_orientation")

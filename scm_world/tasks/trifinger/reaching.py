@@ -13,7 +13,7 @@ from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.geometry.scalars import fused, scalar
 from scm_world.tasks.base import Goal, Observed, checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, term
+from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, weighted
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware, kernels, shaping
 from scm_world.tasks.trifinger.base import TriFingerTask, observe, observe_position
@@ -25,8 +25,8 @@ from scm_world.tasks.trifinger.entities.obstacles import (
     scattering,
 )
 from scm_world.tasks.trifinger.kinematics import inverse
-from scm_world.tasks.trifinger.shaping import TIPS
-from scm_world.variables import Cylinder, Draw, Function, Integers, Measured, Parent, Variable
+from scm_world.tasks.trifinger.shaping import SMOOTHNESS, TIPS, WAS
+from scm_world.variables import Cylinder, Draw, Function, Integers, Measured, Variable
 from scm_world.variables.kinds import SpaceName
 
 REACHED = 0.01  # [m] mean error of a coordinate that counts as success
@@ -51,17 +51,17 @@ def within(error: Value, reached: Value) -> int:
 
 
 @njit(cache=True)
-def minus_norm(vector: Floats) -> float:
-    """Compute the negative Euclidean norm of a vector."""
+def minus_norm(torques: Floats) -> float:
+    """Compute minus the norm of the joint torques [N m]."""
     total = 0.0
-    for number in vector:
+    for number in torques:
         total = fused(number, number, total)
     return -math.sqrt(total)
 
 
 @njit(cache=True)
 def minus_distance(tips: Floats, goal_60: Floats, goal_120: Floats, goal_300: Floats) -> float:
-    """Compute the negative distance of the tips from their goals [m]."""
+    """Compute minus the distance of the tips from their goals [m]."""
     return -kernels.reach_distance(tips, goal_60, goal_120, goal_300)
 
 
@@ -78,35 +78,14 @@ class Reaching(TriFingerTask):
     """
 
     name = "reaching"
-    default_weights = {  # noqa: RUF012 # a constant
-        "reward.tips_to_goals": 100_000.0,
-        "reward.distance": 0.0,
-        "reward.torque": 0.0,
-        "reward.smoothness": 0.0,
-        FRACTION: 1.0,
-    }
-    paper_weights = {FRACTION: 0.0}  # noqa: RUF012 # a constant
-    dense_terms = (
-        term(
-            "reward.tips_to_goals",
-            kernels.reach_progress,
-            (TIPS, Parent(TIPS, 1), *PLACES),
-            "How much nearer the tips came to their goals [m].",
-        ),
-        term(
-            "reward.distance",
-            minus_distance,
-            (TIPS, *PLACES),
-            "Minus the distance of the tips from their goals [m].",
-        ),
-        term(
-            "reward.torque",
-            minus_norm,
-            ("joint_torques",),
-            "Minus the norm of the joint torques [N m].",
-        ),
-        shaping.SMOOTHNESS,
+    default_weights, dense_terms = weighted(
+        (100_000.0, "tips_to_goals", kernels.reach_progress, (TIPS, WAS, *PLACES)),
+        (0.0, "distance", minus_distance, (TIPS, *PLACES)),
+        (0.0, "torque", minus_norm, ("joint_torques",)),
+        (0.0, *SMOOTHNESS),
+        fraction=1.0,
     )
+    paper_weights = {FRACTION: 0.0}  # noqa: RUF012 # a constant
     ready_terms = shaping.REACHING
     decided_by = (COUNT,)
     goal_causes = tuple(f"{name}.cylindrical_position" for name in GOALS)

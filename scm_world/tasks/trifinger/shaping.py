@@ -99,7 +99,7 @@ def corners_progress(
     goal_position: Floats,
     goal_orientation: Floats,
 ) -> float:
-    """Compute how much the mean distance of the corners shrank [m]."""
+    """Compute how much nearer the corners of the block came to those of the goal [m]."""
     goal = goal_size, goal_position, goal_orientation
     before = corner_distance(size, position_before, orientation_before, *goal)
     return before - corner_distance(size, position, orientation, *goal)
@@ -123,7 +123,7 @@ def pushing_distance(tips: Floats, block: Floats, goal: Floats) -> float:
 def pushing_progress(
     tips: Floats, tips_before: Floats, block: Floats, block_before: Floats, goal: Floats
 ) -> float:
-    """Compute how much nearer the nearest fingertip came to behind the block [m]."""
+    """Compute how much nearer a fingertip came to where it can push the block to its goal [m]."""
     before = pushing_distance(tips_before, block_before, goal)
     return before - pushing_distance(tips, block, goal)
 
@@ -148,13 +148,14 @@ def minus_length(vector: Floats) -> float:
 
 @njit(cache=True)
 def minus_change(now: Floats, before: Floats) -> float:
-    """Compute the negative norm of a difference."""
+    """Compute minus the change of the joint velocities [rad/s]."""
     return -distance(now, before)
 
 
 _BLOCK = tuple(f"{_TOOL}.{part}" for part in _POSE)
 _WANTED = tuple(f"{_GOAL}.{part}" for part in _POSE)
 TIPS = "end_effector_positions"
+WAS = Parent(TIPS, 1)
 _REACH = (TIPS, *(f"goal_{f}.cartesian_position" for f in ("60", "120", "300")))
 
 ROBOT: tuple[Measured, ...] = (
@@ -173,12 +174,7 @@ ROBOT: tuple[Measured, ...] = (
 )
 """Terms of every task. The second one keeps fingers from pressing a block from all sides."""
 
-SMOOTHNESS = term(
-    "reward.smoothness",
-    minus_change,
-    ("joint_velocities", Parent("joint_velocities", 1)),
-    "Minus the change of the joint velocities [rad/s].",
-)
+SMOOTHNESS = "smoothness", minus_change, ("joint_velocities", Parent("joint_velocities", 1))
 """A term that most tasks have by themselves."""
 
 ONE_BLOCK: tuple[Measured, ...] = (
@@ -199,17 +195,15 @@ ONE_BLOCK: tuple[Measured, ...] = (
         "reward.corners_to_goal",
         corners_progress,
         (*_BLOCK, *(Parent(f"{_TOOL}.{part}", 1) for part in _MOVES), *_WANTED),
-        "How much nearer the corners of the block came to those of the goal [m].",
     ),
     term(
         "reward.tip_behind_block",
         pushing_progress,
         (
-            *(TIPS, Parent(TIPS, 1)),
+            *(TIPS, WAS),
             *(f"{_TOOL}.cartesian_position", Parent(f"{_TOOL}.cartesian_position", 1)),
             f"{_GOAL}.cartesian_position",
         ),
-        "How much nearer a fingertip came to where it can push the block to its goal [m].",
     ),
 )
 """Terms of tasks with one block and one goal."""

@@ -14,7 +14,7 @@ from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.hulls import Hull, extents
 from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import Common, term
+from scm_world.tasks.rewards import Common
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shapes
 from scm_world.tasks.trifinger.entities.blocks import (
@@ -27,6 +27,7 @@ from scm_world.tasks.trifinger.entities.blocks import (
 from scm_world.tasks.trifinger.entities.goals import GoalBlock, goal_orientation
 from scm_world.tasks.trifinger.shapes import Place, Quaternion
 from scm_world.tasks.trifinger.shaping import TIPS
+from scm_world.tasks.trifinger.shaping import WAS as TIPS_WAS
 from scm_world.variables import Box, Fixed, Function, Parent, Variable
 from scm_world.variables.spaces import Bound
 
@@ -208,16 +209,10 @@ class OneBlock:
 BLOCK, TARGET = f"{TOOL}.cartesian_position", f"{GOAL}.cartesian_position"
 WAS = Parent(BLOCK, 1)
 
-TIPS_TO_BLOCK = term(
-    "reward.tips_to_block",
-    kernels.tips_progress,
-    (TIPS, Parent(TIPS, 1), BLOCK, WAS),
-    "How much nearer the fingertips came to the block [m].",
-)
-TURNED = term(
-    "reward.orientation",
+TIPS_TO_BLOCK = "tips_to_block", kernels.tips_progress, (TIPS, TIPS_WAS, BLOCK, WAS)
+TURNED = (
+    "orientation",
     kernels.turn_progress,
     (f"{TOOL}.orientation", Parent(f"{TOOL}.orientation", 1), f"{GOAL}.orientation"),
-    "By how much the angle between block and goal shrank [rad].",
 )
 """Reward terms of several tasks with one block."""

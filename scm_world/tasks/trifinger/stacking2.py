@@ -12,7 +12,7 @@ from scm_world._types import Floats
 from scm_world.geometry import rotation_matrix
 from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, Common, term
+from scm_world.tasks.rewards import Common, weighted
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shapes
 from scm_world.tasks.trifinger.base import TriFingerTask
@@ -32,14 +32,15 @@ from scm_world.tasks.trifinger.entities.goals import (
     turned_on_the_floor,
 )
 from scm_world.tasks.trifinger.shapes import Place, Quaternion
-from scm_world.tasks.trifinger.shaping import SMOOTHNESS, TIPS
+from scm_world.tasks.trifinger.shaping import SMOOTHNESS, TIPS, WAS
 from scm_world.tasks.trifinger.single import SIZE
 from scm_world.variables import Affine, Function, Parent
 
 TOWER = "goal_tower"
 TOOLS = ("tool_block_1", "tool_block_2")
 GOALS = ("goal_block_1", "goal_block_2")
-FIRST, SECOND, LOWER, UPPER = (f"{name}.cartesian_position" for name in (*TOOLS, *GOALS))
+LOWER, UPPER = (f"{name}.cartesian_position" for name in GOALS)
+FIRST, SECOND = ((place, Parent(place, 1)) for place in (f"{t}.cartesian_position" for t in TOOLS))
 GAP = 0.005  # [m] at least between the blocks at the start
 
 
@@ -112,40 +113,18 @@ class Stacking2(TriFingerTask):
     """
 
     name = "stacking2"
-    default_weights = {  # noqa: RUF012 # a constant
-        "reward.tips_to_block": 750.0,
-        "reward.block_to_goal": 250.0,
-        "reward.block_to_height": 250.0,
-        "reward.block_to_block": 125.0,
-        "reward.smoothness": 0.005,
-        FRACTION: 1.0,
-    }
-    dense_terms = (
-        term(
-            "reward.tips_to_block",
+    default_weights, dense_terms = weighted(
+        (
+            750.0,
+            "tips_to_block",
             kernels.stacking_tips_progress,
-            (TIPS, Parent(TIPS, 1), FIRST, Parent(FIRST, 1), SECOND, Parent(SECOND, 1), LOWER),
-            "How much nearer the fingertips came to the block whose turn it is [m].",
+            (TIPS, WAS, *FIRST, *SECOND, LOWER),
         ),
-        term(
-            "reward.block_to_goal",
-            kernels.placing_progress,
-            (FIRST, Parent(FIRST, 1), LOWER),
-            "How much nearer the first block came to its goal [m].",
-        ),
-        term(
-            "reward.block_to_height",
-            kernels.lifting_progress,
-            (FIRST, LOWER, SECOND, Parent(SECOND, 1), UPPER),
-            "How much nearer the second block came to the height of its goal [m].",
-        ),
-        term(
-            "reward.block_to_block",
-            kernels.stacking_progress,
-            (FIRST, Parent(FIRST, 1), LOWER, SECOND, Parent(SECOND, 1), UPPER),
-            "How much nearer the second block came to the first one, seen from above [m].",
-        ),
-        SMOOTHNESS,
+        (250.0, "block_to_goal", kernels.placing_progress, (*FIRST, LOWER)),
+        (250.0, "block_to_height", kernels.lifting_progress, (FIRST[0], LOWER, *SECOND, UPPER)),
+        (125.0, "block_to_block", kernels.stacking_progress, (*FIRST, LOWER, *SECOND, UPPER)),
+        (0.005, *SMOOTHNESS),
+        fraction=1.0,
     )
     goal_causes = (f"{TOWER}.polar", f"{TOWER}.euler_orientation")
     tools, targets = TOOLS, dict(zip(GOALS, TOOLS, strict=True))  # the lower one first
