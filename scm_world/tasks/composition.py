@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Container, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, final
+from typing import Any
 
 from numba import njit
 
@@ -24,139 +24,32 @@ from scm_world.models import (
 )
 from scm_world.models.camera import Camera
 from scm_world.models.scene import TOLERANCE, Overlap
-from scm_world.variables import Box, Function, Integers, Measured, Parent, Space, Variable
-from scm_world.variables.kinds import Coupled, parent_of
+from scm_world.variables import Box, Function, Integers, Measured, Parent, Variable
 from scm_world.variables.reserved import CONTROL_INDEX
 
-Numbers = float | tuple[float, ...]
 
-
-@final
-@dataclass(frozen=True)
-class StateDeclaration:
-    """A quantity that physics moves.
-
-    Attributes:
-        name: ``"<entity>.<quantity>"``.
-        unit: SI unit.
-        shape: Of one value.
-        bounds: What is possible.
-        default: At the start of an episode.
-        doc: One sentence.
-        on_set: Parameters and states that move it when they are set.
-        start: Its value at the start, a function of ``on_set``.
-        carry: Its value after one of ``on_set`` was set: a function of the present value, of
-            ``on_set`` before and of ``on_set`` after.
-        restart: Those of ``on_set`` that, when set, put it where it would be at the start.
-        settable: False for what the engine reports only.
-        a: Space A.
-        b: Space B.
-    """
-
-    name: str
-    unit: str
-    shape: tuple[int, ...]
-    bounds: Space
-    default: Numbers
-    doc: str
-    on_set: tuple[str, ...] = ()
-    start: Function | None = None
-    carry: Function | None = None
-    restart: tuple[str, ...] = ()
-    settable: bool = True
-    a: Space | None = None
-    b: Space | None = None
-
-    def declare(self, always: tuple[Parent, ...], others: Mapping[str, Parent]) -> Measured:
-        """Write the declaration.
-
-        Args:
-            always: Causes of lag 1 that act at every control step.
-            others: Causes of lag 1 of many states, by name, as edges that hold while there is
-                contact.
-        """
-        on_set = tuple(parent_of(name, 0, "set") for name in self.on_set)
-        return self._alone.model_copy(update={"parents": Coupled(always, others, on_set)})
-
-    @cached_property
-    def _alone(self) -> Measured:
-        """The declaration without what acts by contact: bodies come and go, the rest stays."""
-        return Measured(
-            name=self.name,
-            unit=self.unit,
-            shape=self.shape,
-            bounds=self.bounds,
-            a=self.a,
-            b=self.b,
-            default=self.default,
-            doc=self.doc,
-            start=self.start,
-            carry=self.carry,
-            restart=self.restart,
-            settable_state=self.settable,
-        )
-
-
-class Entity(ABC):  # every hook has a sensible empty default
-    """Something in the world: it declares its variables and says what they mean physically.
+@dataclass(frozen=True, eq=False)
+class Entity:
+    """Something in the world: its variables, and their meaning to a backend.
 
     Attributes:
         name: Prefix of its variables.
+        variables: Its declarations. A ``Measured`` variable without a mechanism is a state: its
+            parents are those that act when something is set, and physics adds the others.
+        parameters: The variables that set a physical parameter, each with which one.
+        actions: What acts through commands, with the states that it acts on in every step.
+        kind: What it is, such as ``"goal"``, where it can be taken away; else empty.
+        hull: The shape of a block or goal that is not a box.
+        shape: The shape of a goal without a hull: ``"box"`` or ``"sphere"``.
     """
 
     name: str
-
-    @cached_property
-    def declared(self) -> tuple[tuple[Variable, ...], tuple[StateDeclaration, ...]]:
-        """Its variables and its states, which are the same in every structure that it is in."""
-        return tuple(self.variables()), tuple(self.states())
-
-    def variables(self) -> Iterable[Variable]:
-        """Declare everything but the states."""
-        return ()
-
-    def states(self) -> Iterable[StateDeclaration]:
-        """Declare what physics moves."""
-        return ()
-
-    def actions(self) -> Mapping[str, tuple[str, ...]]:
-        """Map what acts through commands to the states that it acts on in every step."""
-        return {}
-
-    def parameters(self) -> Mapping[str, ParameterKey]:
-        """Say which variable sets which physical parameter."""
-        return {}
-
-    @property
-    def is_block(self) -> bool:
-        """Whether it is a movable block."""
-        return False
-
-    @property
-    def is_obstacle(self) -> bool:
-        """Whether it is a box that nothing moves."""
-        return False
-
-    @property
-    def hull(self) -> Hull | None:
-        """The shape of a block that is no box."""
-        return None
-
-    def goal(self, values: Values) -> GoalRegion | None:
-        """Describe the goal that this entity is, if it is one."""
-        return None
-
-    def light(self, values: Values) -> Light | None:
-        """Describe the light that this entity is, if it is one."""
-        return None
-
-    def cameras(self, values: Values) -> tuple[Camera, ...]:
-        """Describe the cameras that this entity is."""
-        return ()
-
-    def commands(self) -> Commands | None:
-        """Give what turns actions into commands, if this entity does."""
-        return None
+    variables: tuple[Variable, ...]
+    parameters: Mapping[str, ParameterKey] = field(default_factory=dict)
+    actions: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    kind: str = ""
+    hull: Hull | None = None
+    shape: str = "box"
 
 
 class Commands(ABC):
@@ -288,7 +181,7 @@ class Composition:
 
     def cameras(self, values: Values) -> tuple[Camera, ...]:
         """Describe the cameras whose places are variables."""
-        return tuple(camera for entity in self.entities for camera in entity.cameras(values))
+        return ()
 
 
 @njit(cache=True)
@@ -297,43 +190,29 @@ def remaining(control_index: Value, steps: float, seconds_per_step: float) -> fl
     return max(steps - scalar(control_index), 0.0) * seconds_per_step
 
 
-@final
-class Clock(Entity):
-    """How many control steps of the episode are over.
+def clock(steps: int, seconds_per_step: float) -> tuple[Measured, Measured]:
+    """Declare how many control steps of the episode are over, and the time that is left.
 
     Args:
         steps: Length of an episode in control steps.
         seconds_per_step: Control period [s].
     """
-
-    name = "clock"
-
-    def __init__(self, steps: int, seconds_per_step: float) -> None:
-        self._steps = steps
-        self._seconds_per_step = seconds_per_step
-
-    def variables(self) -> Iterable[Variable]:
-        """Declare the counter and the time that is left."""
-        yield Measured(
-            name=CONTROL_INDEX,
-            dtype="integer",
-            bounds=Integers(0, 10**9),
-            parents=(Parent(CONTROL_INDEX, 1),),
-            settable_state=True,
-            default=0,
-            doc="Control steps since the start of the episode.",
-        )
-        yield Measured(
-            name="time_left_for_task",
-            unit="s",
-            bounds=Box(0.0, self._steps * self._seconds_per_step),
-            parents=(CONTROL_INDEX,),
-            mechanism=Function(
-                remaining,
-                constants={
-                    "steps": float(self._steps),
-                    "seconds_per_step": self._seconds_per_step,
-                },
-            ),
-            doc="Time until the episode is cut off.",
-        )
+    index = Measured(
+        name=CONTROL_INDEX,
+        dtype="integer",
+        bounds=Integers(0, 10**9),
+        parents=(Parent(CONTROL_INDEX, 1),),
+        settable_state=True,
+        default=0,
+        doc="Control steps since the start of the episode.",
+    )
+    length = {"steps": float(steps), "seconds_per_step": seconds_per_step}
+    left = Measured(
+        name="time_left_for_task",
+        unit="s",
+        bounds=Box(0.0, steps * seconds_per_step),
+        parents=(CONTROL_INDEX,),
+        mechanism=Function(remaining, constants=length),
+        doc="Time until the episode is cut off.",
+    )
+    return index, left

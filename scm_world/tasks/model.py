@@ -18,7 +18,7 @@ from scm_world.errors import UnknownOption
 from scm_world.geometry import chains
 from scm_world.models import Model, Readout, Row
 from scm_world.tasks.base import Goal, Observation, Observed, Task, Timing
-from scm_world.tasks.composition import Clock, Commands, Composition
+from scm_world.tasks.composition import Commands, Composition, clock
 from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
 from scm_world.variables import (
     Action,
@@ -106,13 +106,13 @@ class DeclaredTask(Task):
         Raises:
             UnknownOption: Something that is not a variable is to be observed.
         """
-        clock: Variable = next(iter(Clock(timing.steps, timing.control_period).variables()))
+        index, _ = clock(timing.steps, timing.control_period)
         if self.commands is not None:  # noise goes by the control step: setting that is no cause
-            clock = clock.model_copy(update={"settable_state": False, "parents": ()})
+            index = index.model_copy(update={"settable_state": False, "parents": ()})
         own = (one for one in self.outcomes if not isinstance(one, str))
         counted = {name: getattr(self, name) for name in (REWARD, SUCCESS, TERMINATED)}
         variables = [
-            *(*self.quantities(), clock, *map(_readout, self.system.readouts), *own),
+            *(*self.quantities(), index, *map(_readout, self.system.readouts), *own),
             *(declared(name, given) for name, given in counted.items() if given is not None),
         ]
         known = [variable.name for variable in variables]

@@ -169,11 +169,36 @@ def term(
     name: str,
     function: Callable[..., Any] | Function,
     parents: Iterable[str | Parent],
-    doc: str,
+    doc: str | None = None,
 ) -> Measured:
-    """Declare a reward term."""
+    """Declare a reward term.
+
+    Args:
+        name: It begins with ``reward.``.
+        function: Its mechanism.
+        parents: Its causes.
+        doc: One sentence; that of the function, without "Compute", if None.
+    """
     mechanism = function if isinstance(function, Function) else Function(function)
+    if doc is None:
+        text = (mechanism.resolve().__doc__ or "").partition("\n")[0].removeprefix("Compute ")
+        doc = text[:1].upper() + text[1:]
     return Measured(name=name, parents=tuple(parents), mechanism=mechanism, doc=doc)
+
+
+def weighted(
+    *rows: tuple[Any, ...], fraction: float
+) -> tuple[Mapping[str, float], tuple[Measured, ...]]:
+    """Return default weights, and the dense terms that they are for.
+
+    Args:
+        rows: Of each term: its default weight, its name without the prefix, and the other
+            arguments of ``term``.
+        fraction: The default weight of the fractional success.
+    """
+    weights = {f"{PREFIX}{name}": weight for weight, name, *_ in rows}
+    terms = tuple(term(f"{PREFIX}{name}", *row) for _, name, *row in rows)
+    return {**weights, FRACTION: fraction}, terms
 
 
 def reward(weights: Mapping[str, float]) -> Variable:
