@@ -90,6 +90,10 @@ class StepModel:
     vectorized: bool = False
     signature: Literal["dicts", "arrays"] = "dicts"
 
+    bodies: ClassVar[tuple[str, ...]] = ()
+    readouts: ClassVar[tuple[str, ...]] = ()
+    refused: ClassVar[tuple[str, ...]] = ()
+
     @cached_property
     def digest(self) -> str:
         """Hash of the function and the tables."""

@@ -92,7 +92,7 @@ class RobotConformance(BackendConformance):
     def test_all_but_colors_and_fixed_masses_acts(self, backend: Backend, scene: Scene) -> None:
         """Colors and the masses of fixed links have exactly no effect; all else moves something."""
         start = backend.snapshot()
-        expected, wrong = self.continued(backend, start, 40), []
+        expected, wrong = self.continued(backend, start, steps=40), []
         for key, value in self.others(scene).items():
             idle = key[1] == "color" or key[0].endswith("link_0")
             backend.restore(start)

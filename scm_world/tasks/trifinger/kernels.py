@@ -39,7 +39,7 @@ def tips_progress(tips: Floats, tips_before: Floats, block: Floats, block_before
 
 @njit(cache=True)
 def block_progress(block: Floats, block_before: Floats, goal: Floats) -> float:
-    """Compute how much nearer the block came to its goal [m]."""
+    """Compute how much nearer the block came to the goal [m]."""
     return distance(block_before, goal) - distance(block, goal)
 
 
@@ -72,7 +72,7 @@ def horizontal_distance(a: Floats, b: Floats) -> float:
 
 @njit(cache=True)
 def horizontal_progress(block: Floats, block_before: Floats, goal: Floats) -> float:
-    """Compute how much nearer the block came to its goal, seen from above [m]."""
+    """Compute how much nearer the block came to the goal, seen from above [m]."""
     return horizontal_distance(block_before, goal) - horizontal_distance(block, goal)
 
 
@@ -91,7 +91,7 @@ def minus_height_error(block: Floats, goal: Floats) -> float:
 
 @njit(cache=True)
 def height_progress(block: Floats, block_before: Floats, goal: Floats) -> float:
-    """Compute how much nearer the block came to the height of its goal [m]."""
+    """Compute how much nearer the block came to the height of the goal [m]."""
     return height_error(block_before, goal[2]) - height_error(block, goal[2])
 
 
@@ -115,7 +115,7 @@ def centering_progress(block: Floats, block_before: Floats) -> float:
 
 @njit(cache=True)
 def minus_tips_distance(tips: Floats, block: Floats) -> float:
-    """Compute minus the Frobenius norm of the three tips minus a position [m]."""
+    """Compute minus the distance of the fingertips from the block [m]."""
     return -tips_distance(tips, block)
 
 
@@ -142,10 +142,10 @@ def minus_grasp_distance(tips: Floats, block: Floats, size: Floats) -> float:
 def crossing_progress(
     block: Floats, block_before: Floats, goal: Floats, goal_size: Floats
 ) -> float:
-    """Compute how much nearer the block came to the height that it should have now [m].
+    """Compute how much nearer the block came to 0.15 m, or to the floor on the goal's side [m].
 
-    That is ``CARRIED`` while block and goal are on different sides of the wall, and half the
-    height of the goal on the same side.
+    Its height should be ``CARRIED`` while block and goal are on different sides of the wall, and
+    half the height of the goal on the same side.
     """
     same_side = np.sign(block[1]) == np.sign(goal[1])
     height = 0.5 * goal_size[2] if same_side else CARRIED
@@ -162,7 +162,7 @@ def stacking_tips_progress(
     second_before: Floats,
     goal: Floats,
 ) -> float:
-    """Compute how much nearer the tips came to the block whose turn it is [m].
+    """Compute how much nearer the fingertips came to the block whose turn it is [m].
 
     It is the first block's turn until it is at its goal.
     """
@@ -173,7 +173,10 @@ def stacking_tips_progress(
 
 @njit(cache=True)
 def placing_progress(first: Floats, first_before: Floats, goal: Floats) -> float:
-    """Compute how much nearer the first block came to its goal; 0 once it is there [m]."""
+    """Compute how much nearer the first block came to its goal [m].
+
+    It is 0 once the block is there.
+    """
     if distance(first, goal) < PLACED:
         return 0.0
     return block_progress(first, first_before, goal)
@@ -201,7 +204,7 @@ def stacking_progress(
     second_before: Floats,
     second_goal: Floats,
 ) -> float:
-    """Compute how much nearer the blocks came to one another, seen from above [m].
+    """Compute how much nearer the second block came to the first one, seen from above [m].
 
     It is 0 until the first block is placed, and until the second one is higher than its goal.
     """
