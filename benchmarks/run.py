@@ -92,10 +92,8 @@ def drawing() -> dict[str, float]:
         lambda: overlap_kernel(size, place, np.array([0.0, 0.0, 0.0, 1.0]), *box, work), 2000
     )
     tips, joints = forward(np.array(REST), 0.34) + 0.01, np.array(REST)
-    solved, reached = np.empty(9), np.empty(3, dtype=np.bool_)
-    found["inverse kinematics [µs]"] = median(
-        lambda: inverse_kernel(tips, 0.34, joints, solved, reached), 2000
-    )
+    found["inverse kinematics [µs]"] = median(lambda: inverse_kernel(tips, 0.34, joints), 2000)
+    solved, _ = inverse_kernel(tips, 0.34, joints)
     found["error of the inverse kinematics [m]"] = float(np.abs(forward(solved, 0.34) - tips).max())
     return found
 

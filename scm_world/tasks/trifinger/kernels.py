@@ -19,10 +19,7 @@ ABOVE = 0.005  # [m] how near, seen from above, two blocks of a tower must be
 @njit(cache=True)
 def distance(a: Floats, b: Floats) -> float:
     """Compute the Euclidean distance of two points of any dimension."""
-    total = 0.0
-    for i in range(a.size):
-        total += (a[i] - b[i]) ** 2
-    return math.sqrt(total)
+    return math.sqrt(((a - b) ** 2).sum())
 
 
 @njit(cache=True)
