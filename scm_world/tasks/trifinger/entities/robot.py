@@ -206,13 +206,16 @@ def _moving(quantity: int, joints: JointGroup, start: tuple[float, ...]) -> Meas
     if quantity == 0 and not joints.shape:
         doc = "Angle of {}."
     default = start[joints.where] if quantity == 0 else (0.0,) * len(start[joints.where])
-    spaces = {"bounds": kind.bounds, "a": kind.a, "b": kind.b} if quantity == 0 else {}
+    spaces: dict[str, Any] = {}
+    if quantity == 0:
+        whole = {"bounds": kind.bounds, "a": kind.a, "b": kind.b}
+        spaces = {space: joints.cut(box) for space, box in whole.items()}
     return replace(kind, shape=joints.shape).state(
         joints.names[quantity],
         default if joints.shape else default[0],
         doc.format(joints.of),
         settable_state=quantity < 2,
-        **{space: joints.cut(box) for space, box in spaces.items()},
+        **spaces,
     )
 
 
