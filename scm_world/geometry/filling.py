@@ -204,7 +204,7 @@ def overlap_kernel(
     box_kernel(size_b, position_b, orientation_b, edges[1], planes[1])
     shared = remainder_kernel(edges[0], planes[1], planes[:0])
     most = min(size_a[0] * size_a[1] * size_a[2], size_b[0] * size_b[1] * size_b[2])
-    return min(shared, most)
+    return float(min(shared, most))
 
 
 @njit(cache=True)

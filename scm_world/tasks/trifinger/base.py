@@ -321,7 +321,7 @@ class TriFingerTask(Task):
         }
         joints, height = values["joint_positions"], float(values["robot_height"])
         boxes = ([values[f"{goal}.{part}"] for part in building.POSE] for goal in self.targets)
-        if any(fingers_reach(*box, joints, height) for box in boxes):
+        if any(fingers_reach(b[0], b[1], b[2], joints, height) for b in boxes):
             found["joint_positions"] = np.array(hardware.ASIDE)
         return found
 
