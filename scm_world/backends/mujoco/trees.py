@@ -211,18 +211,32 @@ class Couplings:
         return not any(disabled(self._mj, flag) for flag in off)
 
     @cached_property
-    def dynamic(self) -> NDArray[np.bool_]:
-        """Which shapes may touch by their masks, as MuJoCo filters them, shape (ngeom, ngeom)."""
-        mj = self._mj
-        if not self._contacts_on:
-            return np.zeros((mj.ngeom, mj.ngeom), dtype=np.bool_)
-        kind, affinity, body = mj.geom_contype, mj.geom_conaffinity, mj.geom_bodyid
+    def _masked(self) -> NDArray[np.bool_]:
+        """Which geoms, and flexes after them, may touch by their masks, as MuJoCo filters them."""
+        mj, n = self._mj, self._mj.ngeom
+        kind = np.concatenate([mj.geom_contype, mj.flex_contype])
+        affinity = np.concatenate([mj.geom_conaffinity, mj.flex_conaffinity])
         one = (kind[:, None] & affinity[None, :]) != 0
-        bodies = self._may_meet[np.ix_(body, body)]
-        found: NDArray[np.bool_] = (one | one.T) & bodies
-        for first, second in zip(mj.pair_geom1, mj.pair_geom2, strict=True):
-            found[first, second] = found[second, first] = False  # the pair has its own numbers
+        found: NDArray[np.bool_] = (one | one.T) & self._contacts_on
+        found[:n, :n] &= self._may_meet[np.ix_(mj.geom_bodyid, mj.geom_bodyid)]
         return found
+
+    def _with_pairs(self, found: NDArray[np.bool_], which: bool) -> NDArray[np.bool_]:
+        """Mark the shapes that have a declared pair."""
+        for first, second in zip(self._mj.pair_geom1, self._mj.pair_geom2, strict=True):
+            found[first, second] = found[second, first] = which
+        return found
+
+    @cached_property
+    def dynamic(self) -> NDArray[np.bool_]:
+        """Which shapes may touch with numbers of their own, without a pair, (ngeom, ngeom)."""
+        n = self._mj.ngeom
+        return self._with_pairs(self._masked[:n, :n].copy(), False)
+
+    @cached_property
+    def touches(self) -> NDArray[np.bool_]:
+        """Which shapes may touch, by their masks or because a pair says so, (ngeom, ngeom)."""
+        return self._with_pairs(self.dynamic.copy(), self._contacts_on)
 
     @cached_property
     def _may_meet(self) -> NDArray[np.bool_]:
@@ -242,55 +256,28 @@ class Couplings:
         return found
 
     @cached_property
-    def touches(self) -> NDArray[np.bool_]:
-        """Which shapes may touch, by their masks or because a pair says so."""
-        found: NDArray[np.bool_] = self.dynamic.copy()
-        if self._contacts_on:
-            for first, second in zip(self._mj.pair_geom1, self._mj.pair_geom2, strict=True):
-                found[first, second] = found[second, first] = True
-        return found
+    def _meets(self) -> tuple[NDArray[np.bool_], list[Trees]]:
+        """Which geoms, and flexes after them, may touch, and the trees of each of them."""
+        found, n = self._masked.copy(), self._mj.ngeom
+        found[:n, :n] = self.touches
+        geoms = [self._moving([body]) for body in self._mj.geom_bodyid.tolist()]
+        return found, [*geoms, *(flex.trees for flex in self._links["flex"])]
 
     def _touched(self, geom: int) -> Trees:
         """Return the trees that feel a shape: its own, or those that touch it if it is static."""
-        others = self._mj.geom_bodyid[np.flatnonzero(self.touches[geom])]
-        body = int(self._mj.geom_bodyid[geom])
-        meets = self._flexes_at(geom)
-        if not (len(others) or meets):
-            return NONE
-        if self._moves[body]:
-            return frozenset({self.tree(body)})
-        return self._moving(others.tolist()) | meets
-
-    def _flexes_at(self, geom: int) -> Trees:
-        """Return the trees of the flexes that may touch a shape."""
-        mj, found = self._mj, NONE
-        for flex in range(mj.nflex if self._contacts_on else 0):
-            one = mj.geom_contype[geom] & mj.flex_conaffinity[flex]
-            if one or mj.geom_conaffinity[geom] & mj.flex_contype[flex]:
-                found |= self._links["flex"][flex].trees
-        return found
+        meets, trees = self._meets
+        others = np.flatnonzero(meets[geom]).tolist()
+        return NONE if not others else trees[geom] or NONE.union(*(trees[i] for i in others))
 
     @cached_property
     def _islands(self) -> list[Trees]:
         """For each tree, all those that a chain of contacts and couplings may link to it."""
-        mj = self._mj
-        links: list[Iterable[int]] = [link.trees for link in self._all_links()]
-        tree = np.where(self._moves, self._tree, -1)[mj.geom_bodyid]
-        for first, second in np.argwhere(np.triu(self.touches)):
-            if tree[first] >= 0 and tree[second] >= 0 and tree[first] != tree[second]:
-                links.append((int(tree[first]), int(tree[second])))
-        for flex in range(mj.nflex if self._contacts_on else 0):
-            own = self._links["flex"][flex].trees
-            links += [
-                own | {int(tree[g])}
-                for g in range(mj.ngeom)
-                if tree[g] >= 0 and self._flexes_at(g) & own
-            ]
-            for other in range(flex):
-                one = mj.flex_contype[flex] & mj.flex_conaffinity[other]
-                if one or mj.flex_contype[other] & mj.flex_conaffinity[flex]:
-                    links.append(own | self._links["flex"][other].trees)
-        return _groups(len(self.roots), links)
+        meets, trees = self._meets
+        pairs = np.argwhere(np.triu(meets)).tolist()
+        contacts = {
+            trees[one] | trees[other] for one, other in pairs if trees[one] and trees[other]
+        }
+        return _groups(len(self.roots), [*(link.trees for link in self._all_links()), *contacts])
 
     def _reached(self, trees: Iterable[int]) -> Trees:
         return frozenset().union(*{self._islands[tree] for tree in trees})
