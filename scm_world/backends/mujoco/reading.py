@@ -147,7 +147,9 @@ def read_model(
         mj, changed = realized(sealed)
     _check(mj, where)
     start = _start(mj, keyframe)
-    trees = Couplings(mj)
+    patterns = None if expose is None else [expose] if isinstance(expose, str) else list(expose)
+    medium = [p for p in patterns or () if p != "*" and fnmatch.filter(MEDIUM, p)]
+    trees = Couplings(mj, fluid=bool(medium))
     names = element_names(mj)
     elements = {row.name: row for row in _states(mj, names, trees, start, frame)}
     moving = _grouped(elements, states, [reported] if isinstance(reported, str) else [*reported])
@@ -157,13 +159,11 @@ def read_model(
         if [row.name for row in inputs] != [f"{name}.control" for name in controls]:
             first = [row.name.removesuffix(".control") for row in inputs]
             raise ModelError([f"controls={[*controls]}: the first actuators are {first}"])
-    patterns = None if expose is None else [expose] if isinstance(expose, str) else list(expose)
-    fluid = patterns is not None and any(fnmatch.filter(MEDIUM, p) for p in patterns if p != "*")
     if bindings is not None:
         rows = tuple(bindings(mj, start, trees))
         chosen = {row.name for row in rows}
     else:
-        rows = tuple(table(mj, start, trees, fluid=fluid))
+        rows = tuple(table(mj, start, trees))
         chosen = _exposed(rows, patterns)
     parameters = tuple(row for row in rows if row.name in chosen)
     wrong = reversed_ranges({row.key: row.default for row in parameters})

@@ -73,24 +73,27 @@ class Couplings:
 
     Args:
         mj: The model. It is only read.
-        fluid: Whether a medium acts, or may be made to act.
+        fluid: Whether a medium acts, or may be made to act; it acts in any case if it is dense.
 
     Attributes:
+        fluid: The same.
         roots: Number of the body at the root of each tree.
+        links: What joins trees, by kind and number.
     """
 
     def __init__(self, mj: mujoco.MjModel, fluid: bool = False) -> None:
-        self._mj, self._fluid = mj, fluid
+        self._mj = mj
+        self.fluid = fluid or mj.opt.density > 0.0 or mj.opt.viscosity > 0.0
         self._moves = np.asarray(mj.body_treeid) >= 0
         self.roots = sorted({int(root) for root in mj.body_rootid[self._moves]})
         number = {root: i for i, root in enumerate(self.roots)}
         self._tree = np.array([number.get(int(root), -1) for root in mj.body_rootid])
-        self._links: dict[str, list[Link]] = {}
+        self.links: dict[str, list[Link]] = {}
         for kind, count in (
             ("tendon", mj.ntendon), ("flex", mj.nflex), ("equality", mj.neq),
             ("actuator", mj.nactuator),
         ):  # fmt: skip
-            self._links[kind] = [getattr(self, f"_{kind}")(i) for i in range(count)]
+            self.links[kind] = [getattr(self, f"_{kind}")(i) for i in range(count)]
         self._coupled = _groups(len(self.roots), (link.trees for link in self._all_links()))
         self._known: dict[Trees, Effect] = {}
 
@@ -149,7 +152,7 @@ class Couplings:
         """Return the effect of the size or place of a shape: contact, tendons, a medium."""
         body = int(self._mj.geom_bodyid[geom])
         trees = NONE.union(*(link.trees for link in self._all_links() if geom in link.geoms))
-        if self._fluid and self._moves[body] and self._mj.geom_fluid[geom, 0] > 0.0:
+        if self.fluid and self._moves[body] and self._mj.geom_fluid[geom, 0] > 0.0:
             trees |= {self.tree(body)}
         always, contact = self.always(trees)
         return always, (contact | self._reached(self._touched(geom))) - always
@@ -169,13 +172,13 @@ class Couplings:
 
     def tendon(self, tendon: int) -> Effect:
         """Return the effect of a tendon: on what it reaches."""
-        return self.always(self._links["tendon"][tendon].trees)
+        return self.always(self.links["tendon"][tendon].trees)
 
     def equality(self, equality: int) -> Effect:
         """Return the effect of an equality constraint: on what it joins."""
         if disabled(self._mj, _OFF.mjDSBL_EQUALITY):
             return NOTHING
-        return self.always(self._links["equality"][equality].trees)
+        return self.always(self.links["equality"][equality].trees)
 
     def actuator(self, actuator: int) -> Effect:
         """Return the effect of an actuator: on what its transmission reaches."""
@@ -186,7 +189,7 @@ class Couplings:
             body = int(mj.actuator_trnid[actuator, 0])
             shapes = [g for g in range(mj.ngeom) if int(mj.geom_bodyid[g]) == body]
             return self.touching({tree for g in shapes for tree in self._touched(g)})
-        return self.always(self._links["actuator"][actuator].trees)
+        return self.always(self.links["actuator"][actuator].trees)
 
     def option(self, _: int) -> Effect:
         """Return the effect of an option of the whole model."""
@@ -261,7 +264,7 @@ class Couplings:
         found, n = self._masked.copy(), self._mj.ngeom
         found[:n, :n] = self.touches
         geoms = [self._moving([body]) for body in self._mj.geom_bodyid.tolist()]
-        return found, [*geoms, *(flex.trees for flex in self._links["flex"])]
+        return found, [*geoms, *(flex.trees for flex in self.links["flex"])]
 
     def _touched(self, geom: int) -> Trees:
         """Return the trees that feel a shape: its own, or those that touch it if it is static."""
@@ -285,7 +288,7 @@ class Couplings:
     # --- couplings -----------------------------------------------------------------------------
 
     def _all_links(self) -> Iterator[Link]:
-        return (link for links in self._links.values() for link in links)
+        return (link for links in self.links.values() for link in links)
 
     def _moving(self, bodies: Iterable[int]) -> Trees:
         """Return the trees of the bodies that can move."""
@@ -327,9 +330,9 @@ class Couplings:
             case _EQ.mjEQ_JOINT:
                 return self._link(joints=ends)
             case _EQ.mjEQ_TENDON:
-                return Link(NONE.union(*(self._links["tendon"][end].trees for end in ends)))
+                return Link(NONE.union(*(self.links["tendon"][end].trees for end in ends)))
             case _:
-                return self._links["flex"][ends[0]]
+                return self.links["flex"][ends[0]]
 
     def _actuator(self, actuator: int) -> Link:
         ends = [int(end) for end in self._mj.actuator_trnid[actuator] if end >= 0]
@@ -339,7 +342,7 @@ class Couplings:
             case _TRN.mjTRN_SO3 if len(ends) == 1:
                 return self._link(joints=ends)
             case _TRN.mjTRN_TENDON:
-                return Link(self._links["tendon"][ends[0]].trees)
+                return Link(self.links["tendon"][ends[0]].trees)
             case _TRN.mjTRN_SITE | _TRN.mjTRN_SLIDERCRANK | _TRN.mjTRN_SO3:
                 return self._link(sites=ends)
             case _:
