@@ -312,7 +312,7 @@ class InMemory(Backend, ABC):
             now = Scene(self.structure, self._parameters, self._state)
             difference = complete(now, structure, difference)
             self.structure, self._state = structure, structure.empty_state()
-            structure.carried(self._state, now)  # what is reported stays
+            self._state.carry(now.state)  # what is reported stays
             self._parameters = {}
         else:
             for key, value in difference.parameters.items():

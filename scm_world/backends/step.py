@@ -90,6 +90,10 @@ class StepModel:
     vectorized: bool = False
     signature: Literal["dicts", "arrays"] = "dicts"
 
+    bodies: ClassVar[tuple[str, ...]] = ()
+    readouts: ClassVar[tuple[str, ...]] = ()
+    refused: ClassVar[tuple[str, ...]] = ()
+
     @cached_property
     def digest(self) -> str:
         """Hash of the function and the tables."""
@@ -116,13 +120,6 @@ class StepModel:
         """Return the scene in which every parameter and every state has its default."""
         parameters = {quantity.key: quantity.value for quantity in self.parameters}
         return Scene(self, parameters, self.empty_state())
-
-    def carried(self, state: State, before: Scene) -> None:
-        """Copy the states that another structure has too, from a scene of it into a state."""
-        there = before.state.layout.slices
-        for name, where in self.layout.slices.items():
-            if name in there and there[name].stop - there[name].start == where.stop - where.start:
-                state.vector[where] = before.state.vector[there[name]]
 
     def advance(self, parameters: Floats, states: Floats, commands: Floats) -> Floats:
         """Take one step in several systems.

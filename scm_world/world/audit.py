@@ -130,10 +130,7 @@ def report(
                 followed[name] = (_typed(old, new), np.array(new))
     moments = backend.parameters(inertia)
     engine = {".".join(key): (old, moments[key]) for key, old in inertia.items()}
-    there, were = (
-        {*one.compiled.composition.blocks, *one.compiled.composition.obstacles}
-        for one in (now, before)
-    )
+    there, were = ({*one.compiled.composition.bodies} for one in (now, before))
     came, went = sorted(there - were), sorted(were - there)
     remarks: tuple[str, ...] = ()
     if change.structure is None and any(what.endswith("friction") for _, what in change.parameters):

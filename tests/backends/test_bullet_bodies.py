@@ -8,14 +8,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 import pytest
-from robot_scenes import busy_scene, named, octahedron, other_value, play
+from robot_scenes import box_hull, busy_scene, named, octahedron, other_value, play
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import Backend
 from scm_world.backends.bullet import BulletBackend
 from scm_world.backends.mujoco.reading import compiled
 from scm_world.errors import EngineFailure
-from scm_world.geometry.hulls import Hull, box_hull
+from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
 from scm_world.models import Difference, Scene
 from scm_world.models.scene import ParameterKey

@@ -15,12 +15,11 @@ import robot_scenes
 from robot_scenes import busy_scene
 
 from scm_world.backends.bullet import BulletBackend
-from scm_world.backends.mujoco.reading import body_names, compiled
+from scm_world.backends.mujoco.reading import compiled
 from scm_world.errors import EngineFailure, MissingEngine
 from scm_world.models import Difference
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import SPINNING_FRICTION
-from scm_world.tasks.trifinger.kinematics import link_frames
 from scm_world.tasks.trifinger.system import trifinger
 
 pytestmark = pytest.mark.skipif(
@@ -42,7 +41,7 @@ def backend() -> Iterator[BulletBackend]:
 def robot(backend: BulletBackend) -> tuple[Any, Any, tuple[str, ...]]:
     """Give the engine, the client that holds the last step, and the names of the bodies."""
     client = backend.base()
-    return backend._engine, client, body_names(compiled(backend.structure))
+    return backend._engine, client, backend.structure.body_names
 
 
 def test_links_are_where_kinematics_has_them(backend: BulletBackend) -> None:
@@ -51,7 +50,7 @@ def test_links_are_where_kinematics_has_them(backend: BulletBackend) -> None:
     scene.state.joint_positions[:] = np.random.default_rng(0).uniform(-1, 1, 9)
     backend.build(scene)
     engine, client, names = robot(backend)
-    positions, _ = link_frames(scene.state.joint_positions, hardware.NOMINAL_HEIGHT)
+    positions, _ = robot_scenes.link_frames(scene.state.joint_positions)
     for finger, places in zip(hardware.FINGERS, positions.reshape(3, -1, 3), strict=True):
         for link in (1, 2, 3):
             place = client._built.bodies[names.index(hardware.link_name(finger, link))]

@@ -19,7 +19,7 @@ from scm_world.backends.bullet.engine import Connection
 from scm_world.backends.bullet.honoured import realized, rebuilt, rotations
 from scm_world.backends.bullet.joints import Part, parts
 from scm_world.backends.mujoco import reading
-from scm_world.backends.mujoco.backend import realize
+from scm_world.backends.mujoco.realization import Realization
 from scm_world.backends.mujoco.trees import Couplings, disabled
 from scm_world.errors import EngineFailure
 from scm_world.models.model import Model
@@ -187,7 +187,7 @@ class Client:
         if self._model != model:
             compiled = reading.compiled(model)
             self._model, self._inside = None, None
-            self._twin, self._given = realize(model, parameters), dict(parameters)
+            self._twin, self._given = Realization(model, parameters), dict(parameters)
             self._pulled = _pulled(compiled)
             self._usual, self._spinning = usual_friction(compiled), spinning_shares(compiled)
             trees = Couplings(compiled)

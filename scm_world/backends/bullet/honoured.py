@@ -24,7 +24,6 @@ from scm_world.backends.bullet.build import (
     unit_of,
 )
 from scm_world.backends.mujoco import fields, reading
-from scm_world.backends.mujoco.realization import slots_of
 from scm_world.backends.mujoco.trees import Couplings, works
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable
 from scm_world.models.model import Model, Parameter
@@ -277,7 +276,7 @@ def changes(model: Model) -> Mapping[ParameterKey, bool]:
     """
     model = realized(model)
     mj = copy.copy(reading.compiled(model))
-    slots = slots_of(model, mj, mujoco.MjData(mj))
+    slots = model.slots(mj, mujoco.MjData(mj))
     untouched, found = _saved(mj), dict[ParameterKey, bool]()
     rows = [(name, new, which, _read(mj, name)) for name, new, which in _honoured(mj)]
     for row in model.parameters:

@@ -16,11 +16,10 @@ from scm_world.backends.base import (
     EngineBatch,
     EngineSnapshot,
 )
-from scm_world.backends.mujoco.batch import BatchSlot, MujocoBatch
+from scm_world.backends.mujoco.batch import MujocoBatch, Slot
 from scm_world.backends.mujoco.contacts import Touches
 from scm_world.backends.mujoco.realization import Realization, refuse_callbacks
-from scm_world.errors import EngineFailure, ModelError
-from scm_world.models.model import Model
+from scm_world.errors import EngineFailure
 from scm_world.models.scene import (
     Difference,
     ParameterKey,
@@ -53,19 +52,6 @@ class Payload:
     replay: tuple[Floats, int] | None = None
 
 
-def realize(structure: Any, parameters: Parameters) -> Realization:
-    """Compile a structure, and write all parameters.
-
-    Raises:
-        ModelError: It is nothing that MuJoCo can realise.
-    """
-    if not isinstance(structure, Model):
-        raise ModelError([f"MuJoCo cannot realise a {type(structure).__name__}; it takes models"])
-    fresh = Realization(structure)
-    fresh.edit(parameters)
-    return fresh
-
-
 @final
 class MujocoBackend(Backend):
     """MuJoCo, with one compiled model per structure and everything else edited in place."""
@@ -79,7 +65,7 @@ class MujocoBackend(Backend):
 
     _now: Realization
     _touches: Touches | None
-    slot: BatchSlot | None = None
+    slot: Slot | None = None
 
     def __getattr__(self, name: str) -> Any:
         if name == "_now":
@@ -196,13 +182,13 @@ class MujocoBackend(Backend):
         """The compiled model, with parameters and state of the scene when it is not in a slot."""
         return self._now
 
-    def move_to(self, slot: BatchSlot) -> bool:
+    def move_to(self, slot: Slot) -> bool:
         """Copy the state to a slot; tell whether the model has changed since the last time."""
         now = self._now
         edited = now.edited
-        if self.slot is not slot:
+        if self.slot != slot:
             self._return()
-            slot.take(now)
+            slot[0].take(slot[1], now)
             self.slot, edited = slot, True
         now.forget()
         self._touches = None
@@ -212,7 +198,8 @@ class MujocoBackend(Backend):
     def _return(self) -> None:
         """Take the state back from where it is stepped."""
         if self.slot is not None:
-            self.slot.give_back(self._now)
+            group, index = self.slot
+            group.give_back(index, self._now)
             self.slot = None
 
     def close(self) -> None:
@@ -221,10 +208,10 @@ class MujocoBackend(Backend):
             delattr(self, name)
 
     def _realized(self, structure: Any, parameters: Parameters) -> Realization:
-        """Give a structure with these parameters: the present one edited, or a new one."""
+        """Return the present realization, edited, or a new one."""
         now: Realization | None = vars(self).get("_now")
         if now is None or structure != now.structure:
-            return realize(structure, parameters)
+            return Realization(structure, parameters)
         now.edit(parameters)
         return now
 
