@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Value, Values
-from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction_kernel
+from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.tasks.base import OVERLAP, Goal
@@ -63,7 +63,7 @@ def filled(numbers: Floats, tools: float) -> float:
         for k in range(4):
             turn[i, k] = numbers[BOX * i + 6 + k]
     of = int(tools)
-    return overlap_fraction_kernel(
+    return overlap_fraction(
         size[:of], position[:of], turn[:of], size[of:], position[of:], turn[of:]
     )
 
@@ -145,7 +145,7 @@ def _fraction(
     """Compute how much of the desired boxes, or of the desired hull, is filled, shape (...)."""
     have, want = np.asarray(achieved, dtype=float), np.asarray(desired, dtype=float)
     if shape is None:
-        boxes = aabb_overlap_fraction if published else overlap_fraction_kernel
+        boxes = aabb_overlap_fraction if published else overlap_fraction
 
         def filled(mine: Floats, its: Floats) -> float:
             return float(boxes(*_split(mine), *_split(its)))
