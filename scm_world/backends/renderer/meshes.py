@@ -38,31 +38,29 @@ def _projected(mesh: Mesh, position: Floats, rotation: Floats, view: View) -> Fl
 
 
 @njit(cache=True, error_model="numpy")
-def _include(box: Floats, u: float, v: float) -> None:
-    """Extend a box (least and greatest column, least and greatest row) by a pixel."""
-    box[0], box[1] = min(box[0], u), max(box[1], u)
-    box[2], box[3] = min(box[2], v), max(box[3], v)
-
-
-@njit(cache=True, error_model="numpy")
-def _rectangle(corners: Floats, near: float, box: Floats) -> None:
-    """Bound the pixels that a triangle can cover, of what is beyond ``near``.
+def _rectangle(corners: Floats, near: float, shape: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Bound the pixels a triangle can cover: first and last column plus one, the same for rows.
 
     Args:
         corners: Homogeneous pixels, shape (3, 3).
-        near: Smallest depth that is seen.
-        box: Written, shape (4,): least and greatest column, least and greatest row.
+        near: Smallest depth that is seen. A triangle that is partly nearer can cover any pixel.
+        shape: Height and width of the picture.
     """
-    box[0] = box[2] = math.inf
-    box[1] = box[3] = -math.inf
+    height, width = shape
+    left, right, top, bottom, ahead = math.inf, -math.inf, math.inf, -math.inf, 0
     for i in range(3):
-        u, v, w = corners[i]
-        if w > near:
-            _include(box, u / w, v / w)
-        p, q, r = corners[(i + 1) % 3]
-        if (w > near) != (r > near):
-            share, w = (near - w) / (r - w), max(near, 1e-300)
-            _include(box, (u + share * (p - u)) / w, (v + share * (q - v)) / w)
+        if corners[i, 2] > near:
+            u, v = corners[i, 0] / corners[i, 2], corners[i, 1] / corners[i, 2]
+            left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+            ahead += 1
+    if ahead == 0:
+        return 0, 0, 0, 0
+    if ahead < 3:
+        return 0, width, 0, height
+    return (
+        math.ceil(max(left, 0.0)), int(min(right, width - 1.0)) + 1,
+        math.ceil(max(top, 0.0)), int(min(bottom, height - 1.0)) + 1,
+    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
@@ -123,14 +121,12 @@ def draw_mesh(
     color = (255.0 * tint[0], 255.0 * tint[1], 255.0 * tint[2])
     lamp = turned(rotation, light)
     pixels, near = _projected(mesh, shapes.positions[n], rotation, view), view.near
-    corners, edges, box = np.empty((3, 3)), np.empty((3, 3)), np.empty(4)
+    corners, edges = np.empty((3, 3)), np.empty((3, 3))
     for f in range(len(mesh.faces)):
         for i in range(3):
             for k in range(3):
                 corners[i, k] = pixels[mesh.faces[f, i], k]
-        _rectangle(corners, near, box)
-        left, right = math.ceil(max(box[0], 0.0)), int(min(box[1], depth.shape[1] - 1.0)) + 1
-        top, bottom = math.ceil(max(box[2], 0.0)), int(min(box[3], depth.shape[0] - 1.0)) + 1
+        left, right, top, bottom = _rectangle(corners, near, depth.shape)
         if left >= right or top >= bottom:
             continue
         volume = _edges(corners, edges)
