@@ -14,53 +14,12 @@ from scm_world.backends.renderer.kernels import (
     Triple,
     View,
     blend,
+    bounds,
     brightness,
+    projected,
     turned,
 )
 from scm_world.models.shapes import Mesh, Table
-
-
-@njit(cache=True, error_model="numpy")
-def _projected(mesh: Mesh, position: Floats, rotation: Floats, view: View) -> Floats:
-    """Compute the homogeneous pixels of the vertices, shape (n, 3)."""
-    p, r, o = view.projection, rotation, position
-    matrix = np.empty((3, 4))
-    for i in range(3):
-        matrix[i, 3] = p[i, 0] * o[0] + p[i, 1] * o[1] + p[i, 2] * o[2] + p[i, 3]
-        for j in range(3):
-            matrix[i, j] = p[i, 0] * r[0, j] + p[i, 1] * r[1, j] + p[i, 2] * r[2, j]
-    pixels = np.empty((len(mesh.vertices), 3))
-    for n in range(len(pixels)):
-        x, y, z = mesh.vertices[n]
-        for i in range(3):
-            pixels[n, i] = matrix[i, 0] * x + matrix[i, 1] * y + matrix[i, 2] * z + matrix[i, 3]
-    return pixels
-
-
-@njit(cache=True, error_model="numpy")
-def _rectangle(corners: Floats, near: float, shape: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Bound the pixels a triangle can cover: first and last column plus one, the same for rows.
-
-    Args:
-        corners: Homogeneous pixels, shape (3, 3).
-        near: Smallest depth that is seen. A triangle that is partly nearer can cover any pixel.
-        shape: Height and width of the picture.
-    """
-    height, width = shape
-    left, right, top, bottom, ahead = math.inf, -math.inf, math.inf, -math.inf, 0
-    for i in range(3):
-        if corners[i, 2] > near:
-            u, v = corners[i, 0] / corners[i, 2], corners[i, 1] / corners[i, 2]
-            left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
-            ahead += 1
-    if ahead == 0:
-        return 0, 0, 0, 0
-    if ahead < 3:
-        return 0, width, 0, height
-    return (
-        math.ceil(max(left, 0.0)), int(min(right, width - 1.0)) + 1,
-        math.ceil(max(top, 0.0)), int(min(bottom, height - 1.0)) + 1,
-    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
@@ -120,13 +79,13 @@ def draw_mesh(
     tint, rotation = shapes.colors[n], shapes.rotations[n]
     color = (255.0 * tint[0], 255.0 * tint[1], 255.0 * tint[2])
     lamp = turned(rotation, light)
-    pixels, near = _projected(mesh, shapes.positions[n], rotation, view), view.near
+    pixels, near = projected(mesh.vertices, shapes.positions[n], rotation, view), view.near
     corners, edges = np.empty((3, 3)), np.empty((3, 3))
     for f in range(len(mesh.faces)):
         for i in range(3):
             for k in range(3):
                 corners[i, k] = pixels[mesh.faces[f, i], k]
-        left, right, top, bottom = _rectangle(corners, near, depth.shape)
+        left, right, top, bottom = bounds(corners, near, depth.shape)
         if left >= right or top >= bottom:
             continue
         volume = _edges(corners, edges)
