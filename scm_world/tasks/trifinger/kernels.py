@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import Floats
-from scm_world.geometry.filling import overlap_kernel
+from scm_world.geometry.filling import overlap_fraction
 from scm_world.geometry.rotations import angle_between
 
 CARRIED = 0.15  # [m] how high a block should be lifted over a wall
@@ -59,9 +59,15 @@ def filled(
     goal_orientation: Floats,
 ) -> float:
     """Compute the fraction of one goal that one block fills, in [0, 1]."""
-    shared = overlap_kernel(size, position, orientation, goal_size, goal_position, goal_orientation)
-    fraction: float = shared / (goal_size[0] * goal_size[1] * goal_size[2])
-    return min(1.0, fraction)
+    fraction: float = overlap_fraction(
+        size.reshape(1, 3),
+        position.reshape(1, 3),
+        orientation.reshape(1, 4),
+        goal_size.reshape(1, 3),
+        goal_position.reshape(1, 3),
+        goal_orientation.reshape(1, 4),
+    )
+    return fraction
 
 
 @njit(cache=True)
