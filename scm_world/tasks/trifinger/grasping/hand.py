@@ -29,9 +29,6 @@ BALLS = 17
 
 NUDGE = 1e-6  # [rad] by which joints are moved to find out how points of the fingers move
 
-Solids = tuple[Floats, Floats, Floats]
-"""Half edges, centers and axes of boxes: shapes (n, 3), (n, 3) and (n, 3, 3)."""
-
 _LOW, _HIGH = np.array(hardware.JOINT_LOW), np.array(hardware.JOINT_HIGH)
 _LEG, _TIP = hardware.LEG_LENGTH, -hardware.LATERAL_OFFSET
 _SHOULDER, _KNEE = (hardware.JOINT_ORIGINS[joint][1] for joint in (1, 2))
@@ -131,9 +128,9 @@ def poses(
         tips: Shape (n, 9) [m].
         near: Joint positions to stay close to, shape (n, 9) [rad].
         height: Of the robot [m].
-        halves: Half edges of boxes that they may run into; so too what follows; see ``Solids``.
-        centers: See above.
-        turns: See above.
+        halves: Half edges of m boxes that they may run into, shape (m, 3) [m].
+        centers: Of the boxes, shape (m, 3) [m].
+        turns: Axes of the boxes as columns, shape (m, 3, 3).
 
     Returns:
         Joints, shape (n, 9) [rad]; whether all fingertips are reached, shape (n,); and the
