@@ -151,8 +151,7 @@ def group_of(system: Any) -> dict[str, str]:
     """Name the entity of every variable: what declared it, or the beginning of its name."""
     owners: dict[str, str] = {}
     for entity in system.composition.entities if isinstance(system, Simulation) else ():
-        for one in (part for parts in entity.declared for part in parts):
-            owners[one.name] = entity.name
+        owners |= {one.name: entity.name for one in entity.variables}
     roles = {"readout": "outcomes", "action": "actions"}
     found = {
         name: owners.get(name)

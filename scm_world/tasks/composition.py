@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Container, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, final
+from typing import Any
 
 from numba import njit
 
@@ -23,156 +23,49 @@ from scm_world.models import (
     Structure,
 )
 from scm_world.models.camera import Camera
-from scm_world.models.scene import Overlap
-from scm_world.variables import Box, Function, Integers, Measured, Parent, Space, Variable
-from scm_world.variables.kinds import Coupled, parent_of
+from scm_world.models.scene import TOLERANCE, Overlap
+from scm_world.variables import Box, Function, Integers, Measured, Parent, Variable
 from scm_world.variables.reserved import CONTROL_INDEX
 
-Numbers = float | tuple[float, ...]
 
-
-@final
-@dataclass(frozen=True)
-class StateDeclaration:
-    """A quantity that physics moves.
-
-    Attributes:
-        name: ``"<entity>.<quantity>"``.
-        unit: SI unit.
-        shape: Of one value.
-        bounds: What is possible.
-        default: At the start of an episode.
-        doc: One sentence.
-        on_set: Parameters and states that move it when they are set.
-        start: Its value at the start, a function of ``on_set``.
-        carry: Its value after one of ``on_set`` was set: a function of the present value, of
-            ``on_set`` before and of ``on_set`` after.
-        restart: Those of ``on_set`` that, when set, put it where it would be at the start.
-        settable: False for what the engine reports only.
-        a: Space A.
-        b: Space B.
-    """
-
-    name: str
-    unit: str
-    shape: tuple[int, ...]
-    bounds: Space
-    default: Numbers
-    doc: str
-    on_set: tuple[str, ...] = ()
-    start: Function | None = None
-    carry: Function | None = None
-    restart: tuple[str, ...] = ()
-    settable: bool = True
-    a: Space | None = None
-    b: Space | None = None
-
-    def declare(self, always: tuple[Parent, ...], others: Mapping[str, Parent]) -> Measured:
-        """Write the declaration.
-
-        Args:
-            always: Causes of lag 1 that act at every control step.
-            others: Causes of lag 1 of many states, by name, as edges that hold while there is
-                contact.
-        """
-        on_set = tuple(parent_of(name, 0, "set") for name in self.on_set)
-        return self._alone.model_copy(update={"parents": Coupled(always, others, on_set)})
-
-    @cached_property
-    def _alone(self) -> Measured:
-        """The declaration without what acts by contact: bodies come and go, the rest stays."""
-        return Measured(
-            name=self.name,
-            unit=self.unit,
-            shape=self.shape,
-            bounds=self.bounds,
-            a=self.a,
-            b=self.b,
-            default=self.default,
-            doc=self.doc,
-            start=self.start,
-            carry=self.carry,
-            restart=self.restart,
-            settable_state=self.settable,
-        )
-
-
-class Entity(ABC):  # every hook has a sensible empty default
-    """Something in the world: it declares its variables and says what they mean physically.
+@dataclass(frozen=True, eq=False)
+class Entity:
+    """Something in the world: its variables, and their meaning to a backend.
 
     Attributes:
         name: Prefix of its variables.
+        variables: Its declarations. A ``Measured`` variable without a mechanism is a state: its
+            parents are those that act when something is set, and physics adds the others.
+        parameters: The variables that set a physical parameter, each with which one.
+        actions: What acts through commands, with the states that it acts on in every step.
+        kind: What it is, such as ``"goal"``, where it can be taken away; else empty.
+        hull: The shape of a block or goal that is not a box.
+        shape: The shape of a goal without a hull: ``"box"`` or ``"sphere"``.
     """
 
     name: str
-
-    @cached_property
-    def declared(self) -> tuple[tuple[Variable, ...], tuple[StateDeclaration, ...]]:
-        """Its variables and its states, which are the same in every structure that it is in."""
-        return tuple(self.variables()), tuple(self.states())
-
-    def variables(self) -> Iterable[Variable]:
-        """Declare everything but the states."""
-        return ()
-
-    def states(self) -> Iterable[StateDeclaration]:
-        """Declare what physics moves."""
-        return ()
-
-    def actions(self) -> Mapping[str, tuple[str, ...]]:
-        """Map what acts through commands to the states that it acts on in every step."""
-        return {}
-
-    def parameters(self) -> Mapping[str, ParameterKey]:
-        """Say which variable sets which physical parameter."""
-        return {}
-
-    @property
-    def is_block(self) -> bool:
-        """Whether it is a movable block."""
-        return False
-
-    @property
-    def is_obstacle(self) -> bool:
-        """Whether it is a box that nothing moves."""
-        return False
-
-    @property
-    def hull(self) -> Hull | None:
-        """The shape of a block that is no box."""
-        return None
-
-    def goal(self, values: Values) -> GoalRegion | None:
-        """Describe the goal that this entity is, if it is one."""
-        return None
-
-    def light(self, values: Values) -> Light | None:
-        """Describe the light that this entity is, if it is one."""
-        return None
-
-    def cameras(self, values: Values) -> tuple[Camera, ...]:
-        """Describe the cameras that this entity is."""
-        return ()
-
-    def commands(self) -> Commands | None:
-        """Give what turns actions into commands, if this entity does."""
-        return None
+    variables: tuple[Variable, ...]
+    parameters: Mapping[str, ParameterKey] = field(default_factory=dict)
+    actions: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    kind: str = ""
+    hull: Hull | None = None
+    shape: str = "box"
 
 
 class Commands(ABC):
     """The conversion of an action into a command of the backend, where they differ."""
 
-    @abstractmethod
     def applies(self, values: Values) -> bool:
-        """Tell whether it is needed, given the values of everything that physics does not move."""
+        """Return whether it is needed, given the values of all that physics does not move."""
+        return True
 
     @abstractmethod
     def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
-        """Give the command of one control step.
+        """Return the command of one control step.
 
         Args:
             action: All action variables, shape (n_actions,).
-            values: Of everything that physics does not move.
+            values: Those of everything that physics does not move.
             vector: The state.
             key: Where in the noise this control step draws.
 
@@ -181,44 +74,47 @@ class Commands(ABC):
         """
 
 
-class Composition(ABC):
-    """What the variables of a world mean to a backend: where causal and physical column meet.
+class Composition:
+    """What the variables of a world mean to a backend: rows of the tables of its system.
+
+    Args:
+        system: A ``Model`` or a ``StepModel``.
+        commands: What turns an action into a command; None where they are the same.
 
     Attributes:
+        system: Its tables of parameters, states and bodies.
+        commands: As above.
         entities: In the order of the observation.
-        blocks: Names of the movable blocks.
-        obstacles: Names of the obstacles.
-        hulls: The blocks that are no boxes.
+        bodies: Names of the bodies that can come and go. Their variables begin with these names.
+        hides_goals: Whether something that never moves may make goals impossible.
         solid: Whether no episode may begin with two bodies in one place.
-        commands: What turns an action into a command; None where they are the same.
     """
 
-    entities: tuple[Entity, ...] = ()
-    blocks: tuple[str, ...] = ()
-    obstacles: tuple[str, ...] = ()
-    hulls: tuple[tuple[str, Hull], ...] = ()
-    solid: bool = False
+    system: Any
     commands: Commands | None = None
+    entities: tuple[Entity, ...] = ()
+    bodies: tuple[str, ...] = ()
+    hides_goals: bool = False
+    solid: bool = False
 
-    @abstractmethod
+    def __init__(self, system: Any, commands: Commands | None = None) -> None:
+        self.system, self.commands = system, commands
+
     def structure(self, values: Values) -> Structure:
-        """Say what the backend has to compile; equal values give the same object."""
+        """Return what the backend has to compile; equal values give the same object."""
+        found: Structure = self.system
+        return found
 
-    @abstractmethod
     def parameters(self) -> Mapping[str, ParameterKey]:
-        """Say which variable sets which physical parameter."""
+        """Map variables to the physical parameters that they set."""
+        return {row.name: row.key for row in self.system.parameters}
 
-    @abstractmethod
-    def slices(self) -> Mapping[str, slice]:
-        """Say where each state stands in the state vector."""
+    @cached_property
+    def _meant(self) -> frozenset[tuple[int, int]]:
+        """The shapes that lie in one another in the pose of the file: they are meant to."""
+        from scm_world.backends.mujoco.overlaps import touching
 
-    @abstractmethod
-    def empty_state(self) -> Any:
-        """Return a state to read into; it is the same in every structure."""
-
-    def timestep(self, values: Values) -> float:
-        """Give the physics step [s]."""
-        return float(self.structure(values).timestep)
+        return touching(self.system.default_scene(), TOLERANCE)
 
     def overlaps(
         self,
@@ -229,16 +125,23 @@ class Composition(ABC):
     ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance.
 
+        Not listed are shapes that do so in the pose of the file.
+
         Args:
             scene: With complete parameters.
             tolerance: How deep is too deep [m]; what the task allows if None.
             asked: The variables that an intervention is on.
             enough: Where some lie deeper than this in one another, those alone may be listed [m].
         """
-        return ()
+        if not self.system.bodies:
+            return ()
+        from scm_world.backends.mujoco.overlaps import overlaps
 
-    def thin(self, candidates: Any, limit: float) -> None:  # noqa: B027 # may leave all
-        """Leave out candidates of which it is seen at once that they put bodies in one place.
+        tolerance = TOLERANCE if tolerance is None else tolerance
+        return overlaps(scene, tolerance, self._meant, max(enough, tolerance))
+
+    def thin(self, candidates: Any, limit: float) -> None:
+        """Leave out candidates that obviously put bodies in one place.
 
         Args:
             candidates: Draws of an intervention, with ``parameter``, ``state`` and ``keep``.
@@ -254,12 +157,19 @@ class Composition(ABC):
         return ()
 
     def touched(self) -> Mapping[str, tuple[str, ...]]:
-        """Map each body, as contacts name it, to the states that move it; none if it is fixed."""
-        return {}
+        """Map each body, as contacts name it, to the states of its tree; none if it is fixed."""
+        states = dict[int, list[str]]()
+        for row in self.system.states if self.system.bodies else ():
+            for tree in row.trees:
+                states.setdefault(tree, []).append(row.name)
+        return {body.name: (*states.get(body.tree, ()),) for body in self.system.bodies}
 
     def shaped(self) -> Mapping[str, str]:
         """Map parameters to the body whose contacts they shape, as far as that is known."""
-        return {}
+        if not self.system.bodies:
+            return {}
+        names = self.system.body_names
+        return {row.name: names[row.body] for row in self.system.parameters if row.body >= 0}
 
     def goals(self, values: Values) -> tuple[GoalRegion, ...]:
         """Describe all goals."""
@@ -271,7 +181,7 @@ class Composition(ABC):
 
     def cameras(self, values: Values) -> tuple[Camera, ...]:
         """Describe the cameras whose places are variables."""
-        return tuple(camera for entity in self.entities for camera in entity.cameras(values))
+        return ()
 
 
 @njit(cache=True)
@@ -280,43 +190,29 @@ def remaining(control_index: Value, steps: float, seconds_per_step: float) -> fl
     return max(steps - scalar(control_index), 0.0) * seconds_per_step
 
 
-@final
-class Clock(Entity):
-    """How many control steps of the episode are over.
+def clock(steps: int, seconds_per_step: float) -> tuple[Measured, Measured]:
+    """Declare how many control steps of the episode are over, and the time that is left.
 
     Args:
         steps: Length of an episode in control steps.
         seconds_per_step: Control period [s].
     """
-
-    name = "clock"
-
-    def __init__(self, steps: int, seconds_per_step: float) -> None:
-        self._steps = steps
-        self._seconds_per_step = seconds_per_step
-
-    def variables(self) -> Iterable[Variable]:
-        """Declare the counter and the time that is left."""
-        yield Measured(
-            name=CONTROL_INDEX,
-            dtype="integer",
-            bounds=Integers(0, 10**9),
-            parents=(Parent(CONTROL_INDEX, 1),),
-            settable_state=True,
-            default=0,
-            doc="Control steps since the start of the episode.",
-        )
-        yield Measured(
-            name="time_left_for_task",
-            unit="s",
-            bounds=Box(0.0, self._steps * self._seconds_per_step),
-            parents=(CONTROL_INDEX,),
-            mechanism=Function(
-                remaining,
-                constants={
-                    "steps": float(self._steps),
-                    "seconds_per_step": self._seconds_per_step,
-                },
-            ),
-            doc="Time until the episode is cut off.",
-        )
+    index = Measured(
+        name=CONTROL_INDEX,
+        dtype="integer",
+        bounds=Integers(0, 10**9),
+        parents=(Parent(CONTROL_INDEX, 1),),
+        settable_state=True,
+        default=0,
+        doc="Control steps since the start of the episode.",
+    )
+    length = {"steps": float(steps), "seconds_per_step": seconds_per_step}
+    left = Measured(
+        name="time_left_for_task",
+        unit="s",
+        bounds=Box(0.0, steps * seconds_per_step),
+        parents=(CONTROL_INDEX,),
+        mechanism=Function(remaining, constants=length),
+        doc="Time until the episode is cut off.",
+    )
+    return index, left

@@ -22,7 +22,6 @@ from scm_world.errors import InterventionError, ModelError, UnknownOption, Unkno
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import Model, State
 from scm_world.tasks import ModelTask, Task, make_task, tasks
-from scm_world.tasks.composition import Entity
 from scm_world.variables import Exogenous, Intervention, Measured, Mechanism, Null, Variable
 from scm_world.world.compiled_task import (
     CompiledTask,
@@ -323,7 +322,7 @@ def _check_removal(base: StepBase, name: str) -> None:
         base.compiled.model.accept(name, Null())  # which says that it is a variable
     if name not in there:
         raise UnknownVariable(name, there)
-    removable = [n for n, e in there.items() if e.is_block or e.is_obstacle or _is_goal(e)]
+    removable = [n for n, entity in there.items() if entity.kind]
     if name not in removable:
         raise InterventionError(
             f"do({name}): it cannot be taken away; blocks, obstacles and goals can: "
@@ -331,8 +330,3 @@ def _check_removal(base: StepBase, name: str) -> None:
             variable=name,
             value=Null(),
         )
-
-
-def _is_goal(entity: Entity) -> bool:
-    """Tell whether an entity is a place where something should be."""
-    return type(entity).goal is not Entity.goal

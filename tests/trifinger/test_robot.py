@@ -5,13 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.entities.robot import ACTIONS, RESOLUTIONS, Robot
+from scm_world.tasks.trifinger.entities.robot import ACTIONS, RESOLUTIONS, robot
 from scm_world.tasks.trifinger.system import trifinger
-from scm_world.variables import Action, Box
+from scm_world.variables import Action, Box, Measured
 from scm_world.world import Simulation
 
 FINER = RESOLUTIONS[1:]
+
+
+def states(entity: Entity) -> dict[str, Measured]:
+    """Return what physics moves, by name."""
+    variables = (v for v in entity.variables if isinstance(v, Measured) and v.mechanism is None)
+    return {variable.name: variable for variable in variables}
 
 
 @pytest.mark.parametrize("resolution", RESOLUTIONS)
@@ -19,11 +26,11 @@ def test_the_states_fill_the_state_vector(resolution: str) -> None:
     """Every one of the 27 numbers belongs to one declared state, whose shape is that of its row."""
     rows = {row.name: row for row in trifinger(resolution=resolution).states}
     assert sum(int(np.prod(row.shape)) for row in rows.values()) == 27
-    states = tuple(Robot("joint_positions", resolution=resolution).states())
-    assert {state.name: (state.shape, state.unit) for state in states} == {
+    found = states(robot("joint_positions", resolution=resolution))
+    assert {name: (state.shape, state.unit) for name, state in found.items()} == {
         name: (row.shape, row.unit) for name, row in rows.items()
     }
-    assert {state.name for state in states if not state.settable} == {
+    assert {name for name, state in found.items() if not state.settable} == {
         name for name, row in rows.items() if row.reported
     }
 
@@ -32,10 +39,9 @@ def test_the_states_fill_the_state_vector(resolution: str) -> None:
 @pytest.mark.parametrize("resolution", FINER)
 def test_parts_share_what_the_whole_has(mode: str, resolution: str) -> None:
     """Bounds, spaces and starts of the parts are together those of the whole robot."""
-    whole = {state.name: state for state in Robot(mode).states()}
-    finer = Robot(mode, resolution=resolution)
+    whole = states(robot(mode))
     places = trifinger(resolution=resolution).layout.slices
-    parts = {state.name: state for state in finer.states()}
+    parts = states(robot(mode, resolution=resolution))
     for number, state in enumerate(whole.values()):
         mine = {n: w for n, w in places.items() if w.start // 9 == number}
         for what in ("bounds", "a", "b"):
@@ -59,8 +65,7 @@ def test_parts_share_what_the_whole_has(mode: str, resolution: str) -> None:
 @pytest.mark.parametrize("mode", ACTIONS)
 def test_the_names_of_the_whole_robot_are_bundles(mode: str) -> None:
     """Actions, what moves and the tips are put together under the names that they have."""
-    robot = Robot(mode, resolution="finger")
-    bundles = {v.name: v.parts for v in robot.variables() if v.parts}
+    bundles = {v.name: v.parts for v in robot(mode, resolution="finger").variables if v.parts}
     assert bundles == {
         "action": tuple(f"finger_{f}.action" for f in hardware.FINGERS),
         "joint_positions": tuple(f"finger_{f}.joint_positions" for f in hardware.FINGERS),
@@ -70,13 +75,13 @@ def test_the_names_of_the_whole_robot_are_bundles(mode: str) -> None:
             f"finger_{f}.end_effector_position" for f in hardware.FINGERS
         ),
     }
-    assert not [v for v in Robot(mode).variables() if v.parts]
+    assert not [v for v in robot(mode).variables if v.parts]
 
 
 def test_a_tip_is_commanded_as_a_whole() -> None:
     """Where fingertips are commanded, an action is a point, even of a robot of nine joints."""
-    robot = Robot("end_effector_positions", resolution="joint")
-    actions = [v for v in robot.variables() if isinstance(v, Action)]
+    entity = robot("end_effector_positions", resolution="joint")
+    actions = [v for v in entity.variables if isinstance(v, Action)]
     assert [action.shape for action in actions] == [(3,)] * 3
     assert isinstance(actions[0].bounds, Box)
     assert actions[0].bounds.low == (-0.5, -0.5, 0.0)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import lru_cache, partial
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from functools import cached_property, lru_cache, partial
 from typing import Any, ClassVar, Unpack
 
 import numpy as np
@@ -13,7 +13,9 @@ import numpy as np
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import UnknownOption
 from scm_world.geometry.hulls import Hull
+from scm_world.graph import SCM
 from scm_world.tasks.base import (
+    OVERLAP,
     TIME,
     Conventions,
     Goal,
@@ -24,11 +26,13 @@ from scm_world.tasks.base import (
     Timing,
     finite_numbers,
 )
-from scm_world.tasks.composition import Clock, Composition, Entity
+from scm_world.tasks.composition import Composition, Entity, clock
 from scm_world.tasks.rewards import (
     FRACTION,
+    FULFILLED,
     SUCCESS,
     TERMINATED,
+    UNIT,
     Common,
     declared,
     further_terms,
@@ -36,15 +40,16 @@ from scm_world.tasks.rewards import (
     reward,
     succeeded,
 )
-from scm_world.tasks.trifinger import building, hardware, shaping
+from scm_world.tasks.trifinger import building, hardware, kernels, shapes, shaping
 from scm_world.tasks.trifinger.conventions import CONVENTIONS, TriFingerConventions
 from scm_world.tasks.trifinger.entities.block_world import BlockWorld
-from scm_world.tasks.trifinger.entities.robot import ACTIONS, Robot
-from scm_world.tasks.trifinger.entities.stage import LightAndCameras, Stage
+from scm_world.tasks.trifinger.entities.robot import ACTIONS, robot
+from scm_world.tasks.trifinger.entities.stage import light_and_cameras, stage
+from scm_world.tasks.trifinger.feasibility import fingers_reach
 from scm_world.tasks.trifinger.hardware import PRESETS, RESOLUTIONS, TIMESTEP
 from scm_world.tasks.trifinger.scenarios import scenarios
 from scm_world.tasks.trifinger.symmetry import thirds
-from scm_world.variables import Linear, Measured, Variable
+from scm_world.variables import Function, Linear, Measured, Variable
 
 HEAD = (
     Observed(TIME),
@@ -56,38 +61,26 @@ HEAD = (
 )
 """The first rows of every observation."""
 
-_CARTESIAN = ((-0.5, -0.5, 0.0), (0.5, 0.5, 0.5))
-_SPACE = {"low": -1.0, "high": 1.0}
-_SIZE = (0.03, 0.1)
+_ROWS: Mapping[str, Any] = {
+    "size": ((0.03, 0.1), 0.0, 0.6),
+    "cartesian_position": (((-0.5, -0.5, 0.0), (0.5, 0.5, 0.5)), -1.0, 1.0),
+    "orientation": ((-10.0, 10.0), -1.0, 1.0),
+    "linear_velocity": ((-0.5, 0.5),),
+    "angular_velocity": ((-np.pi, np.pi),),
+}
+"""The published normalisation, and the bounds, of quantities of blocks and goals."""
 
 
-def _shape_and_pose(name: str, kind: int) -> Iterable[Observed]:
+def observe(name: str, kind: int, *parts: str) -> Iterable[Observed]:
+    """List the published type of a body, its size and pose, and further quantities of it."""
     yield Observed(f"{name}.type", (kind, kind), low=0.0, high=30.0)
-    yield Observed(f"{name}.size", _SIZE, low=0.0, high=0.6)
-    yield Observed(f"{name}.cartesian_position", _CARTESIAN, **_SPACE)
-    yield Observed(f"{name}.orientation", (-10.0, 10.0), **_SPACE)
+    for part in ("size", "cartesian_position", "orientation", *parts):
+        yield Observed(f"{name}.{part}", *_ROWS[part])
 
 
-def observe_tool(name: str, kind: int = 1) -> Iterable[Observed]:
-    """List the 17 numbers of a movable block."""
-    yield from _shape_and_pose(name, kind)
-    yield Observed(f"{name}.linear_velocity", (-0.5, 0.5))
-    yield Observed(f"{name}.angular_velocity", (-np.pi, np.pi))
-
-
-def observe_goal(name: str, kind: int = 20) -> Iterable[Observed]:
-    """List the 11 numbers of a goal block."""
-    return _shape_and_pose(name, kind)
-
-
-def observe_obstacle(name: str) -> Iterable[Observed]:
-    """List the 11 numbers of an obstacle."""
-    return _shape_and_pose(name, 10)
-
-
-def observe_position(name: str) -> Iterable[Observed]:
-    """List the three numbers of a goal that is a point."""
-    yield Observed(f"{name}.cartesian_position", _CARTESIAN, **_SPACE)
+def observe_position(name: str) -> Observed:
+    """Return the three numbers of a goal that is a point."""
+    return Observed(f"{name}.cartesian_position", *_ROWS["cartesian_position"])
 
 
 REWARD = "reward"
@@ -110,10 +103,12 @@ class TriFingerTask(Task):
     Attributes:
         interleaved: Whether block and goal alternate in the observation.
         block: The block and its goal, a ``OneBlock``, where there is one of each.
+        roots: The variables that ``shared`` declares by default.
         goal_causes: The variables that a new goal is drawn for.
         default_weights: Weight of every dense reward term, in order, and of
             ``fractional_success``.
         paper_weights: Weights of the published training runs, where they differ.
+        dense_terms: The terms that ``dense`` declares by default.
         ready_terms: Further reward terms, by name in the option ``terms``.
         terms: The further reward terms that were asked for.
         options: The options that every task of this kind has; ``Common``, or a subclass of it.
@@ -136,9 +131,11 @@ class TriFingerTask(Task):
 
     interleaved: ClassVar[bool] = False
     block: Any = None
+    roots: tuple[Variable, ...] = ()
     goal_causes: tuple[str, ...] = ()
     default_weights: ClassVar[Mapping[str, float]]
     paper_weights: ClassVar[Mapping[str, float]] = {}
+    dense_terms: ClassVar[tuple[Measured, ...]] = ()
     ready_terms: ClassVar[tuple[Measured, ...]] = shaping.ROBOT
     terms: tuple[Measured, ...] = ()
     options: ClassVar[type] = Common
@@ -215,17 +212,45 @@ class TriFingerTask(Task):
 
     def shared(self) -> Iterable[Variable]:
         """Declare one size, or one shape, for block and goal, where there is one of each."""
-        return () if self.block is None else self.block.shared()
+        return self.roots if self.block is None else self.block.shared()
+
+    @cached_property
+    def _first(self) -> Hashable:
+        return self.arrange(SCM(self.conventions.adapt(self.shared())).solve())
+
+    @property
+    def arranged(self) -> Any:
+        """The plan; where the task stands alone, the one that its defaults give."""
+        return self._first if self.plan is None else self.plan
 
     def dense(self) -> Iterable[Variable]:
         """Declare the dense reward terms."""
-        return ()
+        return self.dense_terms
+
+    def _fraction(self) -> Measured:
+        """Declare the fraction of the goals that is filled."""
+        published, parts = self.conventions.aligned_boxes, building.POSE
+        if self.shape is not None:
+            mechanism = Function(shapes.hull_aligned if published else shapes.hull_filled)
+            parts = ("vertices", *building.POSE[1:])
+        elif len(self.tools) == len(self.targets) == 1 and not published:
+            mechanism = Function(kernels.filled)
+        else:
+            boxes = building.aligned if published else building.filled
+            mechanism = Function(boxes, constants={"tools": float(len(self.tools))})
+        bodies = (*self.tools, *self.targets)
+        return Measured(
+            name=FRACTION,
+            bounds=None if published else UNIT,
+            parents=tuple(f"{body}.{part}" for body in bodies for part in parts),
+            mechanism=mechanism,
+            doc="Fraction of the volume of all goals that the blocks fill.",
+        )
 
     def readouts(self) -> Iterable[Variable]:
         """Declare reward terms, fractional success and success."""
         yield from self.dense()
-        published = self.conventions.aligned_boxes
-        yield building.fractional_success(self.tools, self.targets, self.shape, published=published)
+        yield self._fraction()
         yield succeeded()
         yield from self.terms
         yield reward(self.weights)
@@ -239,22 +264,39 @@ class TriFingerTask(Task):
     @property
     def goal(self) -> Goal:
         """The blocks should fill the goals."""
-        return building.goal(
-            *(self.tools, self.targets, self.goal_causes, self.shape),
-            published=self.conventions.aligned_boxes,
+        have, want = (
+            tuple(f"{name}.{part}" for name in names for part in building.POSE)
+            for names in (self.targets.values(), self.targets)
+        )
+        exact, aligned = (
+            partial(building.fraction_of, self.shape, published) for published in (False, True)
+        )
+        fraction = aligned if self.conventions.aligned_boxes else exact
+        return Goal(
+            achieved=have,
+            desired=want,
+            causes=self.goal_causes,
+            measures={
+                FRACTION: fraction,
+                SUCCESS: lambda mine, its: fraction(mine, its) > FULFILLED,
+                OVERLAP: aligned,
+            },
+            closeness=((shaping.TIPS, *have, *want), building.boxes_apart),
+            tools=self.tools,
+            targets=self.targets,
         )
 
     def observed(self) -> Iterable[Observed]:
         """List the rows of blocks, goals and obstacles."""
         goals = {tool: goal for goal, tool in self.targets.items()}
         for tool in self.tools:
-            yield from observe_tool(tool)
+            yield from observe(tool, 1, *MEASURES[2:])
             if self.interleaved and tool in goals:
-                yield from observe_goal(goals[tool])
-        for goal in () if self.interleaved else goals.values():
-            yield from observe_goal(goal)
+                yield from observe(goals.pop(tool), 20)
+        for goal in goals.values():
+            yield from observe(goal, 20)
         for obstacle in self.obstacles:
-            yield from observe_obstacle(obstacle)
+            yield from observe(obstacle, 10)
 
     @property
     def observation(self) -> Observation:
@@ -272,7 +314,16 @@ class TriFingerTask(Task):
 
     def solution(self, values: Values) -> dict[str, Value]:
         """Put each block where its goal is, and fingers that are in the way to the side."""
-        return building.solution(self.targets, values)
+        found = {
+            f"{tool}.{part}": values[f"{goal}.{part}"]
+            for goal, tool in self.targets.items()
+            for part in building.POSE[1:]
+        }
+        joints, height = values["joint_positions"], float(values["robot_height"])
+        boxes = ([values[f"{goal}.{part}"] for part in building.POSE] for goal in self.targets)
+        if any(fingers_reach(b[0], b[1], b[2], joints, height) for b in boxes):
+            found["joint_positions"] = np.array(hardware.ASIDE)
+        return found
 
     def idle(self, world: Any) -> Floats:
         """Return the command that keeps the robot at rest (position, or no torque), shape (9,)."""
@@ -291,72 +342,80 @@ class TriFingerTask(Task):
         An entity of which something cannot be computed any more goes as well, such as the places
         of a pile of which a block is missing. The reward sums up the terms that are left.
         """
-        torques = timing.action_mode == "joint_torques"
-        entities: tuple[Entity, ...] = (
-            *_always_there(timing, self.start),
-            *self.entities(),
+        others = list(self.readouts())
+        if self.success is not None:
+            own = {FRACTION: declared(FRACTION, self.success), SUCCESS: succeeded()}
+            others = [own.get(one.name, one) for one in others]
+        if self.terminated is not None:
+            others.append(declared(TERMINATED, self.terminated))
+        entities = (*_always_there(timing, self.start), *self.entities())
+        entities = tuple(entity for entity in entities if entity.name not in self.absent)
+        shared, is_settled = tuple(self.shared()), not self.absent
+        while not is_settled:
+            bodies = (*shared, *(v for entity in entities for v in entity.variables))
+            names = {variable.name for variable in (*bodies, *others)}
+            whole = tuple(e for e in entities if all(_kept(v, names) for v in e.variables))
+            kept = [one for one in (_kept(v, names) for v in others) if one is not None]
+            is_settled = (len(whole), len(kept)) == (len(entities), len(others))
+            entities, others = whole, kept
+        made = BlockWorld(
+            entities,
+            shared,
+            self.decided_by,
+            timing,
+            self.conventions,
+            self.unchecked if self.conventions.published_spaces else (),
         )
-        there = tuple(entity for entity in entities if entity.name not in self.absent)
-        while True:
-            unchecked = self.unchecked if self.conventions.published_spaces else ()
-            made = BlockWorld(
-                there,
-                tuple(self.shared()),
-                self.decided_by,
-                torques,
-                timing.resolution,
-                self.conventions,
-                unchecked,
-            )
-            readouts: Iterable[Variable] = self.readouts()
-            if self.success is not None:
-                own = {FRACTION: declared(FRACTION, self.success), SUCCESS: succeeded()}
-                readouts = [own.get(one.name, one) for one in readouts]
-            ends = () if self.terminated is None else (declared(TERMINATED, self.terminated),)
-            variables: list[Variable] = [*made.variables(), *readouts, *ends]
-            if not self.absent:
-                return made, variables
-            variables = _computable(variables)
-            names = {variable.name for variable in variables}
-            whole = tuple(e for e in there if all(v.name in names for v in e.declared[0]))
-            if len(whole) == len(there):
-                return made, variables
-            there = whole
+        return made, [*made.variables(), *others]
 
 
 @lru_cache(maxsize=32)
 def _always_there(timing: Timing, start: tuple[float, ...]) -> tuple[Entity, ...]:
     """List the entities of every goal family; none of them depends on the plan."""
     return (
-        Robot(timing.action_mode, start, timing.resolution),
-        Stage(timing.preset),
-        LightAndCameras(),
-        Clock(timing.steps, timing.control_period),
+        robot(timing.action_mode, start, timing.resolution),
+        stage(timing.preset),
+        light_and_cameras(),
+        Entity("clock", clock(timing.steps, timing.control_period)),
     )
 
 
-def _computable(variables: list[Variable]) -> list[Variable]:
-    while True:
-        names = {variable.name for variable in variables}
-        kept = [_kept(variable, names) for variable in variables]
-        left = [variable for variable in kept if variable is not None]
-        if len(left) == len(variables):
-            return left
-        variables = left
-
-
 def _kept(variable: Variable, names: set[str]) -> Variable | None:
+    """Return a variable that can be computed from others; of the reward, what is left of it."""
     parents = variable.all_parents
     there = [index for index, parent in enumerate(parents) if parent.name in names]
     if len(there) == len(parents):
         return variable
     mechanism: Any = getattr(variable, "mechanism", None)
-    if variable.name == REWARD and isinstance(variable, Measured) and isinstance(mechanism, Linear):
-        weights = tuple(mechanism.weights[index] for index in there)
-        return variable.model_copy(
-            update={
-                "parents": tuple(parents[index] for index in there),
-                "mechanism": mechanism.model_copy(update={"weights": weights}),
-            }
-        )
-    return None
+    if variable.name != REWARD or not isinstance(mechanism, Linear):
+        return None
+    weights = tuple(mechanism.weights[index] for index in there)
+    update = {
+        "parents": tuple(parents[index] for index in there),
+        "mechanism": mechanism.model_copy(update={"weights": weights}),
+    }
+    return variable.model_copy(update=update)
+
+
+class Building(TriFingerTask):
+    """A goal family whose blocks are parts of a building, as many as variables say.
+
+    Attributes:
+        piece: Says where a part comes from: a static method of whether blocks may begin in the air,
+            and of the constants of the part.
+    """
+
+    default_weights: ClassVar[Mapping[str, float]] = {FRACTION: 1.0}
+    interleaved = True
+    rest = hardware.RAISED  # the fingers begin out of the way
+    piece: ClassVar[Callable[..., building.Piece]]
+
+    def entities(self) -> Iterable[Entity]:
+        """List the blocks, and their places in the building."""
+        airborne, targets = self.conventions.published_spaces, self.targets
+        pieces = [
+            building.bodies(self.piece, name, tuple(which.items()), airborne)
+            for name, which in self.parts()
+        ]
+        yield from (tool for tool, _ in pieces)
+        yield from (goal for _, goal in pieces if goal.name in targets)

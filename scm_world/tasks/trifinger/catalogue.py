@@ -8,11 +8,20 @@ Source:
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, final
 
-from scm_world.variables import Derived, Exogenous, Function
+from scm_world._types import Floats
+from scm_world.tasks.base import checked
+from scm_world.variables import Derived, Exogenous, Function, Measured, Variable
+from scm_world.variables.kinds import parent_of
 from scm_world.variables.spaces import Affine, Bound, Box, Categories, Integers, Rotations
+
+
+def same(parent: Floats) -> Floats:
+    """Copy the value of the parent."""
+    return parent
 
 
 @final
@@ -36,54 +45,68 @@ class Range:
     shape: tuple[int, ...] = ()
     dtype: Literal["real", "integer", "categorical"] = "real"
 
-    def root(self, name: str, default: Any, doc: str) -> Exogenous:
-        """Declare an exogenous variable of this kind."""
-        return Exogenous(name=name, default=default, doc=doc, **vars(self))
+    def declare(
+        self,
+        name: str,
+        default: Any,
+        doc: str,
+        parents: tuple[str, ...] = (),
+        mechanism: Any = None,
+        **more: Any,
+    ) -> Variable:
+        """Declare a variable of this kind: a root, or a function of parents, by default a copy."""
+        fields = {"name": name, "doc": doc, **vars(self), **more}
+        if not parents:
+            return Exogenous(default=default, **fields)
+        return Derived(parents=parents, mechanism=mechanism or Function(same), **fields)
 
-    def derived(
-        self, name: str, parents: tuple[str, ...], mechanism: Function, doc: str
-    ) -> Derived:
-        """Declare a derived variable of this kind."""
-        return Derived(name=name, parents=parents, mechanism=mechanism, doc=doc, **vars(self))
+    def state(
+        self, name: str, default: Any, doc: str, on_set: Iterable[str] = (), **how: Any
+    ) -> Measured:
+        """Declare what physics moves; ``on_set`` names what moves it when it is set."""
+        parents = tuple(parent_of(cause, 0, "set") for cause in on_set)
+        fields = {"settable_state": True, "parents": parents, **vars(self), **how}
+        return Measured(name=name, default=default, doc=doc, **fields)
+
+    def option(self, name: str, value: Any, doc: str, option: str = "") -> Variable:
+        """Declare a root whose default is an option of the task, by default of the same name.
+
+        Raises:
+            UnknownOption: It is out of bounds.
+        """
+        default = checked(option or name, value, self.bounds, shape=self.shape)
+        return self.declare(name, default, doc)
 
 
-# --- what is physically possible -----------------------------------------------------------------
+# --- places and their spaces ---------------------------------------------------------------------
 POSITION_BOUNDS = Box((-0.24, -0.24, 0.0), (0.24, 0.24, 0.5))  # [m]
-POLAR_BOUNDS = Box((0.0, -math.pi), (0.24, math.pi))  # [m, rad]
 QUATERNION_BOUNDS = Rotations()
-LINEAR_VELOCITY_BOUNDS = Box(-10.0, 10.0)  # [m/s]
-ANGULAR_VELOCITY_BOUNDS = Box(-100.0, 100.0)  # [rad/s]
-JOINT_BOUNDS = Box((-1.67, -1.67, -3.24) * 3, (1.67, 1.67, 3.24) * 3)
-"""The stops at a quarter and half a turn, and 0.1 rad that a joint may press into them [rad]."""
-JOINT_VELOCITY_BOUNDS = Box(-50.0, 50.0)  # [rad/s]
-TYPE_BOUNDS = Categories((1, 2, 10, 20, 21, 23))
-
-# --- training space A and held-out space B ---------------------------------
-JOINTS_A = Box((-1.57, -1.2, -3.0) * 3, (-0.69, 0.0, 0.0) * 3)
-JOINTS_B = Box((-0.69, 0.0, 0.0) * 3, (1.0, 1.57, 3.0) * 3)
-YAW = Box((0.0, 0.0, -math.pi), (0.0, 0.0, math.pi))  # a rotation about z, as a rotation vector
-
 RADIUS_A = (0.0, 0.11)  # [m]
 RADIUS_B = (0.11, 0.15)  # [m]
 HEIGHT_A = 0.15  # [m] highest center of an object
 HEIGHT_B = 0.3  # [m]
-
-POLAR_A = Box((RADIUS_A[0], -math.pi), (RADIUS_A[1], math.pi))
-POLAR_B = Box((RADIUS_B[0], -math.pi), (RADIUS_B[1], math.pi))
+_YAW = Box((0.0, 0.0, -math.pi), (0.0, 0.0, math.pi))  # a rotation about z, as a rotation vector
 
 
 def half_height(size: str) -> Affine:
-    """Give the height of the center of an object that stands on the floor.
-
-    Args:
-        size: Name of the variable that holds its edge lengths.
-    """
+    """Return the height of the center of an object on the floor; ``size`` holds its edges."""
     return Affine(parent=size, index=2, scale=0.5)
 
 
 def cylindrical(radii: tuple[float, float], low: Bound, high: Bound) -> Box:
-    """Give the space of cylindrical positions between two radii and two heights [m, rad, m]."""
+    """Return the space of cylindrical positions between two radii and two heights [m, rad, m]."""
     return Box((radii[0], -math.pi, low), (radii[1], math.pi, high))
+
+
+def places(low: Bound, *, airborne: bool) -> tuple[Box, Box]:
+    """Return the spaces A and B of the cylindrical position of a body.
+
+    Args:
+        low: Height of its center on the floor [m].
+        airborne: Whether it may be in the air.
+    """
+    tops = (HEIGHT_A, HEIGHT_B) if airborne else (low, low)
+    return cylindrical(RADIUS_A, low, tops[0]), cylindrical(RADIUS_B, low, tops[1])
 
 
 # --- goal families whose blocks follow from a few numbers -----------------------------------------
@@ -139,8 +162,26 @@ SIDES = Range(_SIDE, _SIDE, _SIDE, dtype="categorical")
 STACK_LEVELS = Range(Integers(1, 10), Integers(1, 5), Integers(6, 8), dtype="integer")
 CREATIVE_LEVELS = Range(Integers(1, 10), Integers(3, 5), Integers(6, 8), dtype="integer")
 
+POLAR = Range(
+    Box((0.0, -math.pi), (0.24, math.pi)),
+    Box((RADIUS_A[0], -math.pi), (RADIUS_A[1], math.pi)),
+    Box((RADIUS_B[0], -math.pi), (RADIUS_B[1], math.pi)),
+    "m, rad",
+    (2,),
+)
 POSITIONS = Range(POSITION_BOUNDS, unit="m", shape=(3,))
 ORIENTATIONS = Range(QUATERNION_BOUNDS, shape=(4,))
+YAWS, TURNS = Range(None, _YAW, _YAW, "rad", (3,)), Range(None, unit="rad", shape=(3,))
+"""Rotation vectors with the turns about z as their spaces, and without spaces."""
+LINEAR_VELOCITIES = Range(Box(-10.0, 10.0), unit="m/s", shape=(3,))
+ANGULAR_VELOCITIES = Range(Box(-100.0, 100.0), unit="rad/s", shape=(3,))
+JOINTS = Range(
+    Box((-1.67, -1.67, -3.24) * 3, (1.67, 1.67, 3.24) * 3),
+    Box((-1.57, -1.2, -3.0) * 3, (-0.69, 0.0, 0.0) * 3),
+    Box((-0.69, 0.0, 0.0) * 3, (1.0, 1.57, 3.0) * 3),
+    "rad",
+)
+"""The stops at a quarter and half a turn, and 0.1 rad that a joint may press into them."""
 PART_SIZES = Range(Box(0.005, 0.3), unit="m", shape=(3,))
 """Edges of a block that is a part of something."""
 OBSTACLE_SIZES = Range(Box(0.005, 0.6), unit="m", shape=(3,))
@@ -159,3 +200,9 @@ OBSTACLE_SIZE = (0.01, 0.01, 0.01)  # [m]
 FINGER_FRICTION = 0.5
 SPINNING_FRICTION = 0.001
 IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion (x, y, z, w)
+
+
+def color(name: str, default: tuple[float, float, float]) -> Variable:
+    """Declare a color. Space A is dark and B is bright, as in the paper."""
+    doc = "Red, green and blue; nothing physical depends on it."
+    return COLOR.declare(name, default, doc)

@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import Floats
-from scm_world.geometry.overlap import WORKSPACE, overlap_kernel
-from scm_world.geometry.rotations import angle_between_kernel
+from scm_world.geometry.filling import overlap_kernel
+from scm_world.geometry.rotations import angle_between
 
 CARRIED = 0.15  # [m] how high a block should be lifted over a wall
 PLACED = 0.02  # [m] how near the first block of a tower must be to its goal
@@ -41,14 +41,14 @@ def tips_progress(tips: Floats, tips_before: Floats, block: Floats, block_before
 
 @njit(cache=True)
 def block_progress(block: Floats, block_before: Floats, goal: Floats) -> float:
-    """Compute how much nearer the block came to its goal [m]."""
+    """Compute how much nearer the block came to the goal [m]."""
     return distance(block_before, goal) - distance(block, goal)
 
 
 @njit(cache=True)
 def turn_progress(orientation: Floats, orientation_before: Floats, goal: Floats) -> float:
     """Compute by how much the angle between block and goal shrank [rad]."""
-    return angle_between_kernel(orientation_before, goal) - angle_between_kernel(orientation, goal)
+    return angle_between(orientation_before, goal) - angle_between(orientation, goal)
 
 
 @njit(cache=True)
@@ -61,10 +61,7 @@ def filled(
     goal_orientation: Floats,
 ) -> float:
     """Compute the fraction of one goal that one block fills, in [0, 1]."""
-    work = np.empty(WORKSPACE)
-    shared = overlap_kernel(
-        size, position, orientation, goal_size, goal_position, goal_orientation, work
-    )
+    shared = overlap_kernel(size, position, orientation, goal_size, goal_position, goal_orientation)
     fraction: float = shared / (goal_size[0] * goal_size[1] * goal_size[2])
     return min(1.0, fraction)
 
@@ -77,7 +74,7 @@ def horizontal_distance(a: Floats, b: Floats) -> float:
 
 @njit(cache=True)
 def horizontal_progress(block: Floats, block_before: Floats, goal: Floats) -> float:
-    """Compute how much nearer the block came to its goal, seen from above [m]."""
+    """Compute how much nearer the block came to the goal, seen from above [m]."""
     return horizontal_distance(block_before, goal) - horizontal_distance(block, goal)
 
 
@@ -96,7 +93,7 @@ def minus_height_error(block: Floats, goal: Floats) -> float:
 
 @njit(cache=True)
 def height_progress(block: Floats, block_before: Floats, goal: Floats) -> float:
-    """Compute how much nearer the block came to the height of its goal [m]."""
+    """Compute how much nearer the block came to the height of the goal [m]."""
     return height_error(block_before, goal[2]) - height_error(block, goal[2])
 
 
@@ -114,7 +111,7 @@ def centering_progress(block: Floats, block_before: Floats) -> float:
 
 @njit(cache=True)
 def minus_tips_distance(tips: Floats, block: Floats) -> float:
-    """Compute minus the Frobenius norm of the three tips minus a position [m]."""
+    """Compute minus the distance of the fingertips from the block [m]."""
     return -tips_distance(tips, block)
 
 
@@ -141,10 +138,10 @@ def minus_grasp_distance(tips: Floats, block: Floats, size: Floats) -> float:
 def crossing_progress(
     block: Floats, block_before: Floats, goal: Floats, goal_size: Floats
 ) -> float:
-    """Compute how much nearer the block came to the height that it should have now [m].
+    """Compute how much nearer the block came to 0.15 m, or to the floor on the goal's side [m].
 
-    That is ``CARRIED`` while block and goal are on different sides of the wall, and half the
-    height of the goal on the same side.
+    Its height should be ``CARRIED`` while block and goal are on different sides of the wall, and
+    half the height of the goal on the same side.
     """
     same_side = np.sign(block[1]) == np.sign(goal[1])
     height = 0.5 * goal_size[2] if same_side else CARRIED
@@ -161,7 +158,7 @@ def stacking_tips_progress(
     second_before: Floats,
     goal: Floats,
 ) -> float:
-    """Compute how much nearer the tips came to the block whose turn it is [m].
+    """Compute how much nearer the fingertips came to the block whose turn it is [m].
 
     It is the first block's turn until it is at its goal.
     """
@@ -172,7 +169,10 @@ def stacking_tips_progress(
 
 @njit(cache=True)
 def placing_progress(first: Floats, first_before: Floats, goal: Floats) -> float:
-    """Compute how much nearer the first block came to its goal; 0 once it is there [m]."""
+    """Compute how much nearer the first block came to its goal [m].
+
+    It is 0 once the block is there.
+    """
     if distance(first, goal) < PLACED:
         return 0.0
     return block_progress(first, first_before, goal)
@@ -200,7 +200,7 @@ def stacking_progress(
     second_before: Floats,
     second_goal: Floats,
 ) -> float:
-    """Compute how much nearer the blocks came to one another, seen from above [m].
+    """Compute how much nearer the second block came to the first one, seen from above [m].
 
     It is 0 until the first block is placed, and until the second one is higher than its goal.
     """

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from scm_world._types import Floats, Value
-from scm_world.tasks.trifinger.entities.block_world import lowest_point
+from scm_world.tasks.trifinger.entities.blocks import lowest_point
 from scm_world.tasks.trifinger.hardware import ARENA_HALF_WIDTH, ARENA_HEIGHT
 
 MAX_LEVELS = 10
@@ -111,24 +111,13 @@ def _halves(piece: Piece, size: float, below: tuple[float, float]) -> Iterator[P
 
 
 def counts(found: Floats) -> tuple[int, ...]:
-    """Count the blocks of every level that has some.
-
-    Args:
-        found: A layout, shape (MAX_LEVELS, MAX_PER_LEVEL, 3) [m].
-    """
+    """Count the blocks of every level of a layout that has some."""
     per_level = (found[..., 2] > 0.0).sum(axis=-1)
     return tuple(int(count) for count in per_level if count)
 
 
 def brick_size(found: Floats, least: Value, *, level: float, num: float) -> Floats:
-    """Compute the edge lengths of a block, shape (..., 3) [m].
-
-    Args:
-        found: The layout, shape (..., MAX_LEVELS, MAX_PER_LEVEL, 3) [m].
-        least: Depth and height of every block, shape (...) [m].
-        level: In which level it is.
-        num: Which of it.
-    """
+    """Compute the edge lengths of a block, shape (..., 3) [m], from its level and place in it."""
     width = found[..., int(level), int(num), 2]
     return np.stack(np.broadcast_arrays(width, least, least), axis=-1)
 
@@ -143,15 +132,9 @@ def brick_place(found: Floats, least: Value, *, level: float, num: float) -> Flo
 def _spread(
     widths: tuple[tuple[float, ...], ...], size: float, y: float
 ) -> dict[tuple[int, int], tuple[float, float, int]]:
-    """Put blocks in rows on the floor, beside the wall, and in layers where it is full.
+    """Put blocks in rows on the floor, beside the wall at ``y``, and in layers where it is full.
 
-    Args:
-        widths: Of the blocks, level by level [m].
-        size: Their depth [m].
-        y: Of the wall [m].
-
-    Returns:
-        x, y and the layer, by level and place in it.
+    ``size`` is their depth [m]. Return x, y and the layer, by level and place in it.
     """
     first, step = min(DEPTH, EDGE - size / 2.0), size + GAP
     every = np.arange(-first, first + 1e-9, step).tolist()
@@ -178,25 +161,13 @@ def start(
     num: float,
     airborne: float,
 ) -> Floats:
-    """Compute where a block begins.
+    """Compute where a block begins: its center, shape (3,) [m].
 
     The blocks of a regular wall stand in front of it and behind it, by turns of its levels, in
-    two walls half as high. Those of a random one lie in rows on the floor
-    beside it.
+    two walls half as high. Those of a random one lie in rows on the floor beside it.
 
-    Args:
-        size: Edge lengths, shape (3,) [m].
-        orientation: Quaternion (x, y, z, w).
-        found: The layout, shape (MAX_LEVELS, MAX_PER_LEVEL, 3) [m].
-        least: Depth and height of every block [m].
-        pattern: 0 for the regular wall.
-        level: In which level of the wall it is.
-        num: Which of it.
-        airborne: 1 to begin at the height that it has in the wall, as in the predecessor, whose
-            blocks fall at first.
-
-    Returns:
-        The center, shape (3,) [m].
+    ``airborne`` is 1 to begin at the height that it has in the wall, as in the predecessor, whose
+    blocks fall at first.
     """
     floor, i, j = lowest_point(size, orientation), int(level), int(num)
     if int(pattern) == 0:

@@ -4,30 +4,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Unpack, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, term
+from scm_world.tasks.rewards import FRACTION, weighted
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shapes, shaping
 from scm_world.tasks.trifinger.base import TriFingerTask
-from scm_world.tasks.trifinger.conventions import TriFingerConventions
+from scm_world.tasks.trifinger.entities.blocks import stand
 from scm_world.tasks.trifinger.entities.goals import goal_position, polar, turned_on_the_floor
-from scm_world.tasks.trifinger.entities.obstacles import Obstacle, obstacle_size, wall_on_the_floor
+from scm_world.tasks.trifinger.entities.obstacles import obstacle
 from scm_world.tasks.trifinger.shapes import Place
 from scm_world.tasks.trifinger.single import (
+    BLOCK,
     GOAL,
+    TARGET,
+    TIPS_TO_BLOCK,
     TOOL,
+    TURNED,
+    WAS,
     Alike,
     OneBlock,
-    smoothness,
-    tips_to_block,
-    turned,
 )
-from scm_world.variables import Box, Function, Parent, Switch, Variable
+from scm_world.variables import Box, Function, Switch, Variable
 
 WALL = "obstacle"
 SIDE = "wall_side"
@@ -41,12 +44,7 @@ ANGLES = (math.pi / 6, 5 * math.pi / 6)  # [rad] on the side where y > 0
 
 
 def mirrored(polar_position: Floats, side: Value) -> Floats:
-    """Reflect a radius and an angle at the wall where the sides are exchanged, shape (..., 2).
-
-    Args:
-        polar_position: Radius [m] and angle [rad], shape (..., 2).
-        side: 0 or 1, shape (...).
-    """
+    """Reflect a radius [m] and an angle [rad] at the wall where the side is 1, shape (..., 2)."""
     sign = 1.0 - 2.0 * np.asarray(side)
     return polar_position * np.stack([np.ones_like(sign), sign], axis=-1)
 
@@ -66,15 +64,16 @@ def hull_across(
 def stand_across(size: Floats, orientation: Floats, *causes: Value, place: Floats) -> Floats:
     """Stand a body on its side of the wall, shape (3,) [m].
 
-    Args:
-        size: Edge lengths of a box, shape (3,) [m].
-        orientation: Quaternion (x, y, z, w).
-        causes: Corners of a hull, shape (n, 3) [m], if it is one; the side, 0 or 1.
-        place: Where it stands on side 0: x, y and the height of its lowest point, shape (3,) [m].
+    The last of ``causes`` is the side; ``place`` is where it stands on side 0, see ``stand``.
     """
     *corners, side = causes
     sign = 1.0 - 2.0 * float(side)
-    return shapes.stand(size, orientation, *corners, place=place * [1.0, sign, 1.0])
+    return stand(size, orientation, *corners, place=place * [1.0, sign, 1.0])
+
+
+def wall_on_the_floor(size: Floats) -> Floats:
+    """Put a box on the floor in the middle of the arena: its center, shape (..., 3) [m]."""
+    return np.asarray(size * [0.0, 0.0, 0.5])
 
 
 @final
@@ -85,15 +84,6 @@ class PickAndPlace(TriFingerTask):
     on decides where the goal is, so that the wall is always between them; the wall stands on the
     floor however high it is.
 
-    Reward terms:
-        reward.tips_to_block: How much nearer the three fingertips came to the block [m].
-        reward.block_to_goal: How much nearer the block came to the goal, seen from above [m].
-        reward.block_to_height: How much nearer it came to 0.15 m, or to the floor on the side of
-            the goal [m].
-        reward.orientation: By how much the angle between block and goal shrank [rad].
-        reward.smoothness: Minus the change of the joint velocities [rad/s].
-        fractional_success: How much of the goal the block fills.
-
     Args:
         tool_block_position: Where the center of the block begins while ``wall_side`` is 0: x and
             y if it stands on the floor, or x, y and z [m].
@@ -102,14 +92,14 @@ class PickAndPlace(TriFingerTask):
     """
 
     name = "pick_and_place"
-    default_weights = {  # noqa: RUF012 # a constant
-        "reward.tips_to_block": 750.0,
-        "reward.block_to_goal": 50.0,
-        "reward.block_to_height": 250.0,
-        "reward.orientation": 0.0,
-        "reward.smoothness": 0.005,
-        FRACTION: 0.0,
-    }
+    default_weights, dense_terms = weighted(
+        (750.0, *TIPS_TO_BLOCK),
+        (50.0, "block_to_goal", kernels.horizontal_progress, (BLOCK, WAS, TARGET)),
+        (250.0, "block_to_height", kernels.crossing_progress, (BLOCK, WAS, TARGET, f"{GOAL}.size")),
+        (0.0, *TURNED),
+        (0.005, *shaping.SMOOTHNESS),
+        fraction=0.0,
+    )
     paper_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
     options = Alike
     obstacles = (WALL,)
@@ -137,7 +127,7 @@ class PickAndPlace(TriFingerTask):
         )
         a, b = (Box((near, ANGLES[0]), (far, ANGLES[1])) for near, far in (RADIUS_A, RADIUS_B))
         yield self.block.goal(
-            polar(GOAL, self._polar, a=a, b=b),
+            polar(GOAL, self._polar, (a, b)),
             goal_position(
                 GOAL,
                 parents=(SIDE, f"{GOAL}.polar", *self.block.form(GOAL)),
@@ -145,16 +135,22 @@ class PickAndPlace(TriFingerTask):
             ),
             spaces=self._sector(GOAL, sign=1.0),
         )
-        size = obstacle_size(f"{WALL}.size", WALL_SIZE, a=WALL_A, b=WALL_B)
-        yield Obstacle(WALL, size=size, position=_wall_position(self.conventions))
+        sizes = replace(numbers.OBSTACLE_SIZES, a=WALL_A, b=WALL_B)
+        size = sizes.declare(f"{WALL}.size", WALL_SIZE, "Full edge lengths.")
+        center = (0.0, 0.0, WALL_SIZE[2] / 2.0)
+        position = goal_position(WALL, default=center)  # in the predecessor it keeps its center
+        if not self.conventions.published_spaces:
+            position = numbers.POSITIONS.declare(
+                f"{WALL}.cartesian_position",
+                None,
+                "Position of the center; it stands on the floor in the middle.",
+                (size.name,),
+                Function(wall_on_the_floor),
+            )
+        yield obstacle(WALL, size=size, position=position)
 
     def _sector(self, name: str, *, sign: float) -> tuple[Box, Box]:
-        """Give the cylindrical positions on one side of the wall.
-
-        Args:
-            name: Of block or goal.
-            sign: Of y while the side is 0.
-        """
+        """Return the cylindrical positions on one side of the wall; ``sign`` of y on side 0."""
         height = self.block.level(name)
         near, far = ANGLES if sign > 0.0 else (-ANGLES[1], -ANGLES[0])
         low = Switch(parent=SIDE, below=near, above=-far)
@@ -168,37 +164,8 @@ class PickAndPlace(TriFingerTask):
     def shared(self) -> Iterable[Variable]:
         """One size for both, and on which side of the wall they are."""
         yield from self.block.shared()
-        yield numbers.SIDES.root(
+        yield numbers.SIDES.declare(
             SIDE,
             0,
             "Where the block begins: 0 is at negative y, 1 at positive y; the goal is across.",
         )
-
-    def dense(self) -> Iterable[Variable]:
-        """Declare how block and fingers come nearer, and how steady they are."""
-        block, goal = f"{TOOL}.cartesian_position", f"{GOAL}.cartesian_position"
-        yield tips_to_block()
-        yield term(
-            "reward.block_to_goal",
-            kernels.horizontal_progress,
-            (block, Parent(block, 1), goal),
-            "How much nearer the block came to the goal, seen from above [m].",
-        )
-        yield term(
-            "reward.block_to_height",
-            kernels.crossing_progress,
-            (block, Parent(block, 1), goal, f"{GOAL}.size"),
-            "How much nearer the block came to 0.15 m, or to the floor on the goal's side [m].",
-        )
-        yield turned()
-        yield smoothness()
-
-
-def _wall_position(conventions: TriFingerConventions) -> Variable:
-    """Stand the wall on the floor; the predecessor's keeps its center when its size changes."""
-    name = f"{WALL}.cartesian_position"
-    if conventions.published_spaces:
-        center = (0.0, 0.0, WALL_SIZE[2] / 2.0)
-        return numbers.POSITIONS.root(name, center, "Position of the center.")
-    doc = "Position of the center; it stands on the floor in the middle."
-    return numbers.POSITIONS.derived(name, (f"{WALL}.size",), Function(wall_on_the_floor), doc)

@@ -10,30 +10,33 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.geometry.coordinates import from_cylindrical
-from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, term
+from scm_world.tasks.rewards import weighted
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shaping
 from scm_world.tasks.trifinger.base import TriFingerTask
 from scm_world.tasks.trifinger.entities.goals import goal_position
 from scm_world.tasks.trifinger.shapes import Place
-from scm_world.tasks.trifinger.single import GOAL, TOOL, Alike, OneBlock, smoothness, tips_to_block
-from scm_world.variables import Box, Exogenous, Function, Parent, Variable
+from scm_world.tasks.trifinger.single import (
+    BLOCK,
+    GOAL,
+    TARGET,
+    TIPS_TO_BLOCK,
+    TOOL,
+    WAS,
+    Alike,
+    OneBlock,
+)
+from scm_world.variables import Box, Function
 
 HEIGHT = f"{GOAL}.height"
-HEIGHT_BOUNDS = Box(0.0, 0.5)  # [m] of the center of the goal
-HEIGHT_A = (0.08, 0.2)  # [m]
+HEIGHT_A = (0.08, 0.2)  # [m] of the center of the goal
 HEIGHT_B = (0.2, 0.25)
+HEIGHTS = numbers.Range(Box(0.0, 0.5), Box(*HEIGHT_A), Box(*HEIGHT_B), "m")
 
 
 def lifted(height: Value, *, place: Floats) -> Floats:
-    """Put something at a height above a place, shape (..., 3) [m].
-
-    Args:
-        height: Shape (...) [m].
-        place: x and y, shape (2,) [m].
-    """
+    """Put something at a height above a place (x and y), shape (..., 3) [m]."""
     at = np.broadcast_to(place, (*np.shape(height), 2))
     return np.concatenate([at, np.asarray(height)[..., None]], axis=-1)
 
@@ -47,13 +50,10 @@ def put(*parents: Floats, center: Floats) -> Floats:
 
 
 def above_the_center(cylindrical: Floats) -> Floats:
-    """Put a goal above the centre of the arena, at the height of a cylindrical position.
+    """Put a goal above the centre of the arena, at the height of a cylindrical position [m].
 
     Source: CausalWorld 1.2, ``task_generators/picking.py``,
-    ``_handle_contradictory_interventions``.
-
-    Args:
-        cylindrical: Radius [m] and azimuth [rad], both ignored, and height [m]; shape (..., 3).
+    ``_handle_contradictory_interventions``; radius and azimuth are ignored.
     """
     return np.asarray(cylindrical, dtype=np.float64) * (0.0, 0.0, 1.0)
 
@@ -64,17 +64,6 @@ class Picking(TriFingerTask):
 
     The blocks share the parent ``block.size``. How high the goal is does not depend on it.
 
-    Reward terms:
-        reward.block_to_height: How much nearer the block came to the height of the goal [m].
-        reward.height_error: Minus the difference of their heights [m].
-        reward.block_to_center: How much nearer the block came to the axis of the arena [m].
-        reward.center_distance: Minus its distance from there [m].
-        reward.tips_to_block: How much nearer the three fingertips came to the block [m].
-        reward.tips_distance: Minus their distance from it [m].
-        reward.grasp: Minus how far the two nearest fingertips are from the block [m].
-        reward.smoothness: Minus the change of the joint velocities [rad/s].
-        fractional_success: How much of the goal the block fills.
-
     Args:
         tool_block_position: Where the center of the block begins: x and y if it stands on the
             floor, or x, y and z [m]. The goal is above it.
@@ -83,17 +72,17 @@ class Picking(TriFingerTask):
     """
 
     name = "picking"
-    default_weights = {  # noqa: RUF012 # a constant
-        "reward.block_to_height": 250.0,
-        "reward.height_error": 0.0,
-        "reward.block_to_center": 125.0,
-        "reward.center_distance": 0.0,
-        "reward.tips_to_block": 750.0,
-        "reward.tips_distance": 0.0,
-        "reward.grasp": 0.0,
-        "reward.smoothness": 0.005,
-        FRACTION: 1.0,
-    }
+    default_weights, dense_terms = weighted(
+        (250.0, "block_to_height", kernels.height_progress, (BLOCK, WAS, TARGET)),
+        (0.0, "height_error", kernels.minus_height_error, (BLOCK, TARGET)),
+        (125.0, "block_to_center", kernels.centering_progress, (BLOCK, WAS)),
+        (0.0, "center_distance", kernels.minus_eccentricity, (BLOCK,)),
+        (750.0, *TIPS_TO_BLOCK),
+        (0.0, "tips_distance", kernels.minus_tips_distance, (shaping.TIPS, BLOCK)),
+        (0.0, "grasp", kernels.minus_grasp_distance, (shaping.TIPS, BLOCK, f"{TOOL}.size")),
+        (0.005, *shaping.SMOOTHNESS),
+        fraction=1.0,
+    )
     options = Alike
     ready_terms = shaping.ONE_BLOCK
     goal_causes: tuple[str, ...] = (HEIGHT,)
@@ -108,26 +97,18 @@ class Picking(TriFingerTask):
         self.block = OneBlock(tool_block_position, options)
         super().__init__(**self.block.common)
         self.goal_causes = self.block.causes(self.goal_causes)
-        self._height = checked("goal_height", goal_height, HEIGHT_BOUNDS)
+        self._height = HEIGHTS.option(HEIGHT, goal_height, "Height of its center.", "goal_height")
 
     def entities(self) -> Iterable[Entity]:
         """A block and its goal."""
         published = self.conventions.published_spaces
         center = (*self.block.place[:2], self.block.place[2] + self.block.below(TOOL))
         yield self.block.tool(
-            spaces=self.block.spaces(TOOL, airborne=published),
+            spaces=numbers.places(self.block.level(TOOL), airborne=published),
             start=Function(put, constants={"center": center}) if published else None,
         )
         yield self.block.goal(
-            Exogenous(
-                name=HEIGHT,
-                unit="m",
-                bounds=HEIGHT_BOUNDS,
-                a=Box(*HEIGHT_A),
-                b=Box(*HEIGHT_B),
-                default=self._height,
-                doc="Height of its center.",
-            ),
+            self._height,
             goal_position(
                 GOAL,
                 parents=(HEIGHT,),
@@ -138,7 +119,7 @@ class Picking(TriFingerTask):
         )
 
     def _above(self) -> tuple[Box, Box]:
-        """Give the cylindrical positions above the block's place; at radius 0 any angle will do.
+        """Return the cylindrical positions above the block's place; at radius 0 any angle will do.
 
         The predecessor publishes wider spaces, and moves every value that is drawn or set above the
         centre of the arena; see ``above_the_center``.
@@ -155,46 +136,3 @@ class Picking(TriFingerTask):
             Box((radius, low, bottom), (radius, high, top)) for bottom, top in (HEIGHT_A, HEIGHT_B)
         )
         return a, b
-
-    def dense(self) -> Iterable[Variable]:
-        """Declare how block and fingers come nearer, and how steady they are."""
-        block, goal = f"{TOOL}.cartesian_position", f"{GOAL}.cartesian_position"
-        tips, was = "end_effector_positions", Parent(f"{TOOL}.cartesian_position", 1)
-        yield term(
-            "reward.block_to_height",
-            kernels.height_progress,
-            (block, was, goal),
-            "How much nearer the block came to the height of the goal [m].",
-        )
-        yield term(
-            "reward.height_error",
-            kernels.minus_height_error,
-            (block, goal),
-            "Minus the difference of the heights of block and goal [m].",
-        )
-        yield term(
-            "reward.block_to_center",
-            kernels.centering_progress,
-            (block, was),
-            "How much nearer the block came to the axis of the arena [m].",
-        )
-        yield term(
-            "reward.center_distance",
-            kernels.minus_eccentricity,
-            (block,),
-            "Minus the distance of the block from the axis of the arena [m].",
-        )
-        yield tips_to_block()
-        yield term(
-            "reward.tips_distance",
-            kernels.minus_tips_distance,
-            (tips, block),
-            "Minus the distance of the fingertips from the block [m].",
-        )
-        yield term(
-            "reward.grasp",
-            kernels.minus_grasp_distance,
-            (tips, block, f"{TOOL}.size"),
-            "Minus how far the two nearest fingertips are from the block [m].",
-        )
-        yield smoothness()

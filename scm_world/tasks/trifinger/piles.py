@@ -11,7 +11,7 @@ from scm_world.geometry.rotations import from_rotation_vector
 from scm_world.models import Difference, Scene
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.entities.block_world import lowest_point
+from scm_world.tasks.trifinger.entities.blocks import lowest_point
 from scm_world.tasks.trifinger.state import PhysicalState
 
 MOST = 9
@@ -124,11 +124,7 @@ def _dropped(lone: bytes, each: bytes) -> bytes:
 def _lifted(place: Floats, low: float, there: Floats, size: float) -> Floats:
     """Raise a block until it is above the floor and clear of those that lie there.
 
-    Args:
-        place: Where it should be let go, shape (3,) [m].
-        low: How far it reaches below its center [m].
-        there: Centers of the others, shape (n, 3) [m].
-        size: Edge length of all [m].
+    ``low`` is how far it reaches below its center [m], and ``there`` has the centers of the others.
     """
     x, y, z = place.tolist()
     height, reach = max(z, low), np.sqrt(3.0) * size
@@ -140,15 +136,10 @@ def _lifted(place: Floats, low: float, there: Floats, size: float) -> Floats:
 
 
 def part_of(found: Floats, *, index: float) -> Floats:
-    """Pick the position of a block, shape (..., 3) [m].
-
-    Args:
-        found: A pile, shape (..., MOST, 7).
-        index: Which block.
-    """
+    """Return the position of a block of a pile, shape (..., 3) [m]."""
     return found[..., int(index), :3]
 
 
 def turn_of(found: Floats, *, index: float) -> Floats:
-    """Pick the quaternion of a block, made a unit one, shape (..., 4); see ``part_of``."""
+    """Return the quaternion of a block of a pile, made a unit one, shape (..., 4)."""
     return numbers.QUATERNION_BOUNDS.nearest(found[..., int(index), 3:])

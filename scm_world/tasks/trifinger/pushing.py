@@ -6,14 +6,22 @@ from collections.abc import Iterable
 from typing import Unpack, final
 
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import term
-from scm_world.tasks.trifinger import catalogue as numbers
+from scm_world.tasks.rewards import weighted
 from scm_world.tasks.trifinger import kernels, shapes, shaping
 from scm_world.tasks.trifinger.base import TriFingerTask
 from scm_world.tasks.trifinger.entities.goals import goal_position, polar, turned_on_the_floor
 from scm_world.tasks.trifinger.shapes import Place
-from scm_world.tasks.trifinger.single import GOAL, TOOL, Alike, OneBlock, tips_to_block, turned
-from scm_world.variables import Function, Parent, Variable
+from scm_world.tasks.trifinger.single import (
+    BLOCK,
+    GOAL,
+    TARGET,
+    TIPS_TO_BLOCK,
+    TURNED,
+    WAS,
+    Alike,
+    OneBlock,
+)
+from scm_world.variables import Function
 
 
 @final
@@ -23,12 +31,6 @@ class Pushing(TriFingerTask):
     The blocks share the parent ``block.size``. An intervention on it keeps them alike; one on
     the pose of one leaves the other where it is.
 
-    Reward terms:
-        reward.tips_to_block: How much nearer the three fingertips came to the block [m].
-        reward.block_to_goal: How much nearer the block came to the goal [m].
-        reward.orientation: By how much the angle between block and goal shrank [rad].
-        fractional_success: How much of the goal the block fills.
-
     Args:
         tool_block_position: Where the center of the block begins: x and y if it stands on the
             floor, or x, y and z [m].
@@ -37,12 +39,12 @@ class Pushing(TriFingerTask):
     """
 
     name = "pushing"
-    default_weights = {  # noqa: RUF012 # a constant
-        "reward.tips_to_block": 750.0,
-        "reward.block_to_goal": 250.0,
-        "reward.orientation": 100.0,
-        "fractional_success": 1.0,
-    }
+    default_weights, dense_terms = weighted(
+        (750.0, *TIPS_TO_BLOCK),
+        (250.0, "block_to_goal", kernels.block_progress, (BLOCK, WAS, TARGET)),
+        (100.0, *TURNED),
+        fraction=1.0,
+    )
     paper_weights = {"reward.orientation": 0.0}  # noqa: RUF012 # a constant
     options = Alike
     ready_terms = shaping.ONE_BLOCK
@@ -65,20 +67,8 @@ class Pushing(TriFingerTask):
         yield self.block.tool()
         rests = turned_on_the_floor if self.shape is None else shapes.hull_on_the_floor
         yield self.block.goal(
-            polar(GOAL, self._polar, a=numbers.POLAR_A, b=numbers.POLAR_B),
+            polar(GOAL, self._polar),
             goal_position(
                 GOAL, parents=(f"{GOAL}.polar", *self.block.form(GOAL)), mechanism=Function(rests)
             ),
         )
-
-    def dense(self) -> Iterable[Variable]:
-        """Declare how the fingers and the block come nearer."""
-        block = f"{TOOL}.cartesian_position"
-        yield tips_to_block()
-        yield term(
-            "reward.block_to_goal",
-            kernels.block_progress,
-            (block, Parent(block, 1), f"{GOAL}.cartesian_position"),
-            "How much nearer the block came to the goal [m].",
-        )
-        yield turned()

@@ -13,20 +13,27 @@ from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.geometry.scalars import fused, scalar
 from scm_world.tasks.base import Goal, Observed, checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, term
+from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, weighted
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware, kernels, shaping
-from scm_world.tasks.trifinger.base import TriFingerTask, observe_obstacle, observe_position
-from scm_world.tasks.trifinger.entities.goals import GoalSphere
+from scm_world.tasks.trifinger.base import TriFingerTask, observe, observe_position
+from scm_world.tasks.trifinger.entities.goals import goal_sphere
+from scm_world.tasks.trifinger.entities.obstacles import (
+    COUNT,
+    obstacle_names,
+    scattered,
+    scattering,
+)
 from scm_world.tasks.trifinger.kinematics import inverse
-from scm_world.tasks.trifinger.scattered import COUNT, MOST, obstacle_names, scattered, scattering
-from scm_world.variables import Cylinder, Draw, Function, Integers, Measured, Parent, Variable
+from scm_world.tasks.trifinger.shaping import SMOOTHNESS, TIPS, WAS
+from scm_world.variables import Cylinder, Draw, Function, Integers, Measured, Variable
 from scm_world.variables.kinds import SpaceName
 
 REACHED = 0.01  # [m] mean error of a coordinate that counts as success
 FAR = 0.03  # [m] mean error at which the fractional success is zero
 
 GOALS = tuple(f"goal_{finger}" for finger in hardware.FINGERS)
+PLACES = tuple(f"{name}.cartesian_position" for name in GOALS)
 _TINTS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -44,36 +51,23 @@ def within(error: Value, reached: Value) -> int:
 
 
 @njit(cache=True)
-def minus_norm(vector: Floats) -> float:
-    """Compute the negative Euclidean norm of a vector."""
+def minus_norm(torques: Floats) -> float:
+    """Compute minus the norm of the joint torques [N m]."""
     total = 0.0
-    for number in vector:
+    for number in torques:
         total = fused(number, number, total)
     return -math.sqrt(total)
 
 
 @njit(cache=True)
 def minus_distance(tips: Floats, goal_60: Floats, goal_120: Floats, goal_300: Floats) -> float:
-    """Compute the negative distance of the tips from their goals [m]."""
+    """Compute minus the distance of the tips from their goals [m]."""
     return -kernels.reach_distance(tips, goal_60, goal_120, goal_300)
-
-
-@njit(cache=True)
-def minus_change(now: Floats, before: Floats) -> float:
-    """Compute the negative norm of a difference."""
-    return -kernels.distance(now, before)
 
 
 @final
 class Reaching(TriFingerTask):
     """Three points in the air, one for each fingertip.
-
-    Reward terms:
-        reward.tips_to_goals: How much nearer the tips came to their goals [m].
-        reward.distance: Minus the distance of the tips from their goals [m].
-        reward.torque: Minus the norm of the joint torques [N m].
-        reward.smoothness: Minus the change of the joint velocities [rad/s].
-        fractional_success: 1 within a centimeter, 0 beyond three.
 
     Args:
         default_goal_60: Default goal of the first finger [m].
@@ -84,15 +78,16 @@ class Reaching(TriFingerTask):
     """
 
     name = "reaching"
-    default_weights = {  # noqa: RUF012 # a constant
-        "reward.tips_to_goals": 100_000.0,
-        "reward.distance": 0.0,
-        "reward.torque": 0.0,
-        "reward.smoothness": 0.0,
-        FRACTION: 1.0,
-    }
+    default_weights, dense_terms = weighted(
+        (100_000.0, "tips_to_goals", kernels.reach_progress, (TIPS, WAS, *PLACES)),
+        (0.0, "distance", minus_distance, (TIPS, *PLACES)),
+        (0.0, "torque", minus_norm, ("joint_torques",)),
+        (0.0, *SMOOTHNESS),
+        fraction=1.0,
+    )
     paper_weights = {FRACTION: 0.0}  # noqa: RUF012 # a constant
     ready_terms = shaping.REACHING
+    seconds = 5.0
     decided_by = (COUNT,)
     goal_causes = tuple(f"{name}.cylindrical_position" for name in GOALS)
 
@@ -111,38 +106,25 @@ class Reaching(TriFingerTask):
             checked(f"default_goal_{finger}", place, numbers.POSITION_BOUNDS, shape=(3,))
             for finger, place in given.items()
         )
-        allowed = Integers(0, MOST)
-        self._count = checked(COUNT, number_of_obstacles, allowed)
-
-    @property
-    def seconds(self) -> float:
-        """Five seconds [s]."""
-        return 5.0
+        self.roots = (*scattering(number_of_obstacles),)
 
     def arrange(self, values: Values) -> int:
         """Count the obstacles."""
         return int(values[COUNT])
 
-    def shared(self) -> Iterable[Variable]:
-        """Obstacles."""
-        return scattering(self._count)
-
-    def _obstacles(self) -> int:
-        return self.plan if isinstance(self.plan, int) else self._count
-
     def entities(self) -> Iterable[Entity]:
         """Three goals, and obstacles."""
         for name, place, tint in zip(GOALS, self._places, _TINTS, strict=True):
-            yield GoalSphere(name, position=place, radius=0.015, tint=tint)
-        yield from scattered(self._obstacles())
+            yield goal_sphere(name, place, tint)
+        yield from scattered(self.arranged)
 
     def readouts(self) -> Iterable[Variable]:
         """Declare reward terms and success."""
-        yield from self._terms()
+        yield from self.dense_terms
         yield Measured(
             name="reach_error",
             unit="m",
-            parents=("end_effector_positions", *_positions()),
+            parents=(TIPS, *PLACES),
             mechanism=Function(kernels.reach_error),
             doc="Mean absolute error of the nine tip coordinates.",
         )
@@ -167,34 +149,18 @@ class Reaching(TriFingerTask):
             weights["reach_error"] = weights.pop(FRACTION)
         yield reward(weights)
 
-    def _terms(self) -> Iterable[Variable]:
-        tips, goals, speeds = "end_effector_positions", _positions(), "joint_velocities"
-        yield term(
-            "reward.tips_to_goals",
-            kernels.reach_progress,
-            (tips, Parent(tips, 1), *goals),
-            "How much nearer the tips came to their goals [m].",
-        )
-        far = "Minus the distance of the tips from their goals [m]."
-        yield term("reward.distance", minus_distance, (tips, *goals), far)
-        torque = "Minus the norm of the joint torques [N m]."
-        yield term("reward.torque", minus_norm, ("joint_torques",), torque)
-        change = "Minus the change of the joint velocities [rad/s]."
-        yield term("reward.smoothness", minus_change, (speeds, Parent(speeds, 1)), change)
-
     def observed(self) -> Iterable[Observed]:
         """Observe the three goals and the obstacles."""
-        for name in GOALS:
-            yield from observe_position(name)
-        for name in obstacle_names(self._obstacles()):
-            yield from observe_obstacle(name)
+        yield from map(observe_position, GOALS)
+        for name in obstacle_names(self.arranged):
+            yield from observe(name, 10)
 
     @property
     def goal(self) -> Goal:
         """The tips should be at their goals, nine numbers each [m]."""
         return Goal(
-            achieved=("end_effector_positions",),
-            desired=_positions(),
+            achieved=(TIPS,),
+            desired=PLACES,
             causes=self.goal_causes,
             measures={
                 "reach_error": error_of,
@@ -234,7 +200,3 @@ def fraction_of(tips: ArrayLike, goals: ArrayLike) -> Floats:
     return np.asarray(
         1.0 - (np.clip(error_of(tips, goals), REACHED, FAR) - REACHED) / (FAR - REACHED)
     )
-
-
-def _positions() -> tuple[str, ...]:
-    return tuple(f"{name}.cartesian_position" for name in GOALS)

@@ -33,15 +33,15 @@ Setting = tuple[dict[str, Value], Floats]
 # --- where bodies are ---------------------------------------------------------------------------
 
 
-def top(world: Any, name: str) -> Floats:
-    """Find the middle of the upper face of something upright, shape (3,) [m]."""
-    center, size = world[f"{name}.cartesian_position"], world[f"{name}.size"]
-    return np.array([center[0], center[1], center[2] + size[2] / 2])
-
-
 def sizes(world: Any) -> Floats:
     """List the edge lengths of the blocks, shape (n, 3) [m]."""
     return np.array([world[f"{name}.size"] for name in world.composition.blocks]).reshape(-1, 3)
+
+
+def above(world: Any, name: str) -> tuple[Floats, float]:
+    """Return x and y of something upright, and the height of its upper face [m]."""
+    center = world[f"{name}.cartesian_position"]
+    return np.array(center[:2]), float(center[2] + world[f"{name}.size"][2] / 2)
 
 
 def touched(
@@ -49,7 +49,6 @@ def touched(
     rng: ProbeGenerator,
     middle: Floats,
     bottom: float,
-    *,
     heights: tuple[float, float],
     yaw: float,
 ) -> tuple[dict[str, Value], Floats, float]:
@@ -69,10 +68,11 @@ def touched(
     name, size = world.composition.blocks[0], sizes(world)[0]
     angles = facing(rng)
     height = bottom + rng.uniform(*heights) * size[2]
+    clear = float(np.hypot(size[0], size[1])) / 2 + TIP + CLEARANCE  # at any yaw
     states = {
         f"{name}.cartesian_position": np.array([*middle, bottom + size[2] / 2]),
         f"{name}.euler_orientation": np.array([0.0, 0.0, rng.uniform(-yaw, yaw)]),
-        "joint_positions": gripping(world, middle, beyond_corners(size), angles, height),
+        "joint_positions": joints_for(world, around(middle, clear, angles, height)),
     }
     return states, angles, height
 
@@ -87,10 +87,11 @@ def pressed(
     which = int(np.flatnonzero(middles >= min(REACH, middles[-1]))[0])
     height = float(middles[which]) + rng.uniform(-0.2, 0.2) * edges[which, 2]
     angles = facing(rng)
-    reach = beyond_faces(edges[which], angles)
-    states["joint_positions"] = gripping(world, middle, reach, angles, height)
-    center = np.array([*middle, 0.0])
-    return states, around(center, rng.uniform(0.0, 0.01), angles + 0.4, height - 0.01)
+    # Just beyond the faces of a block that is hardly turned.
+    across = np.abs(np.stack([np.cos(angles), np.sin(angles)], axis=-1))
+    reach = ((edges[which, :2] / 2 + TIP + LOOSE) / np.maximum(across, 1e-9)).min(axis=-1)
+    states["joint_positions"] = joints_for(world, around(middle, reach, angles, height))
+    return states, around(middle, rng.uniform(0.0, 0.01), angles + 0.4, height - 0.01)
 
 
 def stacked(
@@ -113,83 +114,44 @@ def stacked(
     return states
 
 
-def out_of_the_way(world: Any, rng: ProbeGenerator) -> dict[str, Value]:
-    """Stack the blocks in the middle, unless an obstacle may stand there."""
-    if world.composition.obstacles:
-        return {}
-    return stacked(world, rng, np.zeros(2), 0.0)
-
-
 # --- where fingers are --------------------------------------------------------------------------
 
 
 def facing(rng: ProbeGenerator) -> Floats:
-    """Give the direction in which each finger stands, with a little spread [rad]."""
+    """Return the direction in which each finger stands, with a little spread [rad]."""
     tips = np.array([[-0.05945, 0.15864], [0.16711, -0.02783], [-0.10766, -0.13080]])
     directions: Floats = np.arctan2(tips[:, 1], tips[:, 0]) + rng.uniform(-0.2, 0.2, 3)
     return directions
 
 
-def around(center: Floats, radius: float | Floats, angles: Floats, height: float) -> Floats:
-    """Put three fingertips on a circle.
-
-    Args:
-        center: Shape (3,) [m]; its height does not matter.
-        radius: Of the circle, or of one for each finger, shape (3,) [m].
-        angles: Where on it, shape (3,) [rad].
-        height: Of all of them [m].
-
-    Returns:
-        Shape (9,) [m].
-    """
-    ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(3)], axis=-1)
-    points: Floats = center + ring * np.reshape(radius, (-1, 1))
-    points[:, 2] = height
+def around(middle: Floats, radius: float | Floats, angles: Floats, height: float) -> Floats:
+    """Put three fingertips on a circle, or each at a radius of its own, shape (9,) [m]."""
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    points = np.full((3, 3), height)
+    points[:, :2] = middle + ring * np.reshape(radius, (-1, 1))
     return points.ravel()
 
 
-def beyond_corners(size: Floats) -> float:
-    """Compute how far from the middle of a block a tip is clear of it at any yaw [m]."""
-    return float(np.hypot(size[0], size[1])) / 2 + TIP + CLEARANCE
-
-
-def beyond_faces(size: Floats, angles: Floats) -> Floats:
-    """Compute how far out tips just do not touch a block that is hardly turned, shape (3,) [m].
-
-    Args:
-        size: Edge lengths of the block, shape (3,) [m].
-        angles: In which directions, shape (3,) [rad].
-    """
-    across = np.abs(np.stack([np.cos(angles), np.sin(angles)], axis=-1))
-    return np.asarray(((size[:2] / 2 + TIP + LOOSE) / np.maximum(across, 1e-9)).min(axis=-1))
-
-
-def gripping(
-    world: Any, middle: Floats, reach: float | Floats, angles: Floats, height: float
-) -> Floats:
-    """Find the joint positions with the tips around a place, shape (9,) [rad]."""
-    return joints_for(world, around(np.array([*middle, 0.0]), reach, angles, height))
-
-
 def present_tips(world: Any) -> Floats:
-    """Give the fingertip positions, shape (9,) [m]."""
+    """Return the fingertip positions, shape (9,) [m]."""
     return np.array(world["end_effector_positions"])
 
 
 def joints_for(world: Any, tips: Floats) -> Floats:
-    """Find joint positions for fingertip positions, near the resting pose.
-
-    Args:
-        world: Its robot may be higher or lower.
-        tips: Shape (9,) [m].
-
-    Returns:
-        Shape (9,) [rad].
-    """
+    """Compute joint positions for fingertip positions, near the resting pose, shape (9,) [rad]."""
     near = np.array(hardware.REST)
     return inverse(tips, float(world["robot_height"]), near).joint_positions
 
 
+def fingers_at(world: Any, rng: ProbeGenerator, tips: Floats) -> dict[str, Value]:
+    """Put the fingertips somewhere, and the blocks out of their way, unless it is not free."""
+    states: dict[str, Value] = {"joint_positions": joints_for(world, tips)}
+    if not world.composition.obstacles:  # one may stand in the middle
+        states |= stacked(world, rng, ORIGIN, 0.0)
+    return states
+
+
+ORIGIN = np.zeros(2)
 PLACES = "obstacle_places"
 
 
@@ -199,23 +161,19 @@ PLACES = "obstacle_places"
 def touch(world: Any, rng: ProbeGenerator) -> Setting:
     """Stand the first block amid the fingers and let all three press on it."""
     middle = rng.uniform(-0.02, 0.02, 2)
-    states, angles, _ = touched(world, rng, middle, 0.0, heights=(0.3, 0.8), yaw=0.8)
-    center = np.array([*middle, 0.0])
-    drive = around(center, rng.uniform(0.0, 0.02), angles + 0.4, rng.uniform(0.01, 0.06))
+    states, angles, _ = touched(world, rng, middle, 0.0, (0.3, 0.8), yaw=0.8)
+    drive = around(middle, rng.uniform(0.0, 0.02), angles + 0.4, rng.uniform(0.01, 0.06))
     return states, drive
 
 
 def on_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
     """Stand the blocks on the first obstacle and let all three fingers press on one."""
-    obstacle = world.composition.obstacles[0]
-    center = world[f"{obstacle}.cartesian_position"]
-    bottom = float(center[2] + world[f"{obstacle}.size"][2] / 2)
-    middle = center[:2] + rng.uniform(-0.002, 0.002, 2)
+    center, bottom = above(world, world.composition.obstacles[0])
+    middle = center + rng.uniform(-0.002, 0.002, 2)
     if len(world.composition.blocks) > 1:
         return pressed(world, rng, middle, bottom)
-    states, angles, height = touched(world, rng, middle, bottom, heights=(0.4, 0.7), yaw=0.1)
-    center = np.array([*middle, 0.0])
-    return states, around(center, rng.uniform(0.0, 0.02), angles + 0.4, height - 0.02)
+    states, angles, height = touched(world, rng, middle, bottom, (0.4, 0.7), yaw=0.1)
+    return states, around(middle, rng.uniform(0.0, 0.02), angles + 0.4, height - 0.02)
 
 
 def block_in_air(world: Any, rng: ProbeGenerator) -> Setting:
@@ -237,30 +195,24 @@ def free(world: Any, rng: ProbeGenerator) -> Setting:
 
 def finger_on_floor(world: Any, rng: ProbeGenerator) -> Setting:
     """Put the fingertips on the floor and let them rub it."""
-    angles, center = facing(rng), np.zeros(3)
-    radius = rng.uniform(0.1, 0.13)
-    states = {"joint_positions": joints_for(world, around(center, radius, angles, TIP + CLEARANCE))}
-    states.update(out_of_the_way(world, rng))
-    return states, around(center, radius - 0.02, angles + 0.2, -0.02)
+    angles, radius = facing(rng), rng.uniform(0.1, 0.13)
+    states = fingers_at(world, rng, around(ORIGIN, radius, angles, TIP + CLEARANCE))
+    return states, around(ORIGIN, radius - 0.02, angles + 0.2, -0.02)
 
 
 def finger_at_wall(world: Any, rng: ProbeGenerator) -> Setting:
     """Put the fingertips at the ring wall and let them rub it."""
-    angles, center = facing(rng), np.zeros(3)
-    inside = WALL_RADIUS - TIP - 3e-3
-    height = rng.uniform(0.08, 0.14)
-    states = {"joint_positions": joints_for(world, around(center, inside, angles, height))}
-    states.update(out_of_the_way(world, rng))
-    return states, around(center, WALL_RADIUS + 0.03, angles + 0.15, height + 0.02)
+    angles, height = facing(rng), rng.uniform(0.08, 0.14)
+    states = fingers_at(world, rng, around(ORIGIN, WALL_RADIUS - TIP - 3e-3, angles, height))
+    return states, around(ORIGIN, WALL_RADIUS + 0.03, angles + 0.15, height + 0.02)
 
 
 def fingers_together(world: Any, rng: ProbeGenerator) -> Setting:
     """Put the fingertips side by side in the middle and let them press on one another."""
-    angles, center = facing(rng), np.array([*rng.uniform(-0.02, 0.02, 2), 0.0])
-    radius, height = 1.3 * TIP, rng.uniform(0.05, 0.1)
-    states = {"joint_positions": joints_for(world, around(center, radius, angles, height))}
-    states.update(out_of_the_way(world, rng))
-    return states, around(center, 0.0, angles, height + rng.uniform(-0.02, 0.02))
+    angles, middle = facing(rng), rng.uniform(-0.02, 0.02, 2)
+    height = rng.uniform(0.05, 0.1)
+    states = fingers_at(world, rng, around(middle, 1.3 * TIP, angles, height))
+    return states, around(middle, 0.0, angles, height + rng.uniform(-0.02, 0.02))
 
 
 # --- all blocks ---------------------------------------------------------------------------------
@@ -293,11 +245,11 @@ def solved(world: Any, rng: ProbeGenerator) -> Setting:
 
 def leaving(world: Any, rng: ProbeGenerator) -> Setting:
     """Begin where the goal is fulfilled, with the blocks on their way up."""
-    states = world.task.solution(world.values())
+    states, tips = solved(world, rng)
     for name in world.composition.blocks:
         up = rng.uniform(0.4, 0.7)
         states[f"{name}.linear_velocity"] = np.array([*rng.uniform(-0.3, 0.3, 2), up])
-    return states, present_tips(world)
+    return states, tips
 
 
 # --- what may come into being -------------------------------------------------------------------
@@ -312,7 +264,7 @@ def on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
     if place is None:
         return tower(world, rng)
     some = 1 + int(rng.uniform(0.0, min(HIGHEST, len(world.composition.blocks))))
-    return pressed(world, rng, place[:2], place[2], some)
+    return pressed(world, rng, *place, some)
 
 
 def all_on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
@@ -320,11 +272,11 @@ def all_on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
     place = _newcomer(world)
     if place is None:
         return tower(world, rng)
-    return stacked(world, rng, place[:2], place[2]), present_tips(world)
+    return stacked(world, rng, *place), present_tips(world)
 
 
 def on_coming_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
-    """Say that the next obstacle comes to lie in the middle, and press on blocks above it."""
+    """Set the next obstacle into the middle, and press on blocks above it."""
     places, here = np.array(world[PLACES]), len(world.composition.obstacles)
     edge = numbers.OBSTACLE_SIZE[2]
     middle = rng.uniform(-0.01, 0.01, 2)
@@ -334,7 +286,7 @@ def on_coming_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
 
 
 def obstacle_ahead(world: Any, rng: ProbeGenerator) -> Setting:
-    """Say that obstacles, should there be any, are where the fingers are about to go."""
+    """Set obstacles, should there be any, to where the fingers are about to go."""
     tips = present_tips(world).reshape(3, 3)
     places = np.array(world[PLACES])
     inward = -tips * [1.0, 1.0, 0.0] / np.linalg.norm(tips[:, :2], axis=1, keepdims=True)
@@ -344,15 +296,15 @@ def obstacle_ahead(world: Any, rng: ProbeGenerator) -> Setting:
     return {PLACES: places}, (tips + 0.05 * inward).ravel()
 
 
-def _newcomer(world: Any) -> Floats | None:
-    """Find where a further block or obstacle would be: its middle and its top, shape (3,) [m]."""
+def _newcomer(world: Any) -> tuple[Floats, float] | None:
+    """Find where a further block or obstacle would be: its middle and its top [m]."""
     before = world.snapshot()
     for request in world.task.nearby(world.values()):
         try:
             came = world.do(request).came
         except InterventionError:
             continue
-        found = top(world, came[-1]) if came else None
+        found = above(world, came[-1]) if came else None
         world.restore(before)
         if found is not None:
             return found

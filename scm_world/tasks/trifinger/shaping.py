@@ -4,19 +4,6 @@
 to the terms of a task. Names are plain data, so the specification of the environment stays JSON.
 Which ones a task has is in its ``ready_terms``.
 
-Terms:
-    reward.speed: Minus the norm of the joint velocities [rad/s]. Every task.
-    reward.effort: Minus the norm of the joint torques [N m]. It keeps fingers from pressing a block
-        from all sides. Every task.
-    reward.goal_kernel: How near the corners of the block are to those of the goal, in [0, 1];
-        it is felt within about 10 cm. Tasks with one block.
-    reward.goal_kernel_fine: The same with a sharper kernel, felt within about 2 cm.
-    reward.corners_to_goal: How much nearer the corners came to those of the goal [m].
-    reward.tip_behind_block: How much nearer the nearest fingertip came to the point behind the
-        block from where it can be pushed to the goal [m].
-    reward.reach_kernel: How near the fingertips are to their goals, in [0, 1]. Reaching.
-    reward.reach_kernel_fine: The same with a sharper kernel.
-
 Source:
     The kernel on corners is that of Allshire et al., *Transferring Dexterous Manipulation from GPU
     Simulation to a Remote Real-World TriFinger*, IROS 2022, here times 4, so that it ends at 1.
@@ -67,16 +54,7 @@ def corner_distance(
     goal_position: Floats,
     goal_orientation: Floats,
 ) -> float:
-    """Compute the mean distance of the eight corners of two boxes, corner by corner [m].
-
-    Args:
-        size: Edge lengths, shape (3,) [m].
-        position: Of the center, shape (3,) [m].
-        orientation: Quaternion (x, y, z, w), shape (4,).
-        goal_size: Of the other box; so too what follows.
-        goal_position: Shape (3,) [m].
-        goal_orientation: Shape (4,).
-    """
+    """Compute the mean distance of the eight corners of two boxes, corner by corner [m]."""
     turn, goal_turn = np.empty((3, 3)), np.empty((3, 3))
     rotation_kernel(orientation, turn)
     rotation_kernel(goal_orientation, goal_turn)
@@ -121,7 +99,7 @@ def corners_progress(
     goal_position: Floats,
     goal_orientation: Floats,
 ) -> float:
-    """Compute how much the mean distance of the corners shrank [m]."""
+    """Compute how much nearer the corners of the block came to those of the goal [m]."""
     goal = goal_size, goal_position, goal_orientation
     before = corner_distance(size, position_before, orientation_before, *goal)
     return before - corner_distance(size, position, orientation, *goal)
@@ -129,13 +107,7 @@ def corners_progress(
 
 @njit(cache=True)
 def pushing_distance(tips: Floats, block: Floats, goal: Floats) -> float:
-    """Compute how far the nearest fingertip is from behind the block, seen from its goal [m].
-
-    Args:
-        tips: Shape (9,) [m].
-        block: Center, shape (3,) [m].
-        goal: Center, shape (3,) [m].
-    """
+    """Compute how far the nearest fingertip is from behind the block, seen from its goal [m]."""
     x, y = goal[0] - block[0], goal[1] - block[1]
     scale = BEHIND / max(math.sqrt(x * x + y * y), NEAR)
     nearest = math.inf
@@ -151,7 +123,7 @@ def pushing_distance(tips: Floats, block: Floats, goal: Floats) -> float:
 def pushing_progress(
     tips: Floats, tips_before: Floats, block: Floats, block_before: Floats, goal: Floats
 ) -> float:
-    """Compute how much nearer the nearest fingertip came to behind the block [m]."""
+    """Compute how much nearer a fingertip came to where it can push the block to its goal [m]."""
     before = pushing_distance(tips_before, block_before, goal)
     return before - pushing_distance(tips, block, goal)
 
@@ -171,15 +143,20 @@ def reach_kernel(
 @njit(cache=True)
 def minus_length(vector: Floats) -> float:
     """Compute minus the Euclidean norm of a vector."""
-    total = 0.0
-    for number in vector:
-        total += number * number
-    return -math.sqrt(total)
+    return -distance(vector, np.zeros(vector.size))
+
+
+@njit(cache=True)
+def minus_change(now: Floats, before: Floats) -> float:
+    """Compute minus the change of the joint velocities [rad/s]."""
+    return -distance(now, before)
 
 
 _BLOCK = tuple(f"{_TOOL}.{part}" for part in _POSE)
 _WANTED = tuple(f"{_GOAL}.{part}" for part in _POSE)
-_TIPS = ("end_effector_positions", *(f"goal_{f}.cartesian_position" for f in ("60", "120", "300")))
+TIPS = "end_effector_positions"
+WAS = Parent(TIPS, 1)
+_REACH = (TIPS, *(f"goal_{f}.cartesian_position" for f in ("60", "120", "300")))
 
 ROBOT: tuple[Measured, ...] = (
     term(
@@ -195,7 +172,10 @@ ROBOT: tuple[Measured, ...] = (
         "Minus the norm of the joint torques [N m].",
     ),
 )
-"""Terms of every task."""
+"""Terms of every task. The second one keeps fingers from pressing a block from all sides."""
+
+SMOOTHNESS = "smoothness", minus_change, ("joint_velocities", Parent("joint_velocities", 1))
+"""A term that most tasks have by themselves."""
 
 ONE_BLOCK: tuple[Measured, ...] = (
     *ROBOT,
@@ -215,17 +195,15 @@ ONE_BLOCK: tuple[Measured, ...] = (
         "reward.corners_to_goal",
         corners_progress,
         (*_BLOCK, *(Parent(f"{_TOOL}.{part}", 1) for part in _MOVES), *_WANTED),
-        "How much nearer the corners of the block came to those of the goal [m].",
     ),
     term(
         "reward.tip_behind_block",
         pushing_progress,
         (
-            *("end_effector_positions", Parent("end_effector_positions", 1)),
+            *(TIPS, WAS),
             *(f"{_TOOL}.cartesian_position", Parent(f"{_TOOL}.cartesian_position", 1)),
             f"{_GOAL}.cartesian_position",
         ),
-        "How much nearer a fingertip came to where it can push the block to its goal [m].",
     ),
 )
 """Terms of tasks with one block and one goal."""
@@ -235,13 +213,13 @@ REACHING: tuple[Measured, ...] = (
     term(
         "reward.reach_kernel",
         Function(reach_kernel, constants={"sharpness": COARSE}),
-        _TIPS,
+        _REACH,
         "How near the fingertips are to their goals, in [0, 1].",
     ),
     term(
         "reward.reach_kernel_fine",
         Function(reach_kernel, constants={"sharpness": FINE}),
-        _TIPS,
+        _REACH,
         "How near the fingertips are, in [0, 1]; it is felt within about 2 cm.",
     ),
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar, final
 
@@ -10,18 +9,26 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import ModelError
+from scm_world.geometry import canonical, quaternion_product
 from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.hulls import Hull, extents
 from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import Common, term
+from scm_world.tasks.rewards import Common
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shapes
-from scm_world.tasks.trifinger.entities.blocks import ToolBlock, block_mass, block_size, hull_size
+from scm_world.tasks.trifinger.entities.blocks import (
+    ToolBlock,
+    block_mass,
+    block_size,
+    lowest_point,
+    stand,
+)
 from scm_world.tasks.trifinger.entities.goals import GoalBlock, goal_orientation
-from scm_world.tasks.trifinger.reaching import minus_change
 from scm_world.tasks.trifinger.shapes import Place, Quaternion
-from scm_world.variables import Box, Function, Measured, Parent, Variable
+from scm_world.tasks.trifinger.shaping import TIPS
+from scm_world.tasks.trifinger.shaping import WAS as TIPS_WAS
+from scm_world.variables import Box, Fixed, Function, Parent, Variable
 from scm_world.variables.spaces import Bound
 
 SIZE = "block.size"
@@ -67,24 +74,24 @@ class OneBlock:
 
     def __init__(self, tool_block_position: Place, options: Alike) -> None:
         self.common: Any = dict(options)
-        shape = self.common.pop("shape", None)
-        if not (shape is None or isinstance(shape, Hull)):
+        self.shape: Hull | None = self.common.pop("shape", None)
+        if not (self.shape is None or isinstance(self.shape, Hull)):
             raise ModelError(
-                [f"shape must be a Hull: load_hull(path) or hull_of(points); {shape!r}"]
+                [f"shape must be a Hull: load_hull(path) or hull_of(points); {self.shape!r}"]
             )
-        self.shape: Hull | None = shape
         mass = self.common.pop("tool_block_mass", numbers.BLOCK_MASS)
         self._mass = checked("tool_block_mass", mass, numbers.BLOCK_MASSES.bounds)
-        self._turns = {
-            name: shapes.turn_of(option, self.common.pop(option, numbers.IDENTITY), shape)
-            for name, option in (
-                (TOOL, "tool_block_orientation"),
-                (GOAL, "goal_block_orientation"),
-            )
-        }
-        self.place = shapes.start_place(
-            "tool_block_position", tool_block_position, self.below(TOOL)
-        )
+        self._turns = {name: self._turn(f"{name}_orientation") for name in (TOOL, GOAL)}
+        below = self.below(TOOL)
+        self.place = shapes.start_place("tool_block_position", tool_block_position, below)
+
+    def _turn(self, option: str) -> Quaternion:
+        """Read how a body begins turned; a hull is turned from the way its points were given."""
+        turn = shapes.unit_quaternion(option, self.common.pop(option, numbers.IDENTITY))
+        if self.shape is None:
+            return turn
+        x, y, z, w = canonical(quaternion_product(turn, self.shape.axes)).tolist()
+        return x, y, z, w
 
     def causes(self, box: Iterable[str]) -> tuple[str, ...]:
         """Return the variables that a goal is drawn for; a hull turns about the vertical only."""
@@ -94,27 +101,40 @@ class OneBlock:
     def below(self, name: str) -> float:
         """Compute how far block or goal reaches below its center as it begins [m]."""
         corners = () if self.shape is None else (np.array(self.shape.vertices),)
-        size, turn = np.array(numbers.BLOCK_SIZE), np.array(self._turns[name])
-        return shapes.depth(size, turn, *corners)
+        return lowest_point(np.array(numbers.BLOCK_SIZE), np.array(self._turns[name]), *corners)
+
+    def level(self, name: str) -> Bound:
+        """Return the height of the center of block or goal on the floor, as a bound of a space."""
+        return numbers.half_height(f"{name}.size") if self.shape is None else self.below(name)
 
     def floor_polar(self, place: Place) -> tuple[float, float]:
         """Turn the place of a goal on the floor into radius [m] and angle [rad]."""
-        x, y = shapes.floor_place("goal_block_position", place, self.below(GOAL))
-        return math.hypot(x, y), math.atan2(y, x)
+        return shapes.floor_place("goal_block_position", place, self.below(GOAL))
 
     def shared(self) -> Iterable[Variable]:
         """One size for both, or one shape."""
         if self.shape is None:
             yield block_size(SIZE)
-        else:
-            yield from (shapes.vertices(name, self.shape) for name in (TOOL, GOAL))
+            return
+        for name in (TOOL, GOAL):
+            yield Fixed(
+                name=f"{name}.vertices",
+                unit="m",
+                shape=(len(self.shape.vertices), 3),
+                value=tuple(float(x) for corner in self.shape.vertices for x in corner),
+                doc="Corners of the convex shape, in the frame of its center of mass.",
+            )
 
-    def size_of(self, name: str) -> Variable:
-        """Declare the size of the block or of the goal."""
+    def _size(self, name: str) -> Variable:
         if self.shape is None:
             return block_size(f"{name}.size", SIZE)
-        x, y, z = extents(self.shape).tolist()
-        return hull_size(f"{name}.size", (x, y, z))
+        return Fixed(
+            name=f"{name}.size",
+            unit="m",
+            shape=(3,),
+            value=tuple(extents(self.shape).tolist()),
+            doc="Edge lengths of the box around the shape, in its own frame.",
+        )
 
     def form(self, name: str) -> tuple[str, ...]:
         """Name the variables that say how high block or goal is on the floor."""
@@ -136,18 +156,17 @@ class OneBlock:
             causes: The further ones.
         """
         corners = () if self.shape is None else (f"{TOOL}.vertices",)
-        a, b = spaces or self.spaces(TOOL)
+        a, b = spaces or numbers.places(self.level(TOOL), airborne=False)
         return ToolBlock(
             TOOL,
-            size=self.size_of(TOOL),
+            size=self._size(TOOL),
             mass=block_mass(f"{TOOL}.mass", default=self._mass),
-            spawn=start or Function(shapes.stand, constants={"place": self.place}),
+            spawn=start or Function(stand, constants={"place": self.place}),
             spawn_from=(*corners, *causes),
             a=a,
             b=b,
             hull=self.shape,
             orientation=self._turns[TOOL],
-            carry=None if self.shape is None else Function(shapes.keep_lowest_corner),
         )
 
     def goal(
@@ -156,74 +175,44 @@ class OneBlock:
         spaces: tuple[Box, Box] | None = None,
         inverse: Callable[[Floats], Floats] = from_cylindrical,
     ) -> Entity:
-        """Describe the goal.
+        """Describe the goal; a shape keeps to the side it rests on.
 
         Args:
             place: Its position, and the causes of it.
             spaces: A and B of its cylindrical position; those on the floor if None.
             inverse: Cartesian position where a cylindrical one is set.
         """
-        (a, b), box = spaces or self.spaces(GOAL), self.shape is None
-        pose = (*place, *self._goal_turn())
-        size = self.size_of(GOAL)
-        return GoalBlock(
-            GOAL, size=size, pose=pose, a=a, b=b, yaw=box, hull=self.shape, inverse=inverse
-        )
-
-    def _goal_turn(self) -> Iterable[Variable]:
-        """Declare the orientation of the goal; a shape keeps to the side it rests on."""
-        rest = self._turns[GOAL]
-        if self.shape is None:
-            yield goal_orientation(GOAL, default=rest)
-        else:
-            yaw = shapes.yaw_of(GOAL)
+        a, b = spaces or numbers.places(self.level(GOAL), airborne=False)
+        rest, box = self._turns[GOAL], self.shape is None
+        pose = (*place, goal_orientation(GOAL, default=rest))
+        if not box:
+            circle = Box(-np.pi, np.pi)
+            yaw = numbers.Range(circle, circle, circle, "rad").declare(
+                f"{GOAL}.yaw",
+                0.0,
+                "How far it is turned about the vertical from the way it rests.",
+            )
             turn = Function(shapes.about_z, constants={"rest": rest})
-            yield from (yaw, goal_orientation(GOAL, parents=(yaw.name,), mechanism=turn))
-
-    def level(self, name: str) -> Bound:
-        """Return the height of the center of block or goal on the floor, as a bound of a space."""
-        return shapes.level(f"{name}.size", self.shape, self._turns[name])
-
-    def spaces(self, name: str, *, airborne: bool = False) -> tuple[Box, Box]:
-        """Return the spaces A and B of the cylindrical position of block or goal.
-
-        Args:
-            name: ``TOOL`` or ``GOAL``.
-            airborne: Whether it may be in the air.
-        """
-        return shapes.block_spaces(
-            f"{name}.size", airborne=airborne, hull=self.shape, rest=self._turns[name]
+            pose = (*place, yaw, goal_orientation(GOAL, parents=(yaw.name,), mechanism=turn))
+        return GoalBlock(
+            GOAL,
+            size=self._size(GOAL),
+            pose=pose,
+            a=a,
+            b=b,
+            yaw=box,
+            hull=self.shape,
+            inverse=inverse,
         )
 
 
-def tips_to_block(block: str = TOOL) -> Measured:
-    """Declare the term for fingertips that come nearer."""
-    tips, place = "end_effector_positions", f"{block}.cartesian_position"
-    return term(
-        "reward.tips_to_block",
-        kernels.tips_progress,
-        (tips, Parent(tips, 1), place, Parent(place, 1)),
-        "How much nearer the fingertips came to the block [m].",
-    )
+BLOCK, TARGET = f"{TOOL}.cartesian_position", f"{GOAL}.cartesian_position"
+WAS = Parent(BLOCK, 1)
 
-
-def turned() -> Measured:
-    """Declare the term for a block that turns towards its goal."""
-    turn = f"{TOOL}.orientation"
-    return term(
-        "reward.orientation",
-        kernels.turn_progress,
-        (turn, Parent(turn, 1), f"{GOAL}.orientation"),
-        "By how much the angle between block and goal shrank [rad].",
-    )
-
-
-def smoothness() -> Measured:
-    """Declare the term for joints that change their velocities."""
-    speeds = "joint_velocities"
-    return term(
-        "reward.smoothness",
-        minus_change,
-        (speeds, Parent(speeds, 1)),
-        "Minus the change of the joint velocities [rad/s].",
-    )
+TIPS_TO_BLOCK = "tips_to_block", kernels.tips_progress, (TIPS, TIPS_WAS, BLOCK, WAS)
+TURNED = (
+    "orientation",
+    kernels.turn_progress,
+    (f"{TOOL}.orientation", Parent(f"{TOOL}.orientation", 1), f"{GOAL}.orientation"),
+)
+"""Reward terms of several tasks with one block."""

@@ -12,12 +12,18 @@ from scm_world._types import Floats
 from scm_world.geometry import rotation_matrix
 from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, Common, term
+from scm_world.tasks.rewards import Common, weighted
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shapes
 from scm_world.tasks.trifinger.base import TriFingerTask
-from scm_world.tasks.trifinger.entities.block_world import lowest_point
-from scm_world.tasks.trifinger.entities.blocks import ToolBlock, block_mass, block_size, coordinates
+from scm_world.tasks.trifinger.entities.blocks import (
+    ToolBlock,
+    block_mass,
+    block_size,
+    coordinates,
+    lowest_point,
+    stand,
+)
 from scm_world.tasks.trifinger.entities.goals import (
     GoalBlock,
     goal_orientation,
@@ -26,37 +32,27 @@ from scm_world.tasks.trifinger.entities.goals import (
     turned_on_the_floor,
 )
 from scm_world.tasks.trifinger.shapes import Place, Quaternion
-from scm_world.tasks.trifinger.single import SIZE, smoothness
-from scm_world.variables import Affine, Function, Parent, Variable
+from scm_world.tasks.trifinger.shaping import SMOOTHNESS, TIPS, WAS
+from scm_world.tasks.trifinger.single import SIZE
+from scm_world.variables import Affine, Function, Parent
 
 TOWER = "goal_tower"
 TOOLS = ("tool_block_1", "tool_block_2")
 GOALS = ("goal_block_1", "goal_block_2")
+LOWER, UPPER = (f"{name}.cartesian_position" for name in GOALS)
+FIRST, SECOND = ((place, Parent(place, 1)) for place in (f"{t}.cartesian_position" for t in TOOLS))
 GAP = 0.005  # [m] at least between the blocks at the start
 
 
 def tower_center(polar_position: Floats, size: Floats, orientation: Floats) -> Floats:
-    """Put a tower of two blocks on the floor: its lowest point touches it.
-
-    Args:
-        polar_position: Radius [m] and angle [rad], shape (..., 2).
-        size: Edge lengths of a block, shape (..., 3) [m].
-        orientation: Of the tower: quaternion (x, y, z, w), shape (..., 4).
-
-    Returns:
-        The center of the tower, shape (..., 3) [m].
-    """
+    """Put a tower of two blocks of a size on the floor: compute its center, shape (..., 3) [m]."""
     return turned_on_the_floor(polar_position, size * [1.0, 1.0, 2.0], orientation)
 
 
 def floor_of_tower(center: Floats, size: Floats, orientation: Floats, *, side: float) -> Floats:
-    """Find the center of a block of the tower, shape (..., 3) [m].
+    """Compute the center of a block of the tower, shape (..., 3) [m].
 
-    Args:
-        center: Of the tower, shape (..., 3) [m].
-        size: Edge lengths of a block, shape (..., 3) [m].
-        orientation: Of the tower: quaternion (x, y, z, w), shape (..., 4).
-        side: -1 for the lower block, 1 for the upper one.
+    ``side`` is -1 for the lower block, 1 for the upper one.
     """
     upwards = rotation_matrix(orientation)[..., :, 2]
     return np.asarray(center + (0.5 * side) * size[..., 2:] * upwards)
@@ -82,32 +78,17 @@ def beside(size: Floats, orientation: Floats, *, place: Floats, other: Floats) -
     return np.array([x, y, place[2] + lowest_point(size, orientation)])
 
 
-@final
-class GoalTower(Entity):
-    """The place of a tower of two blocks.
-
-    Args:
-        place: Default radius [m] and angle [rad].
-        orientation: Default orientation: quaternion (x, y, z, w).
-    """
-
-    name = TOWER
-
-    def __init__(self, place: tuple[float, float], orientation: Quaternion) -> None:
-        self._place, self._orientation = place, orientation
-
-    def variables(self) -> Iterable[Variable]:
-        """Declare position and orientation, in all coordinates."""
-        yield polar(TOWER, self._place, a=numbers.POLAR_A, b=numbers.POLAR_B)
-        causes = (f"{TOWER}.polar", SIZE, f"{TOWER}.orientation")
-        yield goal_position(TOWER, parents=causes, mechanism=Function(tower_center))
-        yield goal_orientation(TOWER, default=self._orientation)
-        height = Affine(parent=SIZE, index=2)
-        yield from coordinates(
-            TOWER,
-            a=numbers.cylindrical(numbers.RADIUS_A, height, height),
-            b=numbers.cylindrical(numbers.RADIUS_B, height, height),
-        )
+def goal_tower(place: tuple[float, float], orientation: Quaternion) -> Entity:
+    """Describe the place of a tower of two blocks: its default radius and angle, and quaternion."""
+    causes = (f"{TOWER}.polar", SIZE, f"{TOWER}.orientation")
+    a, b = numbers.places(Affine(parent=SIZE, index=2), airborne=False)
+    variables = (
+        polar(TOWER, place),
+        goal_position(TOWER, parents=causes, mechanism=Function(tower_center)),
+        goal_orientation(TOWER, default=orientation),
+        *coordinates(TOWER, a=a, b=b),
+    )
+    return Entity(TOWER, variables)
 
 
 @final
@@ -116,17 +97,6 @@ class Stacking2(TriFingerTask):
 
     All four share the parent ``block.size``. The goals follow ``goal_tower``, whose center is as
     high as a block.
-
-    Reward terms:
-        reward.tips_to_block: How much nearer the three fingertips came to the first block, and to
-            the second one once the first is at its goal [m].
-        reward.block_to_goal: How much nearer the first block came to its goal [m].
-        reward.block_to_height: How much nearer the second block came to the height of its goal
-            afterwards [m].
-        reward.block_to_block: How much nearer it came to the first one, seen from above, while it
-            is higher than its goal [m].
-        reward.smoothness: Minus the change of the joint velocities [rad/s].
-        fractional_success: How much of the two goals the blocks fill.
 
     Args:
         tool_block_mass: Default mass of a block [kg].
@@ -143,14 +113,19 @@ class Stacking2(TriFingerTask):
     """
 
     name = "stacking2"
-    default_weights = {  # noqa: RUF012 # a constant
-        "reward.tips_to_block": 750.0,
-        "reward.block_to_goal": 250.0,
-        "reward.block_to_height": 250.0,
-        "reward.block_to_block": 125.0,
-        "reward.smoothness": 0.005,
-        FRACTION: 1.0,
-    }
+    default_weights, dense_terms = weighted(
+        (
+            750.0,
+            "tips_to_block",
+            kernels.stacking_tips_progress,
+            (TIPS, WAS, *FIRST, *SECOND, LOWER),
+        ),
+        (250.0, "block_to_goal", kernels.placing_progress, (*FIRST, LOWER)),
+        (250.0, "block_to_height", kernels.lifting_progress, (FIRST[0], LOWER, *SECOND, UPPER)),
+        (125.0, "block_to_block", kernels.stacking_progress, (*FIRST, LOWER, *SECOND, UPPER)),
+        (0.005, *SMOOTHNESS),
+        fraction=1.0,
+    )
     goal_causes = (f"{TOWER}.polar", f"{TOWER}.euler_orientation")
     tools, targets = TOOLS, dict(zip(GOALS, TOOLS, strict=True))  # the lower one first
     unchecked = (TOWER,)
@@ -172,6 +147,7 @@ class Stacking2(TriFingerTask):
         self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASSES.bounds)
         edge = checked("tool_block_size", tool_block_size, numbers.BLOCK_SIZES.bounds)
         self._size = (edge, edge, edge)
+        self.roots = (block_size(SIZE, default=self._size),)  # one for all
         given = (
             (tool_block_1_position, tool_block_1_orientation),
             (tool_block_2_position, tool_block_2_orientation),
@@ -181,8 +157,7 @@ class Stacking2(TriFingerTask):
         self._tower_turn = shapes.unit_quaternion("goal_orientation", goal_orientation)
         size, turn = np.array(self._size), np.array(self._tower_turn)
         lower = floor_of_tower(tower_center(np.zeros(2), size, turn), size, turn, side=-1.0)
-        x, y = shapes.floor_place("goal_position", goal_position, float(lower[2]))
-        self._tower = math.hypot(x, y), math.atan2(y, x)
+        self._tower = shapes.floor_place("goal_position", goal_position, float(lower[2]))
 
     def _start(
         self, tool: str, place: Place, orientation: Quaternion
@@ -191,16 +166,12 @@ class Stacking2(TriFingerTask):
         below = lowest_point(np.array(self._size), np.array(turn))
         return shapes.start_place(f"{tool}_position", place, below), turn
 
-    def shared(self) -> Iterable[Variable]:
-        """One size for all."""
-        yield block_size(SIZE, default=self._size)
-
     def entities(self) -> Iterable[Entity]:
         """Two blocks, a tower, and its two floors."""
         first, second = self._places
-        yield self._tool(0, Function(shapes.stand, constants={"place": first}))
+        yield self._tool(0, Function(stand, constants={"place": first}))
         yield self._tool(1, Function(beside, constants={"place": second, "other": first}))
-        yield GoalTower(self._tower, self._tower_turn)
+        yield goal_tower(self._tower, self._tower_turn)
         causes = (f"{TOWER}.cartesian_position", SIZE, f"{TOWER}.orientation")
         for name, side in zip(GOALS, (-1.0, 1.0), strict=True):
             center = Function(floor_of_tower, constants={"side": side})
@@ -215,44 +186,15 @@ class Stacking2(TriFingerTask):
             )
 
     def _tool(self, index: int, start: Function) -> Entity:
-        name, size = TOOLS[index], f"{TOOLS[index]}.size"
-        a, b = shapes.block_spaces(size, airborne=self.conventions.published_spaces)
+        name, size = TOOLS[index], block_size(f"{TOOLS[index]}.size", SIZE, spaces=False)
+        low, airborne = numbers.half_height(size.name), self.conventions.published_spaces
+        a, b = numbers.places(low, airborne=airborne)
         return ToolBlock(
             name,
-            size=block_size(size, SIZE, spaces=False),
+            size=size,
             mass=block_mass(f"{name}.mass", default=self._mass),
             spawn=start,
             a=a,
             b=b,
             orientation=self._turns[index],
         )
-
-    def dense(self) -> Iterable[Variable]:
-        """Declare how blocks and fingers come nearer, and how steady they are."""
-        tips = "end_effector_positions"
-        first, second, goal, top = (f"{name}.cartesian_position" for name in (*TOOLS, *GOALS))
-        yield term(
-            "reward.tips_to_block",
-            kernels.stacking_tips_progress,
-            (tips, Parent(tips, 1), first, Parent(first, 1), second, Parent(second, 1), goal),
-            "How much nearer the fingertips came to the block whose turn it is [m].",
-        )
-        yield term(
-            "reward.block_to_goal",
-            kernels.placing_progress,
-            (first, Parent(first, 1), goal),
-            "How much nearer the first block came to its goal [m].",
-        )
-        yield term(
-            "reward.block_to_height",
-            kernels.lifting_progress,
-            (first, goal, second, Parent(second, 1), top),
-            "How much nearer the second block came to the height of its goal [m].",
-        )
-        yield term(
-            "reward.block_to_block",
-            kernels.stacking_progress,
-            (first, Parent(first, 1), goal, second, Parent(second, 1), top),
-            "How much nearer the second block came to the first one, seen from above [m].",
-        )
-        yield smoothness()

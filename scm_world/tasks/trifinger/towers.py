@@ -4,29 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import lru_cache
-from typing import Any, Unpack, final
+from typing import Unpack, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.tasks.base import checked
-from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, Common
+from scm_world.tasks.rewards import Common
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.base import TriFingerTask
-from scm_world.tasks.trifinger.building import Part, assembled
-from scm_world.tasks.trifinger.entities.block_world import lowest_point
-from scm_world.tasks.trifinger.entities.blocks import ToolBlock
-from scm_world.tasks.trifinger.entities.goals import GoalBlock
-from scm_world.tasks.trifinger.shapes import (
-    MASS,
-    MOST_PARTS,
-    blocks_mass,
-    part_goal,
-    part_tool,
-)
-from scm_world.variables import Function, Variable
+from scm_world.tasks.trifinger.base import Building
+from scm_world.tasks.trifinger.building import MASS, Part, Piece, blocks_mass
+from scm_world.tasks.trifinger.entities.blocks import lowest_point
+from scm_world.variables import Function
 
 DIMS = "tower_dims"
 NUMBER = "number_of_blocks_in_tower"
@@ -40,28 +28,14 @@ Counts = tuple[int, int, int]
 
 
 def part(dims: Floats, number: Value) -> Floats:
-    """Compute the size of a block, shape (..., 3) [m].
-
-    Args:
-        dims: Of the tower, shape (..., 3) [m].
-        number: How many blocks it has along each axis, shape (..., 3).
-    """
+    """Compute the size of a block of the tower, shape (..., 3) [m]."""
     return np.asarray(dims / number)
 
 
 def place(
     dims: Floats, number: Value, center: Floats, *, level: float, col: float, row: float
 ) -> Floats:
-    """Compute the center of a part of the tower, shape (..., 3) [m].
-
-    Args:
-        dims: Of the tower, shape (..., 3) [m].
-        number: How many blocks it has along each axis, shape (..., 3).
-        center: Of its base, x and y, shape (..., 2) [m].
-        level: Which part along z.
-        col: Along y.
-        row: Along x.
-    """
+    """Compute the center of the part with these numbers along z, y and x, shape (..., 3) [m]."""
     corner = np.concatenate([center - dims[..., :2] / 2.0, 0.0 * dims[..., 2:]], axis=-1)
     return np.asarray(corner + (np.array([row, col, level]) + 0.5) * part(dims, number))
 
@@ -76,18 +50,7 @@ def _cells(columns: int, rows: int) -> tuple[tuple[int, int], ...]:
 def start(
     size: Floats, orientation: Floats, number: Value, *, level: float, col: float, row: float
 ) -> Floats:
-    """Compute where a block begins: on the diagonal of the floor, then beside it, then above.
-
-    Args:
-        size: Edge lengths, shape (3,) [m].
-        orientation: Quaternion (x, y, z, w).
-        number: How many blocks the tower has along each axis, shape (3,).
-        level: Which part of the tower it is, along z.
-        col: Along y.
-        row: Along x.
-
-    Returns:
-        The center, shape (3,) [m].
+    """Compute where a block begins: on the diagonal of the floor, then beside it, then above [m].
 
     Source:
         CausalWorld 1.2, ``towers.py``; there the diagonal is all there is, and the blocks rise
@@ -103,38 +66,21 @@ def start(
     return np.array([i * step[0] - first[0], j * step[1] - first[1], height])
 
 
-@lru_cache(maxsize=MOST_PARTS)
-def piece(
-    name: str, *, level: float, col: float, row: float, airborne: bool
-) -> tuple[ToolBlock, GoalBlock]:
-    """Describe a block of a tower, and its place in it.
-
-    Args:
-        name: Of the two, without what tells them apart.
-        level: Which part it is, along z.
-        col: Along y.
-        row: Along x.
-        airborne: Whether its spaces reach into the air, as in the predecessor.
-    """
-    which = {"level": level, "col": col, "row": row}
-    size = ((DIMS, NUMBER), Function(part))
-    where = ((DIMS, NUMBER, CENTER), Function(place, constants=which))
-    first = ((NUMBER,), Function(start, constants=which))
-    return (
-        part_tool(f"tool_{name}", size=size, spawn=first, airborne=airborne),
-        part_goal(f"goal_{name}", size=size, position=where),
+def piece(airborne: bool, **which: float) -> Piece:
+    """Describe where a block of a tower, and its place in it, come from."""
+    return Piece(
+        size=((DIMS, NUMBER), Function(part)),
+        place=((DIMS, NUMBER, CENTER), Function(place, constants=which)),
+        start=((NUMBER,), Function(start, constants=which)),
     )
 
 
 @final
-class Towers(TriFingerTask):
+class Towers(Building):
     """A cuboid on the floor, cut into equal blocks.
 
     Its size, its place and into how many blocks it is cut along each axis are variables. The
     blocks begin beside one another on the floor, and do so again whenever their size changes.
-
-    Reward terms:
-        fractional_success: How much of the tower the blocks fill.
 
     Args:
         tool_block_mass: Default mass of a block [kg].
@@ -150,9 +96,7 @@ class Towers(TriFingerTask):
     name = "towers"
     decided_by = (NUMBER,)
     goal_causes = (NUMBER, MASS, DIMS, CENTER)
-    default_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
-    interleaved = True
-    rest = hardware.RAISED  # the fingers begin out of the way
+    piece = staticmethod(piece)
 
     def __init__(
         self,
@@ -164,11 +108,18 @@ class Towers(TriFingerTask):
         **common: Unpack[Common],
     ) -> None:
         super().__init__(**common)
-        bounds = numbers.TOWER_COUNT.bounds
-        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASSES.bounds)
-        self._number = checked(NUMBER, number_of_blocks_in_tower, bounds, shape=(3,))
-        self._dims = checked(DIMS, tower_dims, numbers.TOWER_DIMS.bounds, shape=(3,))
-        self._center = checked(CENTER, tower_center, numbers.TOWER_CENTER.bounds, shape=(2,))
+        self.roots = (
+            blocks_mass(tool_block_mass),
+            numbers.TOWER_COUNT.option(
+                NUMBER,
+                number_of_blocks_in_tower,
+                "How many blocks the tower has along x, y and z.",
+            ),
+            numbers.TOWER_DIMS.option(DIMS, tower_dims, "Full edge lengths of the tower."),
+            numbers.TOWER_CENTER.option(
+                CENTER, tower_center, "Where the middle of its base is, x and y."
+            ),
+        )
 
     def arrange(self, values: Values) -> Counts:
         """Count the blocks along each axis."""
@@ -177,23 +128,6 @@ class Towers(TriFingerTask):
 
     def parts(self) -> Iterable[Part]:
         """List the blocks, level by level, column by column."""
-        plan: Any = self.plan or self._number
-        for level, col, row in np.ndindex(*(int(count) for count in reversed(plan))):
+        for level, col, row in np.ndindex(*reversed(self.arranged)):
             which = {"level": float(level), "col": float(col), "row": float(row)}
             yield f"level_{level}_col_{col}_row_{row}", which
-
-    def entities(self) -> Iterable[Entity]:
-        """The blocks, and their places in the tower."""
-        airborne = self.conventions.published_spaces
-        return assembled(self.parts(), piece, self.targets, airborne=airborne)
-
-    def shared(self) -> Iterable[Variable]:
-        """Declare the tower."""
-        yield blocks_mass(self._mass)
-        yield numbers.TOWER_COUNT.root(
-            NUMBER, self._number, "How many blocks the tower has along x, y and z."
-        )
-        yield numbers.TOWER_DIMS.root(DIMS, self._dims, "Full edge lengths of the tower.")
-        yield numbers.TOWER_CENTER.root(
-            CENTER, self._center, "Where the middle of its base is, x and y."
-        )

@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from functools import lru_cache
+from collections.abc import Iterable
 from typing import Any, ClassVar, Unpack, final
 
 import numpy as np
 
 from scm_world._types import Value, Values
 from scm_world.errors import InterventionError
-from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, Common
+from scm_world.tasks.rewards import Common
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware, layouts
-from scm_world.tasks.trifinger.base import TriFingerTask
-from scm_world.tasks.trifinger.building import Part, assembled
-from scm_world.tasks.trifinger.entities.blocks import ToolBlock
-from scm_world.tasks.trifinger.entities.goals import GoalBlock
-from scm_world.tasks.trifinger.scattered import COUNT, obstacle_names, scattered, scattering
-from scm_world.tasks.trifinger.shapes import (
-    MASS,
-    MOST_PARTS,
-    blocks_mass,
-    part_goal,
-    part_tool,
+from scm_world.tasks.trifinger.base import Building
+from scm_world.tasks.trifinger.building import MASS, Part, Piece, blocks_mass
+from scm_world.tasks.trifinger.entities.obstacles import (
+    COUNT,
+    obstacle_names,
+    scattered,
+    scattering,
 )
-from scm_world.variables import Box, Categories, Derived, Exogenous, Function, Variable
+from scm_world.variables import Box, Categories, Derived, Function, Variable
 from scm_world.variables.kinds import SpaceName
 
 LEVELS = "stack_levels"
@@ -41,37 +35,23 @@ RANDOM = 1  # the category of ``wall_pattern``
 LOW = 0.25  # [m] what is lower fits under the raised fingers
 
 
-@lru_cache(maxsize=MOST_PARTS)
-def brick(name: str, *, level: float, num: float, airborne: bool) -> tuple[ToolBlock, GoalBlock]:
-    """Describe a block of a wall, and its place in it.
-
-    Args:
-        name: Of the two, without what tells them apart.
-        level: In which level it is.
-        num: Which of it.
-        airborne: Whether it begins in the air, as in the predecessor.
-    """
-    which = {"level": level, "num": num}
-    size = ((LAYOUT, SIZE), Function(layouts.brick_size, constants=which))
-    where = ((LAYOUT, SIZE), Function(layouts.brick_place, constants=which))
+def piece(airborne: bool, **which: float) -> Piece:
+    """Describe where a block of a wall, and its place in it, come from."""
     first = Function(layouts.start, constants={**which, "airborne": float(airborne)})
-    spawn = ((LAYOUT, SIZE, PATTERN), first)
-    return (
-        part_tool(f"tool_{name}", size=size, spawn=spawn, airborne=airborne),
-        part_goal(f"goal_{name}", size=size, position=where),
+    return Piece(
+        size=((LAYOUT, SIZE), Function(layouts.brick_size, constants=which)),
+        place=((LAYOUT, SIZE), Function(layouts.brick_place, constants=which)),
+        start=((LAYOUT, SIZE, PATTERN), first),
     )
 
 
-class StackedBlocks(TriFingerTask):
+class StackedBlocks(Building):
     """A wall, regular or random; each block has its place in it.
 
     How many levels it has, how wide it is and how small its blocks are, are variables, and so is
     the noise of a random wall: an intervention on one of the others keeps it; draw ``wall_noise``
     for another wall. The layout follows from them, or can be set as a whole. The fingers begin
     raised: at rest they would stand where larger blocks begin.
-
-    Reward terms:
-        fractional_success: How much of the wall the blocks fill.
 
     Args:
         tool_block_mass: Default mass of a block [kg].
@@ -90,9 +70,7 @@ class StackedBlocks(TriFingerTask):
     name = "stacked_blocks"
     decided_by: ClassVar[tuple[str, ...]] = (LAYOUT,)
     goal_causes = (LEVELS, MASS, SIZE, WIDTH, NOISE)
-    default_weights: ClassVar[Mapping[str, float]] = {FRACTION: 1.0}
-    interleaved = True
-    rest = hardware.RAISED
+    piece = staticmethod(piece)
     levels: ClassVar[numbers.Range] = numbers.STACK_LEVELS
 
     def __init__(
@@ -105,10 +83,33 @@ class StackedBlocks(TriFingerTask):
         **common: Unpack[Common],
     ) -> None:
         super().__init__(**common)
-        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASSES.bounds)
-        self._size = checked(SIZE, blocks_min_size, numbers.MIN_SIZE.bounds)
-        self._levels = checked("num_of_levels", num_of_levels, numbers.STACK_LEVELS.bounds)
-        self._width = checked(WIDTH, max_level_width, numbers.LEVEL_WIDTH.bounds)
+        self.roots = (
+            blocks_mass(tool_block_mass),
+            self.levels.option(
+                LEVELS,
+                num_of_levels,
+                "How many levels the wall has, as far as they fit into the arena.",
+                "num_of_levels",
+            ),
+            numbers.MIN_SIZE.option(
+                SIZE, blocks_min_size, "Depth and height of every block, and the least width."
+            ),
+            numbers.LEVEL_WIDTH.option(
+                WIDTH,
+                max_level_width,
+                "Greatest width of a level; it is never narrower than a block.",
+            ),
+            *_noise(),
+            Derived(
+                name=LAYOUT,
+                unit="m",
+                shape=layouts.SHAPE,
+                bounds=Box(-0.3, 0.3),
+                parents=(LEVELS, SIZE, WIDTH, PATTERN, NOISE),
+                mechanism=Function(layouts.layout),
+                doc="For each place in each level: x and y of a block, and its width, or zero.",
+            ),
+        )
 
     def arrange(self, values: Values) -> Any:
         """Count the blocks of each level.
@@ -122,26 +123,17 @@ class StackedBlocks(TriFingerTask):
             raise InterventionError(message, variable=LAYOUT)
         return counts
 
+    @property
     def counts(self) -> tuple[int, ...]:
-        """Return how many blocks each level has."""
-        return self.plan or self.regular()  # type: ignore[return-value] # from ``arrange``
-
-    def regular(self) -> tuple[int, ...]:
-        """Count the blocks of each level of the wall that there is without interventions."""
-        levels, size, width = (np.array(x) for x in (self._levels, self._size, self._width))
-        unused = np.zeros((layouts.MAX_LEVELS, 3))
-        return layouts.counts(layouts.layout(levels, size, width, np.array(0), unused))
+        """How many blocks each level has."""
+        found: tuple[int, ...] = self.arranged
+        return found
 
     def parts(self) -> Iterable[Part]:
         """List the blocks, level by level."""
-        for level, count in enumerate(self.counts()):
+        for level, count in enumerate(self.counts):
             for num in range(count):
                 yield f"level_{level}_num_{num}", {"level": float(level), "num": float(num)}
-
-    def entities(self) -> Iterable[Entity]:
-        """The blocks, and their places in the wall."""
-        airborne = self.conventions.published_spaces
-        return assembled(self.parts(), brick, self.targets, airborne=airborne)
 
     def solution(self, values: Values) -> dict[str, Value]:
         """Build the wall: all of it, so that it stands, with the fingers out of its way."""
@@ -150,7 +142,7 @@ class StackedBlocks(TriFingerTask):
             place = layouts.brick_place(values[LAYOUT], values[SIZE], **which)
             found[f"tool_{name}.cartesian_position"] = place
             found[f"tool_{name}.orientation"] = np.array(numbers.IDENTITY)
-        if len(self.counts()) * float(values[SIZE]) > LOW:
+        if len(self.counts) * float(values[SIZE]) > LOW:
             found["joint_positions"] = np.array(hardware.ASIDE)
         return found
 
@@ -171,59 +163,18 @@ class StackedBlocks(TriFingerTask):
         """Draw a new random wall."""
         return {**super().sample_goal(space), PATTERN: RANDOM}
 
-    def shared(self) -> Iterable[Variable]:
-        """Declare the wall."""
-        yield blocks_mass(self._mass)
-        yield from self._numbers()
-        yield from _noise()
-        yield Derived(
-            name=LAYOUT,
-            unit="m",
-            shape=layouts.SHAPE,
-            bounds=Box(-0.3, 0.3),
-            parents=(LEVELS, SIZE, WIDTH, PATTERN, NOISE),
-            mechanism=Function(layouts.layout),
-            doc="For each place in each level: x and y of a block, and its width, or zero.",
-        )
-
-    def _numbers(self) -> Iterable[Variable]:
-        """Declare what the predecessor has too."""
-        yield self.levels.root(
-            LEVELS, self._levels, "How many levels the wall has, as far as they fit into the arena."
-        )
-        yield numbers.MIN_SIZE.root(
-            SIZE, self._size, "Depth and height of every block, and the least width."
-        )
-        yield numbers.LEVEL_WIDTH.root(
-            WIDTH, self._width, "Greatest width of a level; it is never narrower than a block."
-        )
-
 
 def _noise() -> Iterable[Variable]:
     """Declare what the predecessor takes from a global generator."""
-    both = Categories((0, RANDOM))
-    yield Exogenous(
-        name=PATTERN,
-        dtype="categorical",
-        bounds=both,
-        a=both,
-        b=both,
-        default=0,
-        doc="How the blocks are laid out: 0 is regular, 1 is random.",
+    both, unit = Categories((0, RANDOM)), Box(0.0, 1.0)
+    yield numbers.Range(both, both, both, dtype="categorical").declare(
+        PATTERN, 0, "How the blocks are laid out: 0 is regular, 1 is random."
     )
-    unit = Box(0.0, 1.0)
-    yield Exogenous(
-        name=NOISE,
-        shape=(layouts.MAX_LEVELS, 3),
-        bounds=unit,
-        a=unit,
-        b=unit,
-        default=(0.5,) * (3 * layouts.MAX_LEVELS),
-        doc="What a random wall is made of: x, y and width of each level, as fractions.",
+    yield numbers.Range(unit, unit, unit, shape=(layouts.MAX_LEVELS, 3)).declare(
+        NOISE,
+        (0.5,) * (3 * layouts.MAX_LEVELS),
+        "What a random wall is made of: x, y and width of each level, as fractions.",
     )
-
-
-Plan = tuple[tuple[int, ...], int]
 
 
 @final
@@ -232,9 +183,6 @@ class CreativeStackedBlocks(StackedBlocks):
 
     What is between the two, the robot has to make up. Small boxes may be in the way. The other
     variables are those of ``StackedBlocks``.
-
-    Reward terms:
-        fractional_success: How much of the two levels the blocks fill.
 
     Args:
         tool_block_mass: Default mass of a block [kg].
@@ -266,36 +214,30 @@ class CreativeStackedBlocks(StackedBlocks):
             max_level_width=max_level_width,
             **common,
         )
-        self._obstacles = number_of_obstacles
+        self.roots += (*scattering(number_of_obstacles),)
 
-    def arrange(self, values: Values) -> Plan:
+    def arrange(self, values: Values) -> tuple[tuple[int, ...], int]:
         """Count the blocks of each level, and the obstacles."""
         return super().arrange(values), int(values[COUNT])
 
+    @property
     def counts(self) -> tuple[int, ...]:
-        """Return how many blocks each level has."""
-        return self._arranged()[0]
+        """How many blocks each level has."""
+        found: tuple[int, ...] = self.arranged[0]
+        return found
 
     @property
     def targets(self) -> dict[str, str]:
         """The goals of the first level and of the last."""
-        ends = (0, len(self.counts()) - 1)
+        ends = (0, len(self.counts) - 1)
         return {f"goal_{p}": f"tool_{p}" for p, which in self.parts() if which["level"] in ends}
 
     @property
     def obstacles(self) -> tuple[str, ...]:
         """The small boxes."""
-        return obstacle_names(self._arranged()[1])
-
-    def _arranged(self) -> Plan:
-        return self.plan or (self.regular(), self._obstacles)  # type: ignore[return-value] # from ``arrange``
+        return obstacle_names(self.arranged[1])
 
     def entities(self) -> Iterable[Entity]:
         """The wall, and small boxes."""
         yield from super().entities()
-        yield from scattered(self._arranged()[1])
-
-    def shared(self) -> Iterable[Variable]:
-        """Declare the wall, and where obstacles are."""
-        yield from super().shared()
-        yield from scattering(self._obstacles)
+        yield from scattered(self.arranged[1])

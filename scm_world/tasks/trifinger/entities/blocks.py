@@ -1,8 +1,8 @@
-"""Blocks that can be moved."""
+"""Blocks that can be moved, and what they have in common with goals and obstacles."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, final
 
@@ -11,29 +11,54 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.geometry.coordinates import from_cylindrical, to_cylindrical
 from scm_world.geometry.hulls import Hull
-from scm_world.geometry.rotations import from_rotation_vector, to_rotation_vector
-from scm_world.models import ParameterKey
-from scm_world.tasks.composition import Entity, StateDeclaration
+from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix, to_rotation_vector
+from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger.entities.block_world import lowest_point
-from scm_world.variables import Box, Derived, Exogenous, Fixed, Function, Variable
+from scm_world.variables import Box, Categories, Fixed, Function, Measured, Variable
 
-CUBOID = 1  # the published type ids
-MESH = 2
+TYPES = {"block": (1, 2), "obstacle": (10, 10), "goal": (20, 23), "sphere": (21, 21)}
+"""The published ids of kinds of objects: of boxes, and of those with another shape."""
+
+ZERO = (0.0, 0.0, 0.0)
 
 
-def standing(size: Floats, orientation: Floats, *, place: Floats) -> Floats:
-    """Stand a block on the floor.
+def lowest_point(size: Floats, orientation: Floats, *corners: Floats) -> float:
+    """Compute how far a body reaches below its center [m].
 
     Args:
-        size: Edge lengths, shape (3,) [m].
+        size: Edge lengths of a box, shape (3,) [m].
         orientation: Quaternion (x, y, z, w).
-        place: x and y of the center, and the height of the lowest point, shape (3,) [m].
-
-    Returns:
-        The center, shape (3,) [m].
+        corners: Those of a hull, shape (n, 3) [m]; none for a box.
     """
-    return np.array([place[0], place[1], place[2] + lowest_point(size, orientation)])
+    if corners:
+        return -float((corners[0] @ rotation_matrix(orientation)[2]).min())
+    x, y, z, w = orientation.tolist()
+    length, width, height = size.tolist()
+    row = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
+    return 0.5 * float(abs(row[0]) * length + abs(row[1]) * width + abs(row[2]) * height)
+
+
+def stand(size: Floats, orientation: Floats, *corners: Floats, place: Floats) -> Floats:
+    """Stand a body on the floor: compute its center, shape (3,) [m]; see ``lowest_point``.
+
+    ``place`` is x and y of the center, and the height of the lowest point, shape (3,) [m].
+    """
+    return np.array([place[0], place[1], place[2] + lowest_point(size, orientation, *corners)])
+
+
+def keep_lowest_point(position: Floats, *parents: Floats, form: float = 2.0) -> Floats:
+    """Raise or lower the center so that the lowest point stays where it was.
+
+    A block that grows does not sink into the floor, and one that shrinks does not hang above it.
+
+    Args:
+        position: Of the center, shape (3,) [m].
+        parents: What ``lowest_point`` takes and what else moves it, before; then the same after.
+        form: How many of them ``lowest_point`` takes.
+    """
+    before, after = parents[: len(parents) // 2], parents[len(parents) // 2 :]
+    lift = lowest_point(*after[: int(form)]) - lowest_point(*before[: int(form)])
+    return np.array([position[0], position[1], position[2] + lift])
 
 
 def constantly(*_: Floats, value: Floats) -> Floats:
@@ -41,31 +66,29 @@ def constantly(*_: Floats, value: Floats) -> Floats:
     return value
 
 
-def keep_lowest_point(position: Floats, *parents: Floats) -> Floats:
-    """Raise or lower the center so that the lowest point stays where it was.
+def looks(
+    name: str, kind: str, color: tuple[float, float, float], hull: Hull | None = None
+) -> tuple[Variable, Variable]:
+    """Declare the type and the color of a body or goal."""
+    published = Fixed(
+        name=f"{name}.type",
+        dtype="categorical",
+        bounds=Categories((1, 2, 10, 20, 21, 23)),
+        value=TYPES[kind][hull is not None],
+        doc="Published id of the kind of object.",
+    )
+    return published, numbers.color(f"{name}.color", color)
 
-    A block that grows does not sink into the floor, and one that shrinks does not hang above it.
 
-    Args:
-        position: Of the center, shape (3,) [m].
-        parents: Size, orientation and what else moves it, before; then the same after.
-    """
-    size, orientation = parents[:2]
-    new_size, new_orientation = parents[len(parents) // 2 :][:2]
-    lift = lowest_point(new_size, new_orientation) - lowest_point(size, orientation)
-    return np.array([position[0], position[1], position[2] + lift])
-
-
-_KEEP, _CYLINDRICAL = Function(keep_lowest_point), Function(to_cylindrical)
-_TO_VECTOR, _FROM_VECTOR = Function(to_rotation_vector), Function(from_rotation_vector)
+_COORDINATES = (Function(to_cylindrical), Function(to_rotation_vector))
+_FROM_VECTOR = Function(from_rotation_vector)
 
 
 def coordinates(
     entity: str,
     *,
-    a: Box | None,
-    b: Box | None,
-    orientation: bool = True,
+    a: Box | None = None,
+    b: Box | None = None,
     yaw: bool = True,
     inverse: Callable[[Floats], Floats] = from_cylindrical,
 ) -> Iterable[Variable]:
@@ -75,33 +98,25 @@ def coordinates(
         entity: Prefix.
         a: Space A of the cylindrical position.
         b: Space B of it.
-        orientation: Whether there is an orientation.
         yaw: Whether A and B of the rotation vector are the turns about z, or there are none.
         inverse: Cartesian position where a cylindrical one is set.
     """
-    yield Derived(
-        name=f"{entity}.cylindrical_position",
-        unit="m, rad, m",
-        shape=(3,),
-        a=a,
-        b=b,
-        parents=(f"{entity}.cartesian_position",),
-        mechanism=_CYLINDRICAL,
+    yield numbers.Range(None, a, b, "m, rad, m", (3,)).declare(
+        f"{entity}.cylindrical_position",
+        None,
+        "Position as radius, angle and height; setting it sets the Cartesian position.",
+        (f"{entity}.cartesian_position",),
+        _COORDINATES[0],
         inverse=inverse,
-        doc="Position as radius, angle and height; setting it sets the Cartesian position.",
     )
-    if orientation:
-        yield Derived(
-            name=f"{entity}.euler_orientation",
-            unit="rad",
-            shape=(3,),
-            a=numbers.YAW if yaw else None,
-            b=numbers.YAW if yaw else None,
-            parents=(f"{entity}.orientation",),
-            mechanism=_TO_VECTOR,
-            inverse=_FROM_VECTOR,
-            doc="Orientation as a rotation vector; setting it sets the quaternion.",
-        )
+    yield (numbers.YAWS if yaw else numbers.TURNS).declare(
+        f"{entity}.euler_orientation",
+        None,
+        "Orientation as a rotation vector; setting it sets the quaternion.",
+        (f"{entity}.orientation",),
+        _COORDINATES[1],
+        inverse=_FROM_VECTOR,
+    )
 
 
 @final
@@ -112,19 +127,15 @@ class ToolBlock(Entity):
         name: Prefix of its variables.
         size: The declaration of ``<name>.size``; see ``block_size``.
         mass: Of ``<name>.mass``; see ``block_mass``.
-        place: x, y of the center at the start and height of its lowest point [m].
-        spawn: Instead of ``place``: how it stands at the start as a function of its size, its
-            orientation and of what ``spawn_from`` names. Setting one of those puts it there
-            again.
-        spawn_from: Further causes of the place at the start.
+        spawn: How it stands at the start as a function of its size, its orientation and of what
+            ``spawn_from`` names. Setting one of those puts it there again.
+        spawn_from: Further causes of the place at the start; the corners of a hull come first.
         spawn_again: Whether a size that is set does so too; else the block then keeps its lowest
             point.
         a: Space A of the cylindrical position.
         b: Space B of it.
-        hull: Its shape, if it is no box. The size is then a constant.
+        hull: Its shape, if it is not a box. The size is then a constant.
         orientation: How it begins turned: quaternion (x, y, z, w).
-        carry: Instead of keeping the lowest point of a box: where its center goes as it is turned
-            or changes its size.
     """
 
     def __init__(
@@ -133,7 +144,6 @@ class ToolBlock(Entity):
         *,
         size: Variable,
         mass: Variable,
-        place: tuple[float, float, float] = (0.0, 0.0, 0.0),
         spawn: Function | None = None,
         spawn_from: tuple[str, ...] = (),
         spawn_again: bool = False,
@@ -141,106 +151,48 @@ class ToolBlock(Entity):
         b: Box | None = None,
         hull: Hull | None = None,
         orientation: tuple[float, float, float, float] = numbers.IDENTITY,
-        carry: Function | None = None,
     ) -> None:
-        self.name = name
-        self._size, self._mass = size, mass
-        self._spawn = spawn or Function(standing, constants={"place": place})
-        self._spawn_from = spawn_from
-        self._restart = (*spawn_from, self._v("size")) if spawn_again else spawn_from
-        self._again = self._restart if spawn_again else ()
-        self._a, self._b = a, b
-        self._hull, self._orientation, self._carry = hull, orientation, carry or _KEEP
+        restart = (*spawn_from, size.name) if spawn_again else spawn_from
 
-    @property
-    def is_block(self) -> bool:
-        """A block it is."""
-        return True
+        def moving(what: str, kind: numbers.Range, default: Any, doc: str) -> Measured:
+            """Declare a state that is as at the start when the block is put there again."""
+            if not spawn_again:
+                return kind.state(f"{name}.{what}", default, doc)
+            value = numbers.IDENTITY if what == "orientation" else default
+            start = Function(constantly, constants={"value": value})
+            how: dict[str, Any] = {"on_set": restart, "start": start, "restart": restart}
+            return kind.state(f"{name}.{what}", default, doc, **how)
 
-    @property
-    def hull(self) -> Hull | None:
-        """The shape of a block that is no box."""
-        return self._hull
-
-    def _v(self, quantity: str) -> str:
-        return f"{self.name}.{quantity}"
-
-    def variables(self) -> Iterable[Variable]:
-        """Declare type, size, mass, friction, color and the other coordinates of the pose."""
-        yield object_type(self._v("type"), CUBOID if self._hull is None else MESH)
-        yield self._size
-        yield self._mass
-        yield numbers.BLOCK_FRICTIONS.root(
-            self._v("friction"),
+        kind, paint = looks(name, "block", numbers.BLOCK_COLOR, hull)
+        friction = numbers.BLOCK_FRICTIONS.declare(
+            f"{name}.friction",
             numbers.BLOCK_FRICTION,
             "Friction of its surface; a contact has the product of two frictions.",
         )
-        yield color(self._v("color"), numbers.BLOCK_COLOR)
-        yield from coordinates(self.name, a=self._a, b=self._b)
-
-    def states(self) -> Iterable[StateDeclaration]:
-        """Declare pose and velocities."""
-        position, orientation = self._v("cartesian_position"), self._v("orientation")
-        linear, angular = self._v("linear_velocity"), self._v("angular_velocity")
-        yield StateDeclaration(
-            position,
-            "m",
-            (3,),
-            numbers.POSITION_BOUNDS,
-            (0.0, 0.0, 0.0),
+        place = numbers.POSITIONS.state(
+            f"{name}.cartesian_position",
+            ZERO,
             "Position of the center.",
-            on_set=(self._v("size"), orientation, *self._spawn_from),
-            start=self._spawn,
-            carry=self._carry,
-            restart=self._restart,
+            (size.name, f"{name}.orientation", *spawn_from),
+            start=spawn or Function(stand, constants={"place": ZERO}),
+            carry=Function(keep_lowest_point, constants={} if hull is None else {"form": 3.0}),
+            restart=restart,
         )
-        yield StateDeclaration(
-            orientation,
-            "1",
-            (4,),
-            numbers.QUATERNION_BOUNDS,
-            self._orientation,
-            "Orientation as a unit quaternion (x, y, z, w) with w >= 0.",
-            **self._respawn(numbers.IDENTITY),
+        doc = "Orientation as a unit quaternion (x, y, z, w) with w >= 0."
+        turn = moving("orientation", numbers.ORIENTATIONS, orientation, doc)
+        doc = "Velocity of the center."
+        slide = moving("linear_velocity", numbers.LINEAR_VELOCITIES, ZERO, doc)
+        doc = "Angular velocity in the world frame."
+        spin = moving("angular_velocity", numbers.ANGULAR_VELOCITIES, ZERO, doc)
+        own = (kind, size, mass, friction, paint, *coordinates(name, a=a, b=b))
+        set_by = ("mass", "friction", "color") if hull else ("mass", "size", "friction", "color")
+        super().__init__(
+            name,
+            (*own, place, turn, slide, spin),
+            {f"{name}.{quantity}": (name, quantity) for quantity in set_by},
+            kind="block",
+            hull=hull,
         )
-        yield StateDeclaration(
-            linear,
-            "m/s",
-            (3,),
-            numbers.LINEAR_VELOCITY_BOUNDS,
-            (0.0, 0.0, 0.0),
-            "Velocity of the center.",
-            **self._respawn((0.0, 0.0, 0.0)),
-        )
-        yield StateDeclaration(
-            angular,
-            "rad/s",
-            (3,),
-            numbers.ANGULAR_VELOCITY_BOUNDS,
-            (0.0, 0.0, 0.0),
-            "Angular velocity in the world frame.",
-            **self._respawn((0.0, 0.0, 0.0)),
-        )
-
-    def _respawn(self, value: tuple[float, ...]) -> dict[str, Any]:
-        """Say that a state is as it was at the start when the block is put there again."""
-        if not self._again:
-            return {}
-        start = Function(constantly, constants={"value": value})
-        return {"on_set": self._again, "start": start, "restart": self._again}
-
-    def parameters(self) -> Mapping[str, ParameterKey]:
-        """Say which variable sets which physical parameter."""
-        own = ("mass", "friction", "color") if self._hull else ("mass", "size", "friction", "color")
-        return {self._v(quantity): (self.name, quantity) for quantity in own}
-
-
-def same(parent: Floats) -> Floats:
-    """Copy the value of the parent."""
-    return parent
-
-
-_COPY = Function(same)
 
 
 def block_size(
@@ -259,10 +211,7 @@ def block_size(
         spaces: Whether it has the spaces A and B of a block.
     """
     kind = numbers.BLOCK_SIZES if spaces else replace(numbers.BLOCK_SIZES, a=None, b=None)
-    doc = "Full edge lengths."
-    if size_from is None:
-        return kind.root(name, default, doc)
-    return kind.derived(name, (size_from,), _COPY, doc)
+    return kind.declare(name, default, "Full edge lengths.", (size_from,) if size_from else ())
 
 
 def block_mass(
@@ -275,34 +224,5 @@ def block_mass(
         mass_from: The variable that it copies.
         default: Of a root [kg].
     """
-    kind, doc = numbers.BLOCK_MASSES, "Mass; the inertia of the solid follows from it."
-    if mass_from is None:
-        return kind.root(name, default, doc)
-    return kind.derived(name, (mass_from,), _COPY, doc)
-
-
-def hull_size(name: str, size: tuple[float, float, float]) -> Fixed:
-    """Declare the edge lengths of the box around a hull, which cannot change [m]."""
-    return Fixed(
-        name=name,
-        unit="m",
-        shape=(3,),
-        value=size,
-        doc="Edge lengths of the box around the shape, in its own frame.",
-    )
-
-
-def object_type(name: str, value: int) -> Fixed:
-    """Declare the published id of the kind of object, which cannot change."""
-    return Fixed(
-        name=name,
-        dtype="categorical",
-        bounds=numbers.TYPE_BOUNDS,
-        value=value,
-        doc="Published id of the kind of object.",
-    )
-
-
-def color(name: str, default: tuple[float, float, float]) -> Exogenous:
-    """Declare a color. Space A is dark and B is bright, as in the paper."""
-    return numbers.COLOR.root(name, default, "Red, green and blue; nothing physical depends on it.")
+    doc = "Mass; the inertia of the solid follows from it."
+    return numbers.BLOCK_MASSES.declare(name, default, doc, (mass_from,) if mass_from else ())

@@ -3,40 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import final
 
 import numpy as np
 
-from scm_world._types import Floats, Values
+from scm_world._types import Floats
 from scm_world.geometry import from_cylindrical, rotation_matrix
 from scm_world.geometry.hulls import Hull
-from scm_world.models import GoalRegion
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger.entities.blocks import color, coordinates, object_type, same
-from scm_world.variables import Box, Exogenous, Function, Variable
-
-SILHOUETTE_CUBOID = 20
-SILHOUETTE_SPHERE = 21
-SILHOUETTE_MESH = 23
+from scm_world.tasks.trifinger.entities.blocks import ZERO, coordinates, looks
+from scm_world.variables import Box, Function, Variable
 
 
-def on_the_floor(polar: Floats, size: Floats) -> Floats:
-    """Put a box on the floor at a radius and an angle.
-
-    Args:
-        polar: Radius [m] and angle [rad], shape (..., 2).
-        size: Edge lengths, shape (..., 3) [m].
-
-    Returns:
-        The center, shape (..., 3) [m].
-    """
+def on_the_floor(polar: Floats, height: Floats) -> Floats:
+    """Compute a center, shape (..., 3) [m], from radius [m] and angle [rad], and its height [m]."""
     radius, angle = polar[..., 0], polar[..., 1]
-    center = np.empty((*np.broadcast_shapes(polar.shape[:-1], size.shape[:-1]), 3))
-    center[..., 0] = radius * np.cos(angle)
-    center[..., 1] = radius * np.sin(angle)
-    center[..., 2] = size[..., 2] / 2.0
-    return center
+    planar = radius * np.cos(angle), radius * np.sin(angle)
+    return np.stack(np.broadcast_arrays(*planar, height), axis=-1)
 
 
 def turned_on_the_floor(polar: Floats, size: Floats, orientation: Floats) -> Floats:
@@ -50,8 +35,8 @@ def turned_on_the_floor(polar: Floats, size: Floats, orientation: Floats) -> Flo
     Returns:
         The center, shape (..., 3) [m].
     """
-    height = (np.abs(rotation_matrix(orientation)[..., 2, :]) * size).sum(axis=-1, keepdims=True)
-    return on_the_floor(polar, np.broadcast_to(height, (*height.shape[:-1], 3)))
+    height = (np.abs(rotation_matrix(orientation)[..., 2, :]) * size).sum(axis=-1)
+    return on_the_floor(polar, height / 2.0)
 
 
 def goal_position(
@@ -59,13 +44,11 @@ def goal_position(
     *,
     parents: tuple[str, ...] = (),
     mechanism: Function | None = None,
-    default: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    default: tuple[float, float, float] = ZERO,
 ) -> Variable:
     """Declare the center of a goal: a root, or where a mechanism puts it [m]."""
-    quantity, doc = f"{name}.cartesian_position", "Position of the center."
-    if mechanism is None:
-        return numbers.POSITIONS.root(quantity, default, doc)
-    return numbers.POSITIONS.derived(quantity, parents, mechanism, doc)
+    doc = "Position of the center."
+    return numbers.POSITIONS.declare(f"{name}.cartesian_position", default, doc, parents, mechanism)
 
 
 def goal_orientation(
@@ -75,47 +58,22 @@ def goal_orientation(
     mechanism: Function | None = None,
     default: tuple[float, float, float, float] = numbers.IDENTITY,
 ) -> Variable:
-    """Declare the orientation of a goal: a root, or what a mechanism makes it."""
-    quantity, doc = f"{name}.orientation", "Orientation as a unit quaternion (x, y, z, w)."
-    if not parents:
-        return numbers.ORIENTATIONS.root(quantity, default, doc)
-    return numbers.ORIENTATIONS.derived(quantity, parents, mechanism or Function(same), doc)
+    """Declare the orientation of a goal or obstacle: a root, a copy, or what a mechanism makes."""
+    doc = "Orientation as a unit quaternion (x, y, z, w)."
+    return numbers.ORIENTATIONS.declare(f"{name}.orientation", default, doc, parents, mechanism)
 
 
-def polar(name: str, default: tuple[float, float], *, a: Box, b: Box) -> Exogenous:
-    """Declare radius and angle of something that stands on the floor [m, rad]."""
-    return Exogenous(
-        name=f"{name}.polar",
-        unit="m, rad",
-        shape=(2,),
-        bounds=numbers.POLAR_BOUNDS,
-        a=a,
-        b=b,
-        default=default,
-        doc="Radius and angle of its center; the height follows from the size.",
-    )
-
-
-class _Goal(Entity):
-    """What boxes, hulls and spheres have in common."""
-
-    def _v(self, quantity: str) -> str:
-        return f"{self.name}.{quantity}"
-
-    def _silhouette(self, shape: str, values: Values, hull: Hull | None = None) -> GoalRegion:
-        return GoalRegion(
-            name=self.name,
-            shape=shape,
-            size=values[self._v("size")],
-            position=values[self._v("cartesian_position")],
-            orientation=values[self._v("orientation")],
-            color=values[self._v("color")],
-            hull=hull,
-        )
+def polar(
+    name: str, default: tuple[float, float], spaces: tuple[Box, Box] | None = None
+) -> Variable:
+    """Declare radius and angle of something on the floor [m, rad], with other spaces A and B."""
+    kind = numbers.POLAR if spaces is None else replace(numbers.POLAR, a=spaces[0], b=spaces[1])
+    doc = "Radius and angle of its center; the height follows from the size."
+    return kind.declare(f"{name}.polar", default, doc)
 
 
 @final
-class GoalBlock(_Goal):
+class GoalBlock(Entity):
     """A place that a block should fill.
 
     Args:
@@ -126,7 +84,7 @@ class GoalBlock(_Goal):
         a: Space A of the cylindrical position.
         b: Space B of it.
         yaw: Whether turns about z are in the spaces of the rotation vector.
-        hull: Its shape, if it is no box.
+        hull: Its shape, if it is not a box.
         inverse: Cartesian position where a cylindrical one is set.
     """
 
@@ -142,73 +100,22 @@ class GoalBlock(_Goal):
         hull: Hull | None = None,
         inverse: Callable[[Floats], Floats] = from_cylindrical,
     ) -> None:
-        self.name = name
-        self._size, self._pose = size, tuple(pose)
-        self._inverse = inverse
-        self._a, self._b, self._yaw = a, b, yaw
-        self._shape = hull
-
-    def variables(self) -> Iterable[Variable]:
-        """Declare place, orientation, size and color."""
-        kind = SILHOUETTE_CUBOID if self._shape is None else SILHOUETTE_MESH
-        yield object_type(self._v("type"), kind)
-        yield self._size
-        yield from self._pose
-        yield color(self._v("color"), numbers.GOAL_COLOR)
-        yield from coordinates(
-            self.name, a=self._a, b=self._b, yaw=self._yaw, inverse=self._inverse
-        )
-
-    def goal(self, values: Values) -> GoalRegion:
-        """Describe the silhouette."""
-        return self._silhouette("box" if self._shape is None else "hull", values, self._shape)
+        kind, paint = looks(name, "goal", numbers.GOAL_COLOR, hull)
+        others = coordinates(name, a=a, b=b, yaw=yaw, inverse=inverse)
+        super().__init__(name, (kind, size, *pose, paint, *others), kind="goal", hull=hull)
 
 
-@final
-class GoalSphere(_Goal):
-    """A ball that a fingertip should reach.
-
-    Args:
-        name: Prefix of its variables.
-        position: Default center [m].
-        radius: Default radius [m].
-        tint: Default color.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        *,
-        position: tuple[float, float, float],
-        radius: float,
-        tint: tuple[float, float, float],
-    ) -> None:
-        self.name = name
-        self._position = position
-        self._radius = radius
-        self._tint = tint
-
-    def variables(self) -> Iterable[Variable]:
-        """Declare place, size and color."""
-        yield object_type(self._v("type"), SILHOUETTE_SPHERE)
-        yield Exogenous(
-            name=self._v("size"),
-            unit="m",
-            shape=(3,),
-            bounds=Box(0.005, 0.2),
-            default=(2.0 * self._radius,) * 3,
-            doc="Diameter, three times; only pictures and the lowest height of A and B use it.",
-        )
-        yield goal_position(self.name, default=self._position)
-        yield goal_orientation(self.name)
-        yield color(self._v("color"), self._tint)
-        low = numbers.half_height(self._v("size"))
-        yield from coordinates(
-            self.name,
-            a=numbers.cylindrical(numbers.RADIUS_A, low, numbers.HEIGHT_A),
-            b=numbers.cylindrical(numbers.RADIUS_B, low, numbers.HEIGHT_B),
-        )
-
-    def goal(self, values: Values) -> GoalRegion:
-        """Describe the silhouette."""
-        return self._silhouette("sphere", values)
+def goal_sphere(
+    name: str, position: tuple[float, float, float], tint: tuple[float, float, float]
+) -> Entity:
+    """Describe a ball of 3 cm that a fingertip should reach: its default center [m] and color."""
+    size = numbers.Range(Box(0.005, 0.2), unit="m", shape=(3,)).declare(
+        f"{name}.size",
+        (0.03,) * 3,
+        "Diameter, three times; only pictures and the lowest height of A and B use it.",
+    )
+    kind, paint = looks(name, "sphere", tint)
+    pose = goal_position(name, default=position), goal_orientation(name)
+    a, b = numbers.places(numbers.half_height(size.name), airborne=True)
+    own = (kind, size, *pose, paint, *coordinates(name, a=a, b=b))
+    return Entity(name, own, kind="goal", shape="sphere")

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
-from typing import final
+from collections.abc import Iterable
 
-from scm_world._types import Floats, Value
-from scm_world.models import ParameterKey
+import numpy as np
+
+from scm_world._types import Floats
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger.entities.blocks import color, coordinates, object_type
-from scm_world.variables import Box, Exogenous, Variable
-
-STATIC_CUBOID = 10  # the published type id
+from scm_world.tasks.trifinger.entities.blocks import ZERO, coordinates, looks
+from scm_world.tasks.trifinger.entities.goals import goal_orientation, goal_position
+from scm_world.tasks.trifinger.hardware import ARENA_HALF_WIDTH, ARENA_HEIGHT
+from scm_world.variables import Box, Function, Integers, Variable
 
 QUANTITIES = {
     "size": "size",
@@ -25,66 +24,69 @@ QUANTITIES = {
 """The quantities of an obstacle, and what the scene calls them. All of them are parameters."""
 
 
-@final
-class Obstacle(Entity):
-    """A box that nothing moves. Its pose is a parameter: it holds until the reset.
+def obstacle(name: str, *, size: Variable, position: Variable) -> Entity:
+    """Describe a box that nothing moves. Its pose is a parameter: it holds until the reset.
 
     Args:
         name: Prefix of its variables.
         size: The declaration of ``<name>.size`` [m].
         position: Of ``<name>.cartesian_position``: a root, or where a mechanism puts it [m].
     """
-
-    def __init__(self, name: str, *, size: Variable, position: Variable) -> None:
-        self.name = name
-        self._size, self._position = size, position
-
-    @property
-    def is_obstacle(self) -> bool:
-        """An obstacle it is."""
-        return True
-
-    def _v(self, quantity: str) -> str:
-        return f"{self.name}.{quantity}"
-
-    def variables(self) -> Iterable[Variable]:
-        """Declare type, size, friction, color and pose."""
-        yield object_type(self._v("type"), STATIC_CUBOID)
-        yield self._size
-        yield self._position
-        yield numbers.ORIENTATIONS.root(
-            self._v("orientation"),
-            numbers.IDENTITY,
-            "Orientation as a unit quaternion (x, y, z, w).",
-        )
-        yield numbers.FRICTION.root(
-            self._v("friction"),
-            numbers.SURFACE_FRICTION,
-            "Friction of its surface; a contact has the product of two frictions.",
-        )
-        yield color(self._v("color"), (0.0, 0.0, 0.0))
-        yield from coordinates(self.name, a=None, b=None, yaw=False)
-
-    def parameters(self) -> Mapping[str, ParameterKey]:
-        """Say which variable sets which physical parameter."""
-        return {self._v(ours): (self.name, its) for ours, its in QUANTITIES.items()}
+    kind, paint = looks(name, "obstacle", ZERO)
+    friction = numbers.FRICTION.declare(
+        f"{name}.friction",
+        numbers.SURFACE_FRICTION,
+        "Friction of its surface; a contact has the product of two frictions.",
+    )
+    own = (kind, size, position, goal_orientation(name), friction, paint)
+    parameters = {f"{name}.{ours}": (name, its) for ours, its in QUANTITIES.items()}
+    return Entity(name, (*own, *coordinates(name, yaw=False)), parameters, kind="obstacle")
 
 
-def wall_on_the_floor(size: Floats) -> Floats:
-    """Put a box on the floor in the middle of the arena.
+COUNT = "number_of_obstacles"
+PLACES = "obstacle_places"
+MOST = 10
+_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # the golden angle: places never line up
 
-    Args:
-        size: Edge lengths, shape (..., 3) [m].
 
-    Returns:
-        The center, shape (..., 3) [m].
+def obstacle_names(count: int) -> tuple[str, ...]:
+    """Name the first of the small boxes that are scattered over the arena."""
+    return tuple(f"obstacle_{index}" for index in range(count))
+
+
+def place(places: Floats, *, index: float) -> Floats:
+    """Return one of the places, shape (..., 3) [m]."""
+    return places[..., int(index), :]
+
+
+def scattering(default: int) -> Iterable[Variable]:
+    """Declare how many scattered boxes there are, ``default`` of them, and where they are.
+
+    Raises:
+        UnknownOption: The number is out of bounds.
     """
-    center: Value = size * [0.0, 0.0, 0.5]
-    return center
+    some = Integers(1, 5)
+    counts = numbers.Range(Integers(0, MOST), some, some, dtype="integer")
+    yield counts.option(COUNT, default, "How many small boxes are in the way.")
+    index = np.arange(MOST)  # between the fingers and above the blocks
+    radius, height = 0.05 + 0.008 * index, 0.16 + 0.004 * index
+    x, y = radius * np.cos(_ANGLE * index), radius * np.sin(_ANGLE * index)
+    inside, top = ARENA_HALF_WIDTH - 0.005, ARENA_HEIGHT - 0.005
+    space = Box((-inside, -inside, 0.005) * MOST, (inside, inside, top) * MOST)
+    bounds = Box((-0.24, -0.24, 0.0) * MOST, (0.24, 0.24, 0.5) * MOST)
+    yield numbers.Range(bounds, space, space, "m", (MOST, 3)).declare(
+        PLACES,
+        tuple(np.stack([x, y, height], axis=-1).ravel().tolist()),
+        "Where the centers of the obstacles are.",
+    )
 
 
-def obstacle_size(
-    name: str, default: tuple[float, float, float], *, a: Box | None = None, b: Box | None = None
-) -> Exogenous:
-    """Declare the edge lengths of an obstacle [m]."""
-    return replace(numbers.OBSTACLE_SIZES, a=a, b=b).root(name, default, "Full edge lengths.")
+def scattered(count: int) -> Iterable[Entity]:
+    """List the scattered boxes that there are."""
+    for index, name in enumerate(obstacle_names(count)):
+        size = numbers.OBSTACLE_SIZES.declare(
+            f"{name}.size", numbers.OBSTACLE_SIZE, "Full edge lengths."
+        )
+        where = Function(place, constants={"index": float(index)})
+        position = goal_position(name, parents=(PLACES,), mechanism=where)
+        yield obstacle(name, size=size, position=position)

@@ -2,80 +2,69 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import final
+from collections.abc import Iterable
 
-from scm_world._types import Floats, Values
+from scm_world._types import Values
 from scm_world.geometry import from_rotation_vector, to_rotation_vector
-from scm_world.models import Light, ParameterKey
+from scm_world.models import Light
 from scm_world.models.camera import Camera, camera_from
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.cameras import CAMERAS, published_poses
-from scm_world.tasks.trifinger.entities.blocks import color
 from scm_world.tasks.trifinger.hardware import PRESET_NAMES
-from scm_world.variables import Box, Derived, Exogenous, Variable
+from scm_world.variables import Box, Variable
 from scm_world.variables.reserved import PRESET, SENSOR_NOISE
 
+PARAMETERS = {
+    "gravity": ("world", "gravity"),
+    "floor_friction": ("floor", "friction"),
+    "stage_friction": ("stage", "friction"),
+    "floor_color": ("floor", "color"),
+    "stage_color": ("stage", "color"),
+    "restitution": ("world", "restitution"),
+    "spinning_friction": ("world", "spinning_friction"),
+}
 
-@final
-class Stage(Entity):
-    """What the robot and the blocks stand in.
 
-    Args:
-        preset: Numerical settings at the start: ``"fast"`` or ``"precise"``.
-    """
-
-    name = "stage"
-
-    def __init__(self, preset: str = "fast") -> None:
-        self._preset = preset
-
-    def variables(self) -> Iterable[Variable]:
-        """Declare gravity, frictions and colors."""
-        yield numbers.GRAVITIES.root(
-            "gravity", numbers.GRAVITY, "Acceleration of free fall; it pulls the fingers too."
+def stage(preset: str) -> Entity:
+    """Describe what the robot and the blocks stand in, with the settings that a preset names."""
+    frictions = (
+        numbers.FRICTION.declare(
+            f"{surface}_friction",
+            numbers.SURFACE_FRICTION,
+            f"Friction of {what}; a contact has the product of two frictions.",
         )
-        for surface, what in (("floor", "the table"), ("stage", "the ring wall")):
-            yield numbers.FRICTION.root(
-                f"{surface}_friction",
-                numbers.SURFACE_FRICTION,
-                f"Friction of {what}; a contact has the product of two frictions.",
-            )
-        yield color("floor_color", numbers.FLOOR_COLOR)
-        yield color("stage_color", numbers.STAGE_COLOR)
-        yield numbers.RESTITUTION.root(
+        for surface, what in (("floor", "the table"), ("stage", "the ring wall"))
+    )
+    variables = (
+        numbers.GRAVITIES.declare(
+            "gravity", numbers.GRAVITY, "Acceleration of free fall; it pulls the fingers too."
+        ),
+        *frictions,
+        numbers.color("floor_color", numbers.FLOOR_COLOR),
+        numbers.color("stage_color", numbers.STAGE_COLOR),
+        numbers.RESTITUTION.declare(
             "restitution",
             0.0,
             "Speed after a head-on impact over speed before it, for every contact.",
-        )
-        yield numbers.SPINNING.root(
+        ),
+        numbers.SPINNING.declare(
             "spinning_friction",
             numbers.SPINNING_FRICTION,
             "Friction of every contact against turning about its normal.",
-        )
-        yield numbers.PRESETS.root(
+        ),
+        numbers.PRESETS.declare(
             PRESET,
-            PRESET_NAMES.index(self._preset),
+            PRESET_NAMES.index(preset),
             "How finely time is cut: 0 is fast (4 ms), 1 is precise (2 ms).",
-        )
-        yield numbers.NOISE.root(
+        ),
+        numbers.NOISE.declare(
             SENSOR_NOISE,
             0.0,
             "Standard deviation of every observed number, as a fraction of half its range.",
-        )
-
-    def parameters(self) -> Mapping[str, ParameterKey]:
-        """Say which variable sets which physical parameter."""
-        return {
-            "gravity": ("world", "gravity"),
-            "floor_friction": ("floor", "friction"),
-            "stage_friction": ("stage", "friction"),
-            "floor_color": ("floor", "color"),
-            "stage_color": ("stage", "color"),
-            "restitution": ("world", "restitution"),
-            "spinning_friction": ("world", "spinning_friction"),
-        }
+        ),
+    )
+    return Entity("stage", variables, PARAMETERS)
 
 
 _DEFAULT = Light()
@@ -83,97 +72,79 @@ _NEAR, _FAR = 0.01, 0.03  # [m] how far a camera is moved in A and in B
 _TURN = 0.02  # [rad] how far it is turned in A, about each axis
 
 
-@final
-class LightAndCameras(Entity):
-    """The light and the three cameras."""
-
-    name = "looks"
-
-    def variables(self) -> Iterable[Variable]:
-        """Declare where the light comes from, how bright shade is, and what cameras see."""
-        yield Exogenous(
-            name="light_direction",
+def light_and_cameras() -> Entity:
+    """Describe where the light comes from, how bright shade is, and the three cameras."""
+    light = (
+        numbers.Range(
+            Box((-1.0, -1.0, 0.05), (1.0, 1.0, 1.0)),
+            Box((0.0, -1.0, 0.5), (1.0, 0.0, 1.0)),
+            Box((-1.0, 0.0, 0.5), (0.0, 1.0, 1.0)),
             shape=(3,),
-            bounds=Box((-1.0, -1.0, 0.05), (1.0, 1.0, 1.0)),
-            a=Box((0.0, -1.0, 0.5), (1.0, 0.0, 1.0)),
-            b=Box((-1.0, 0.0, 0.5), (0.0, 1.0, 1.0)),
-            default=_DEFAULT.direction,
-            doc="Direction towards the light, of any length; only pictures depend on it.",
-        )
-        yield Exogenous(
-            name="light_ambient",
-            bounds=Box(0.0, 1.0),
-            a=Box(0.2, 0.4),
-            b=Box(0.4, 0.7),
-            default=_DEFAULT.ambient,
-            doc="Brightness of what the light does not reach; only pictures depend on it.",
-        )
-        for camera in CAMERAS:
-            yield from self._camera(camera)
-
-    def _camera(self, camera: Camera) -> Iterable[Variable]:
-        name = f"camera_{camera.name}"
-        position, orientation = (pose.tolist() for pose in published_poses()[camera.name])
-        x, y, z = position
-        yield Exogenous(
-            name=f"{name}.position",
-            unit="m",
-            shape=(3,),
-            bounds=Box(-2.0, 2.0),
-            a=Box((x - _NEAR, y - _NEAR, z - _NEAR), (x + _NEAR, y + _NEAR, z + _NEAR)),
-            b=Box((x - _NEAR, y - _NEAR, z + _NEAR), (x + _NEAR, y + _NEAR, z + _FAR)),
-            default=tuple(position),
-            doc="Where the camera stands; only pictures depend on it.",
-        )
-        yield Exogenous(
-            name=f"{name}.orientation",
-            shape=(4,),
-            bounds=numbers.QUATERNION_BOUNDS,
-            default=tuple(orientation),
-            doc="Quaternion (x, y, z, w) of its axes right, down and forward.",
-        )
-        yield _turned(name, to_rotation_vector(orientation))
-        yield Exogenous(
-            name=f"{name}.field_of_view",
-            unit="deg",
-            bounds=Box(5.0, 150.0),
-            a=Box(50.0, 54.0),
-            b=Box(54.0, 60.0),
-            default=camera.field_of_view,
-            doc="Vertical opening angle; only pictures depend on it.",
-        )
-
-    def light(self, values: Values) -> Light:
-        """Describe the light."""
-        x, y, z = values["light_direction"].tolist()
-        return Light((x, y, z), float(values["light_ambient"]))
-
-    def cameras(self, values: Values) -> tuple[Camera, ...]:
-        """Describe the three cameras, with pictures of 128 x 128 pixels."""
-        return tuple(
-            camera_from(
-                camera.name,
-                values[f"camera_{camera.name}.position"],
-                values[f"camera_{camera.name}.orientation"],
-                float(values[f"camera_{camera.name}.field_of_view"]),
-            )
-            for camera in CAMERAS
-        )
+        ).declare(
+            "light_direction",
+            _DEFAULT.direction,
+            "Direction towards the light, of any length; only pictures depend on it.",
+        ),
+        numbers.Range(Box(0.0, 1.0), Box(0.2, 0.4), Box(0.4, 0.7)).declare(
+            "light_ambient",
+            _DEFAULT.ambient,
+            "Brightness of what the light does not reach; only pictures depend on it.",
+        ),
+    )
+    cameras = (variable for camera in CAMERAS for variable in _camera(camera))
+    return Entity("looks", (*light, *cameras))
 
 
-def _turned(camera: str, usual: Floats) -> Variable:
-    """Declare the orientation of a camera as a rotation vector, near the usual one [rad]."""
+def _camera(camera: Camera) -> Iterable[Variable]:
+    """Declare the pose of a camera, and its opening angle; A and B are near the usual ones."""
+    name = f"camera_{camera.name}"
+    position, orientation = (pose.tolist() for pose in published_poses()[camera.name])
+    x, y, z = position
+    a = Box((x - _NEAR, y - _NEAR, z - _NEAR), (x + _NEAR, y + _NEAR, z + _NEAR))
+    b = Box((x - _NEAR, y - _NEAR, z + _NEAR), (x + _NEAR, y + _NEAR, z + _FAR))
+    yield numbers.Range(Box(-2.0, 2.0), a, b, "m", (3,)).declare(
+        f"{name}.position",
+        tuple(position),
+        "Where the camera stands; only pictures depend on it.",
+    )
+    yield numbers.ORIENTATIONS.declare(
+        f"{name}.orientation",
+        tuple(orientation),
+        "Quaternion (x, y, z, w) of its axes right, down and forward.",
+    )
+    usual = to_rotation_vector(orientation)
     low, high = usual - _TURN, usual + _TURN
-    far_low, far_high = low.copy(), high.copy()
-    far_low[2], far_high[2] = high[2], usual[2] + 3.0 * _TURN
-    return Derived(
-        name=f"{camera}.euler_orientation",
-        unit="rad",
-        shape=(3,),
-        a=Box(tuple(low.tolist()), tuple(high.tolist())),
-        b=Box(tuple(far_low.tolist()), tuple(far_high.tolist())),
-        parents=(f"{camera}.orientation",),
-        mechanism=to_rotation_vector,
+    far_low, far_high = (*low[:2], high[2]), (*high[:2], usual[2] + 3.0 * _TURN)
+    a, b = Box(tuple(low), tuple(high)), Box(far_low, far_high)
+    yield numbers.Range(None, a, b, "rad", (3,)).declare(
+        f"{name}.euler_orientation",
+        None,
+        "Orientation as a rotation vector; setting it sets the quaternion.",
+        (f"{name}.orientation",),
+        to_rotation_vector,
         inverse=from_rotation_vector,
-        doc="Orientation as a rotation vector; setting it sets the quaternion.",
+    )
+    yield numbers.Range(Box(5.0, 150.0), Box(50.0, 54.0), Box(54.0, 60.0), "deg").declare(
+        f"{name}.field_of_view",
+        camera.field_of_view,
+        "Vertical opening angle; only pictures depend on it.",
+    )
+
+
+def light_of(values: Values) -> Light:
+    """Describe the light."""
+    x, y, z = values["light_direction"].tolist()
+    return Light((x, y, z), float(values["light_ambient"]))
+
+
+def cameras_of(values: Values) -> tuple[Camera, ...]:
+    """Describe the three cameras, with pictures of 128 x 128 pixels."""
+    return tuple(
+        camera_from(
+            camera.name,
+            values[f"camera_{camera.name}.position"],
+            values[f"camera_{camera.name}.orientation"],
+            float(values[f"camera_{camera.name}.field_of_view"]),
+        )
+        for camera in CAMERAS
     )
