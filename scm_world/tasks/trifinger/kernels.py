@@ -15,6 +15,8 @@ CARRIED = 0.15  # [m] how high a block should be lifted over a wall
 PLACED = 0.02  # [m] how near the first block of a tower must be to its goal
 ABOVE = 0.005  # [m] how near, seen from above, two blocks of a tower must be
 
+AXIS = np.zeros(2)  # [m] of the arena, seen from above
+
 
 @njit(cache=True)
 def distance(a: Floats, b: Floats) -> float:
@@ -102,21 +104,15 @@ def height_progress(block: Floats, block_before: Floats, goal: Floats) -> float:
 
 
 @njit(cache=True)
-def eccentricity(block: Floats) -> float:
-    """Compute the distance of the block from the axis of the arena [m]."""
-    return math.sqrt(block[0] ** 2 + block[1] ** 2)
-
-
-@njit(cache=True)
 def minus_eccentricity(block: Floats) -> float:
     """Compute minus the distance of the block from the axis of the arena [m]."""
-    return -eccentricity(block)
+    return -horizontal_distance(block, AXIS)
 
 
 @njit(cache=True)
 def centering_progress(block: Floats, block_before: Floats) -> float:
     """Compute how much nearer the block came to the axis of the arena [m]."""
-    return eccentricity(block_before) - eccentricity(block)
+    return horizontal_progress(block, block_before, AXIS)
 
 
 @njit(cache=True)
