@@ -141,12 +141,6 @@ def checked(
 ) -> Any:
     """Return an argument that lies within the bounds of the variable whose default it is.
 
-    Args:
-        option: Its name.
-        value: The argument.
-        allowed: The bounds.
-        shape: Shape of the variable.
-
     Raises:
         UnknownOption: It is not a number, of another shape, or out of bounds.
     """

@@ -83,12 +83,8 @@ class StepTask(DeclaredTask):
             named like a state has its shape; else it is a number, or has the shape of the ends
             of its box.
         outcomes: ``Measured`` or ``Derived`` variables that are computed from others.
-        reward: A ``Measured`` variable called ``"reward"``, or a function and the names of its
-            parents: ``(harvested, "prey", "catch")``. A parent may be a ``Parent`` with lag 1.
-        success: The same for ``"success"``, 0 or 1.
-        terminated: The same for ``"terminated"``: whether the episode ends here.
-        start: Where episodes begin: for states a value, or a space or distribution to draw from.
-        observe: Names of what a policy observes; all states if None.
+        reward, success, terminated, start, observe, goal: What counts, and where episodes begin;
+            see ``DeclaredTask``.
         seconds: Length of an episode [s]; 100 control steps if None.
         vectorized: Whether the function takes many systems together, with a leading axis.
         signature: ``"dicts"``, or ``"arrays"`` for flat arrays in the order of declaration.
