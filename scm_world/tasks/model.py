@@ -289,7 +289,9 @@ class ModelTask(DeclaredTask):
     def on(self, backend: Backend) -> Self:
         """Give the same task with the parameters that a backend has."""
         kept = tuple(
-            row for row in self.system.parameters if backend.supports(self.system, row.key)
+            row
+            for row in self.system.parameters
+            if backend.capabilities.supports(self.system, row.key)
         )
         if len(kept) == len(self.system.parameters):
             return self

@@ -76,7 +76,7 @@ def play(backend: Backend, commands: Floats, substeps: int) -> Floats:
     rows = []
     for command in commands:
         backend.step(command, substeps)
-        rows.append(backend.state().vector)
+        rows.append(backend.read().vector)
     return np.array(rows)
 
 
@@ -115,7 +115,9 @@ class BackendConformance(ABC):
     def busy(self) -> Scene:
         """Return a scene in which bodies touch: the default one of the model."""
         model, backend = read_model(self.model), self.make()
-        kept = tuple(row for row in model.parameters if backend.supports(model, row.key))
+        kept = tuple(
+            row for row in model.parameters if backend.capabilities.supports(model, row.key)
+        )
         backend.close()
         return replace(model, parameters=kept).default_scene()
 
@@ -237,7 +239,7 @@ class BackendConformance(ABC):
             assert bool(contacts) == backend.capabilities.physics
             for contact in contacts:
                 assert np.linalg.norm(contact.normal) == pytest.approx(1.0)
-            *_, changed = self.changed_states(backend.state())
+            *_, changed = self.changed_states(backend.read())
             backend.apply(Difference(state=changed))
             assert [c.bodies for c in backend.contacts()] == [c.bodies for c in contacts]
 
@@ -245,7 +247,7 @@ class BackendConformance(ABC):
 
     def test_parameters_are_read_back(self, backend: Backend, scene: Scene) -> None:
         """Each is reported as it was set, and leaves the state and all others as they were."""
-        keys, start, state = tuple(scene.parameters), backend.snapshot(), backend.state()
+        keys, start, state = tuple(scene.parameters), backend.snapshot(), backend.read()
         before, other = backend.parameters(keys), self.others(scene)
         self.check_parameters(before, scene.parameters)
         for key, value in other.items():
@@ -253,7 +255,7 @@ class BackendConformance(ABC):
             now = backend.parameters(keys)
             self.check_parameters({key: now[key]}, {key: value})
             assert [k for k in keys if k != key and not same(now[k], before[k])] == []
-            assert backend.state() == state
+            assert backend.read() == state
             backend.apply(Difference(parameters={key: scene.parameters[key]}))
         backend.apply(Difference(parameters=other))
         self.check_parameters(backend.parameters(keys), other)
@@ -262,11 +264,11 @@ class BackendConformance(ABC):
 
     def test_a_state_is_read_back(self, backend: Backend) -> None:
         """The engine reports the state as it was set; what it reports stays that of the step."""
-        before = backend.state()
+        before = backend.read()
         fixed = ~before.layout.can_be_set
         for changed in self.changed_states(before):
             backend.apply(Difference(state=changed))
-            read = backend.state()
+            read = backend.read()
             np.testing.assert_allclose(read.settable(), changed.settable(), rtol=0, atol=1e-12)
             assert same(read.vector[fixed], before.vector[fixed])
 
@@ -277,7 +279,7 @@ class BackendConformance(ABC):
 
     def test_only_the_result_of_changes_counts(self, backend: Backend, scene: Scene) -> None:
         """Together, one by one, or with detours; all taken back, nothing is left for long."""
-        start, before, other = backend.snapshot(), backend.state(), self.others(scene)
+        start, before, other = backend.snapshot(), backend.read(), self.others(scene)
         *_, state = self.changed_states(before)
         alone = [Difference(parameters={key: other[key]}) for key in sorted(other)]
         undone = [Difference(parameters={key: scene.parameters[key]}) for key in sorted(other)]
@@ -325,7 +327,7 @@ class BackendConformance(ABC):
         yield
         backend.apply(Difference(parameters=self.others(scene)))
         yield
-        *_, state = self.changed_states(backend.state())
+        *_, state = self.changed_states(backend.read())
         backend.apply(Difference(state=state))
         yield
         self.play(backend, 3)
@@ -338,14 +340,14 @@ class BackendConformance(ABC):
     def test_a_snapshot_continues_bit_for_bit(self, backend: Backend, scene: Scene) -> None:
         """From a snapshot, this, another and a pickled backend continue alike, repeatedly."""
         for _ in self.moments(backend, scene):
-            snapshot, state, touching = backend.snapshot(), backend.state(), backend.contacts()
+            snapshot, state, touching = backend.snapshot(), backend.read(), backend.contacts()
             assert backend.snapshot() is not snapshot  # another one does not disturb
             expected = self.play(backend, 15)
-            backend.apply(Difference(state=backend.state()))
+            backend.apply(Difference(state=backend.read()))
             backend.restore(snapshot)
             with pytest.raises(SnapshotMismatch):
                 backend.restore(EngineSnapshot("no engine 0", None))
-            assert backend.state() == state
+            assert backend.read() == state
             assert [c.bodies for c in backend.contacts()] == [c.bodies for c in touching]
             assert same(self.play(backend, 15), expected)
             with self.built(scene) as other:
@@ -381,7 +383,7 @@ class BackendConformance(ABC):
                     if step == 6:
                         backends[1].restore(start)
                 for one, other in zip(alone, many, strict=True):
-                    assert other.state() == one.state()
+                    assert other.read() == one.read()
                     touching = [[(c.bodies, c.force) for c in b.contacts()] for b in (one, other)]
                     assert touching[0] == touching[1]
 
@@ -391,7 +393,7 @@ class BackendConformance(ABC):
     ) -> None:
         """A state that is not finite is never returned, also not from a batch."""
         monkeypatch.chdir(tmp_path)  # engines may write a log
-        batch, state = type(backend).batch([backend], 1), backend.state()
+        batch, state = type(backend).batch([backend], 1), backend.read()
         commands = self.commands(backend.structure, 1)
         state.vector[np.flatnonzero(state.layout.can_be_set)[-1]] = np.inf
         with pytest.raises(EngineFailure):  # noqa: PT012 # either of the two may notice it

@@ -544,12 +544,12 @@ class Simulation(WorldAttributes):
             self._offset = offset
             raise
 
-    def _inertia(self, change: Difference) -> dict[str, Value]:
+    def _inertia(self, change: Difference) -> Parameters:
         if change.structure is not None or not self.composition.movers():
             return {}
         bodies = {body for body, what in change.parameters if what in ("mass", "size")}
         bodies -= {*self.composition.bodies}.difference(self.composition.movers())
-        return {body: self.backend.inertia(body) for body in sorted(bodies)}
+        return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
     def _applied(self, change: Difference) -> Parameters:
         """Read back what was applied.

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from robot_scenes import link_frames
 
 from scm_world._types import Floats
 from scm_world.backends.renderer import (
@@ -25,7 +26,7 @@ from scm_world.models import GoalRegion, ParameterKey, Scene
 from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
-from scm_world.tasks.trifinger.kinematics import forward, link_frames
+from scm_world.tasks.trifinger.kinematics import forward
 from scm_world.tasks.trifinger.system import tip_name, trifinger
 
 TOP = Camera("top", eye=(0.0, 0.0, 0.25), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
@@ -120,7 +121,7 @@ def test_fingertips_appear_where_kinematics_puts_them(scene: Scene) -> None:
 
 def test_capsules_follow_their_links(scene: Scene) -> None:
     """The middle of every link's capsule, seen from above the robot, shows a link nearby."""
-    positions, _ = link_frames(scene.state.joint_positions, hardware.NOMINAL_HEIGHT)
+    positions, _ = link_frames(scene.state.joint_positions)
     knees = positions[3::5]
     camera = replace(TOP, eye=(0.0, 0.0, 1.5), field_of_view=30.0, width=300, height=300)
     image = render(scene, camera)

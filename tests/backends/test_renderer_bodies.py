@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from robot_scenes import box_hull, link_frames
 
 from scm_world._types import Floats
 from scm_world.backends.renderer import body_names, render
 from scm_world.geometry import from_rotation_vector, rotation_matrix
-from scm_world.geometry.hulls import Hull, box_hull, hull_of
+from scm_world.geometry.hulls import Hull, hull_of
 from scm_world.models import GoalRegion, Light, Scene
 from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
-from scm_world.tasks.trifinger.kinematics import link_frames
 from scm_world.tasks.trifinger.system import MOUNT, tip_name, trifinger
 
 TOP = Camera("top", eye=(0.0, 0.0, 0.25), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
@@ -268,7 +268,7 @@ def test_fingers_cover_the_pixels_whose_rays_pass_them(camera: Camera) -> None:
     camera = replace(camera, width=80, height=60)
     scene = trifinger().default_scene()
     image = render(scene, camera)
-    frames = link_frames(scene.state.joint_positions, hardware.NOMINAL_HEIGHT)
+    frames = link_frames(scene.state.joint_positions)
     step = 2.0 * np.tan(np.radians(camera.field_of_view) / 2.0) / 60
     v, u = np.mgrid[:60, :80]
     seen = np.stack([(u - 39.5) * step, (29.5 - v) * step, np.full(u.shape, -1.0)], axis=-1)

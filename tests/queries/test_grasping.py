@@ -21,7 +21,7 @@ from scm_world.tasks.trifinger.grasping import Feedback
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, body_of, smallest, turns
 from scm_world.tasks.trifinger.grasping.choice import Choice
 from scm_world.tasks.trifinger.grasping.feedback import TOUCHING, held
-from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand, carrying, pressing
+from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand, poses, torques
 from scm_world.tasks.trifinger.grasping.ways import gripped
 from scm_world.training.imitation import lesson
 
@@ -102,9 +102,8 @@ def test_it_tries_again() -> None:
 def test_two_fingers_carry_through_the_air_by_feedback() -> None:
     """On the floor three fingers are chosen."""
     for task, fingers, over in (("picking", 2, False), ("pushing", 3, False), (TASKS[1], 2, True)):
-        job = Choice(Sight(world_of(task, "mujoco"))).job()
-        assert job is not None
-        _, move = job
+        move = Choice(Sight(world_of(task, "mujoco"))).move()
+        assert move is not None
         assert sum(move.grip.used) == fingers
         assert move.over == over
 
@@ -140,9 +139,8 @@ def test_by_feedback_a_block_is_turned_less_where_no_grip_can_make_the_whole_tur
     for episode in range(9):
         runner.begin(everything, seed=0, episode=episode)
         sight = Sight(env.world)
-        goal, job = sight.body("goal_block"), Choice(sight).job()
-        if job is not None:  # fingers have no room between a wall and a block close to it
-            _, move = job
+        goal, move = sight.body("goal_block"), Choice(sight).move()
+        if move is not None:  # fingers have no room between a wall and a block close to it
             np.testing.assert_allclose(move.end.place[:2], goal.place[:2])
             fills.append(move.end.fills(goal))
     runner.close()
@@ -249,10 +247,11 @@ def test_fingertips_come_where_they_are_told() -> None:
 def test_strength_ends_where_a_joint_does_all_it_can() -> None:
     """Forces of that strength need the largest torque at one joint, and more at none."""
     hand = Hand(world_of("picking", "fake").evaluate(()))
-    joints, forces = np.array(hardware.REST), np.eye(3)
-    (strength,) = hand.strengths(joints[None], forces[None])
-    torques = carrying(joints, hand.weights) + strength * pressing(joints, hand.height, forces)
-    assert np.abs(torques).max() == pytest.approx(0.97 * 0.36)
+    joints, forces = np.array([hardware.REST]), hand.weights.copy()
+    (strength,) = hand.strengths(joints, np.eye(3)[None])
+    forces[:, 2] += strength * np.eye(3)
+    found = torques(joints, hand.height, forces[None])
+    assert np.abs(found).max() == pytest.approx(0.97 * 0.36)
 
 
 def test_legs_lie_in_what_their_tips_are_in() -> None:
@@ -262,7 +261,8 @@ def test_legs_lie_in_what_their_tips_are_in() -> None:
     for below, depth in ((0.0, 0.01 + TIP_RADIUS), (0.011 + TIP_RADIUS, -0.001)):
         center = tips[:3] - [0.0, 0.0, below]
         boxes = np.full((1, 3), 0.01), center[None], axes
-        _, reached, depths = hand.poses(tips[None], np.array([hardware.REST]), boxes)
+        near = np.array([hardware.REST])
+        _, reached, depths = poses(tips[None], near, hand.height, *boxes)
         assert reached.all()
         assert depths[0] == pytest.approx(depth, abs=1e-6)
 

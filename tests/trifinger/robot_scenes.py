@@ -7,20 +7,27 @@ from collections.abc import Iterator, Mapping
 from itertools import product
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends import Backend
-from scm_world.geometry.hulls import Hull
+from scm_world.backends.mujoco.backend import realize
+from scm_world.geometry.hulls import Hull, hull_of
 from scm_world.geometry.rotations import from_rotation_vector, quaternion_product
 from scm_world.models.scene import Difference, ParameterKey, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import FAST, PRECISE, Preset
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.system import trifinger
+from scm_world.tasks.trifinger.system import tip_name, trifinger
 
 SUBSTEPS = 10
 SEED = 20_26
+
+
+def box_hull(size: ArrayLike) -> Hull:
+    """Make a box of these edge lengths [m] as a hull."""
+    return hull_of(np.asarray(size) * (np.indices((2, 2, 2)).reshape(3, 8).T - 0.5))
 
 
 def octahedron(a: float, b: float, c: float) -> Hull:
@@ -45,6 +52,26 @@ def octahedron(a: float, b: float, c: float) -> Hull:
 
 
 STONE = octahedron(0.03, 0.035, 0.025)
+
+
+def link_frames(joint_positions: ArrayLike) -> tuple[Floats, Floats]:
+    """Ask MuJoCo for the frames of links 0 to 3 and of the tip, finger by finger.
+
+    Returns:
+        Origins, shape (15, 3) [m], and quaternions (x, y, z, w), shape (15, 4).
+    """
+    scene = trifinger().default_scene()
+    model = realize(scene.structure, scene.parameters).model
+    data = mujoco.MjData(model)
+    data.qpos[:9] = joint_positions
+    mujoco.mj_kinematics(model, data)
+    names = [
+        name
+        for finger in hardware.FINGERS
+        for name in (*(hardware.link_name(finger, i) for i in range(4)), tip_name(finger))
+    ]
+    bodies = [model.body(name).id for name in names]
+    return data.xpos[bodies], np.roll(data.xquat[bodies], -1, axis=1)
 
 
 def busy_scene(preset: Preset = FAST) -> Scene:
@@ -100,7 +127,7 @@ def play(
     if structure.torques is not torques:
         backend.apply(Difference(structure.with_(torques=torques)))
     center = np.zeros(9) if torques else np.array(hardware.REST)
-    state = backend.state()
+    state = backend.read()
     states = np.empty((steps, state.vector.size))
     for row in states:
         command = center + generator.uniform(-0.3, 0.3, 9)

@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from robot_scenes import octahedron
+from robot_scenes import box_hull, link_frames, octahedron
 
 from scm_world._types import ArrayLike
 from scm_world.geometry import from_rotation_vector
-from scm_world.geometry.hulls import Hull, box_hull
+from scm_world.geometry.hulls import Hull
 from scm_world.models import Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.feasibility import overlaps
 from scm_world.tasks.trifinger.hardware import WALL_HEIGHT, WALL_RADIUS
-from scm_world.tasks.trifinger.kinematics import inverse, link_frames
+from scm_world.tasks.trifinger.kinematics import inverse
 from scm_world.tasks.trifinger.system import trifinger
 
 TOLERANCE = 1e-4  # [m]
@@ -107,7 +107,7 @@ def test_a_block_in_a_link_is_reported_with_the_published_name(
 ) -> None:
     """A block where a link or its tip is, is in that link; the tip belongs to link 3."""
     scene = _scene((0, 0, 0.03))
-    origins, _ = link_frames(scene.state.joint_positions, hardware.NOMINAL_HEIGHT)
+    origins, _ = link_frames(scene.state.joint_positions)
     scene.state.positions[0] = origins[5 * finger + frame]
     name = hardware.link_name(hardware.FINGERS[finger], link)
     assert ("a", name) in _found(scene)
@@ -116,7 +116,7 @@ def test_a_block_in_a_link_is_reported_with_the_published_name(
 def test_the_deepest_shape_of_a_link_counts() -> None:
     """A block around the tip lies in link 3 once, much deeper than the radius of the tip."""
     scene = _scene((0, 0, 0.03))
-    origins, _ = link_frames(scene.state.joint_positions, hardware.NOMINAL_HEIGHT)
+    origins, _ = link_frames(scene.state.joint_positions)
     scene.state.positions[0] = origins[4]
     found = {pair: depth for pair, depth in _found(scene).items() if "floor" not in pair}
     (depth,) = found.values()
@@ -140,7 +140,7 @@ def test_poses_near_rest_are_reported_only_where_a_finger_reaches_the_ring() -> 
     for _ in range(500):
         joints = hardware.REST + rng.uniform(-0.35, 0.35, 9)
         scene.state.joint_positions[:] = np.clip(joints, hardware.JOINT_LOW, hardware.JOINT_HIGH)
-        origins, _ = link_frames(scene.state.joint_positions, hardware.NOMINAL_HEIGHT)
+        origins, _ = link_frames(scene.state.joint_positions)
         for overlap in overlaps(scene, tolerance=0.0):
             reported += 1
             link, body = overlap.bodies
@@ -230,7 +230,7 @@ def test_size_and_orientation_of_an_obstacle_count() -> None:
 def test_a_finger_in_an_obstacle_is_reported() -> None:
     """Middle and lower links are compared with obstacles, upper ones are not."""
     scene = trifinger().default_scene()
-    origins, _ = link_frames(scene.state.joint_positions, hardware.NOMINAL_HEIGHT)
+    origins, _ = link_frames(scene.state.joint_positions)
     at_tip = _with_wall(scene, [0.01] * 3, origins[4])
     assert set(_found(at_tip)) == {("robot_finger_60_link_3", "wall")}
     everywhere = _with_wall(scene, [1.0] * 3, [0.0, 0.0, 0.5])
@@ -291,7 +291,7 @@ def test_a_finger_beside_a_stone_is_not_in_it() -> None:
     """A fingertip in the box around a hull is reported only where it reaches a side."""
     hull = octahedron(0.05, 0.05, 0.05)
     scene = _stone(hull, (0.0, 0.0, 0.0))
-    origins, _ = link_frames(scene.state.joint_positions, hardware.NOMINAL_HEIGHT)
+    origins, _ = link_frames(scene.state.joint_positions)
     radius = hardware.COLLISION["tip"].radius
     name = "robot_finger_60_link_3"
     for gap, hit in ((0.004, False), (-0.004, True)):

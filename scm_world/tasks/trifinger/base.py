@@ -15,6 +15,7 @@ from scm_world.errors import UnknownOption
 from scm_world.geometry.hulls import Hull
 from scm_world.graph import SCM
 from scm_world.tasks.base import (
+    OVERLAP,
     TIME,
     Conventions,
     Goal,
@@ -28,8 +29,10 @@ from scm_world.tasks.base import (
 from scm_world.tasks.composition import Composition, Entity, clock
 from scm_world.tasks.rewards import (
     FRACTION,
+    FULFILLED,
     SUCCESS,
     TERMINATED,
+    UNIT,
     Common,
     declared,
     further_terms,
@@ -37,15 +40,16 @@ from scm_world.tasks.rewards import (
     reward,
     succeeded,
 )
-from scm_world.tasks.trifinger import building, hardware, shaping
+from scm_world.tasks.trifinger import building, hardware, kernels, shapes, shaping
 from scm_world.tasks.trifinger.conventions import CONVENTIONS, TriFingerConventions
 from scm_world.tasks.trifinger.entities.block_world import BlockWorld
 from scm_world.tasks.trifinger.entities.robot import ACTIONS, robot
 from scm_world.tasks.trifinger.entities.stage import light_and_cameras, stage
+from scm_world.tasks.trifinger.feasibility import fingers_reach
 from scm_world.tasks.trifinger.hardware import PRESETS, RESOLUTIONS, TIMESTEP
 from scm_world.tasks.trifinger.scenarios import scenarios
 from scm_world.tasks.trifinger.symmetry import thirds
-from scm_world.variables import Linear, Measured, Variable
+from scm_world.variables import Function, Linear, Measured, Variable
 
 HEAD = (
     Observed(TIME),
@@ -223,10 +227,30 @@ class TriFingerTask(Task):
         """Declare the dense reward terms."""
         return self.dense_terms
 
+    def _fraction(self) -> Measured:
+        """Declare the fraction of the goals that is filled."""
+        published, parts = self.conventions.aligned_boxes, building.POSE
+        if self.shape is not None:
+            mechanism = Function(shapes.hull_aligned if published else shapes.hull_filled)
+            parts = ("vertices", *building.POSE[1:])
+        elif len(self.tools) == len(self.targets) == 1 and not published:
+            mechanism = Function(kernels.filled)
+        else:
+            boxes = building.aligned if published else building.filled
+            mechanism = Function(boxes, constants={"tools": float(len(self.tools))})
+        bodies = (*self.tools, *self.targets)
+        return Measured(
+            name=FRACTION,
+            bounds=None if published else UNIT,
+            parents=tuple(f"{body}.{part}" for body in bodies for part in parts),
+            mechanism=mechanism,
+            doc="Fraction of the volume of all goals that the blocks fill.",
+        )
+
     def readouts(self) -> Iterable[Variable]:
         """Declare reward terms, fractional success and success."""
         yield from self.dense()
-        yield building.fractional_success(self)
+        yield self._fraction()
         yield succeeded()
         yield from self.terms
         yield reward(self.weights)
@@ -240,7 +264,27 @@ class TriFingerTask(Task):
     @property
     def goal(self) -> Goal:
         """The blocks should fill the goals."""
-        return building.goal(self)
+        have, want = (
+            tuple(f"{name}.{part}" for name in names for part in building.POSE)
+            for names in (self.targets.values(), self.targets)
+        )
+        exact, aligned = (
+            partial(building.fraction_of, self.shape, published) for published in (False, True)
+        )
+        fraction = aligned if self.conventions.aligned_boxes else exact
+        return Goal(
+            achieved=have,
+            desired=want,
+            causes=self.goal_causes,
+            measures={
+                FRACTION: fraction,
+                SUCCESS: lambda mine, its: fraction(mine, its) > FULFILLED,
+                OVERLAP: aligned,
+            },
+            closeness=((shaping.TIPS, *have, *want), building.boxes_apart),
+            tools=self.tools,
+            targets=self.targets,
+        )
 
     def observed(self) -> Iterable[Observed]:
         """List the rows of blocks, goals and obstacles."""
@@ -270,7 +314,16 @@ class TriFingerTask(Task):
 
     def solution(self, values: Values) -> dict[str, Value]:
         """Put each block where its goal is, and fingers that are in the way to the side."""
-        return building.solution(self.targets, values)
+        found = {
+            f"{tool}.{part}": values[f"{goal}.{part}"]
+            for goal, tool in self.targets.items()
+            for part in building.POSE[1:]
+        }
+        joints, height = values["joint_positions"], float(values["robot_height"])
+        boxes = ([values[f"{goal}.{part}"] for part in building.POSE] for goal in self.targets)
+        if any(fingers_reach(b[0], b[1], b[2], joints, height) for b in boxes):
+            found["joint_positions"] = np.array(hardware.ASIDE)
+        return found
 
     def idle(self, world: Any) -> Floats:
         """Return the command that keeps the robot at rest (position, or no torque), shape (9,)."""

@@ -5,29 +5,23 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache, partial
-from typing import TYPE_CHECKING, final
+from functools import lru_cache
+from typing import final
 
 import numpy as np
 from numba import njit
 
-from scm_world._types import ArrayLike, Floats, Value, Values
-from scm_world.geometry.filling import overlap_fraction_kernel
-from scm_world.geometry.overlap import aabb_overlap_fraction
+from scm_world._types import ArrayLike, Floats, Values
+from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction_kernel
+from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import rotation_matrix
-from scm_world.tasks.base import OVERLAP, Goal
-from scm_world.tasks.rewards import FRACTION, FULFILLED, SUCCESS, UNIT
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import hardware, kernels, shapes
+from scm_world.tasks.trifinger import shapes
 from scm_world.tasks.trifinger.entities.blocks import ToolBlock, block_mass
 from scm_world.tasks.trifinger.entities.goals import GoalBlock, goal_orientation, goal_position
-from scm_world.tasks.trifinger.feasibility import fingers_reach
 from scm_world.tasks.trifinger.views import SIZE, view
-from scm_world.variables import Function, Measured, Variable
+from scm_world.variables import Function, Variable
 from scm_world.variables.mechanisms import Stacked
-
-if TYPE_CHECKING:
-    from scm_world.tasks.trifinger.base import TriFingerTask
 
 MASS = "blocks_mass"
 BOX = 10  # numbers of a box in a goal vector: size (3), position (3), quaternion (4)
@@ -39,7 +33,7 @@ NEAR = 0.1
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 """Of a cube with edges of length one, shape (8, 3)."""
 
-_POSE = ("size", "cartesian_position", "orientation")
+POSE = ("size", "cartesian_position", "orientation")
 
 
 @Stacked
@@ -66,66 +60,21 @@ def aligned(numbers: Floats, tools: float) -> float:
     return aabb_overlap_fraction(*(part[:of] for part in parts), *(part[of:] for part in parts))
 
 
-def fractional_success(task: TriFingerTask) -> Measured:
-    """Declare the fraction of the goals of a task that its blocks fill."""
-    tools, targets, shape = task.tools, task.targets, task.shape
-    published = task.conventions.aligned_boxes
-    parts = _POSE
-    if shape is not None:
-        mechanism = Function(shapes.hull_aligned if published else shapes.hull_filled)
-        parts = ("vertices", *_POSE[1:])
-    elif len(tools) == len(targets) == 1 and not published:
-        mechanism = Function(kernels.filled)
-    else:
-        constants = {"tools": float(len(tools))}
-        mechanism = Function(aligned if published else filled, constants=constants)
-    return Measured(
-        name=FRACTION,
-        bounds=None if published else UNIT,
-        parents=tuple(f"{body}.{part}" for body in (*tools, *targets) for part in parts),
-        mechanism=mechanism,
-        doc="Fraction of the volume of all goals that the blocks fill.",
-    )
+def fraction_of(
+    shape: Hull | None, published: bool, achieved: ArrayLike, desired: ArrayLike
+) -> Floats:
+    """Compute how much of the desired boxes, or of the desired hull, is filled, shape (...)."""
+    vertices = None if shape is None else np.array(shape.vertices)
 
-
-def goal(task: TriFingerTask) -> Goal:
-    """Return the goal of blocks that should fill others: size, position and quaternion of each."""
-    targets, shape = task.targets, task.shape
-    have, want = (
-        tuple(f"{name}.{part}" for name in names for part in _POSE)
-        for names in (targets.values(), targets)
-    )
-    usual, vertices = (
-        task.conventions.aligned_boxes,
-        np.array(() if shape is None else shape.vertices),
-    )
-
-    def one(mine: Floats, its: Floats, published: bool) -> float:
-        if shape is None:
+    def one(mine: Floats, its: Floats) -> float:
+        if vertices is None:
             boxes = aligned if published else filled
             return float(boxes(mine, its, tools=len(mine) / BOX))
         overlap = shapes.hull_aligned if published else shapes.hull_filled
         return overlap(vertices, mine[3:6], mine[6:], vertices, its[3:6], its[6:])
 
-    vectorized = np.vectorize(one, signature="(n),(n),()->()", otypes=[float])
-
-    def fraction(achieved: ArrayLike, desired: ArrayLike, published: bool = usual) -> Floats:
-        """Compute how much of the desired boxes, or of the desired hull, is filled, shape (...)."""
-        return np.asarray(vectorized(np.asarray(achieved), np.asarray(desired), published))
-
-    return Goal(
-        achieved=have,
-        desired=want,
-        causes=task.goal_causes,
-        measures={
-            FRACTION: fraction,
-            SUCCESS: lambda mine, its: fraction(mine, its) > FULFILLED,
-            OVERLAP: partial(fraction, published=True),
-        },
-        closeness=((TIPS, *have, *want), boxes_apart),
-        tools=task.tools,
-        targets=targets,
-    )
+    vectorized = np.vectorize(one, signature="(n),(n)->()", otypes=[float])
+    return np.asarray(vectorized(np.asarray(achieved, float), np.asarray(desired, float)))
 
 
 def view_of(
@@ -133,7 +82,7 @@ def view_of(
 ) -> tuple[tuple[str, ...], int, Callable[[Values], Floats]]:
     """Describe the view of the boxes that have goals, in their own frames."""
     parts = [
-        (TIPS, *(f"{tool}.{part}" for part in _POSE), *(f"{goal}.{p}" for p in _POSE[1:]))
+        (TIPS, *(f"{tool}.{part}" for part in POSE), *(f"{goal}.{p}" for p in POSE[1:]))
         for goal, tool in targets.items()
     ]
 
@@ -141,20 +90,6 @@ def view_of(
         return np.concatenate([view(*(values[name] for name in names)) for names in parts])
 
     return tuple(dict.fromkeys(itertools.chain(*parts))), SIZE * len(parts), seen
-
-
-def solution(targets: Mapping[str, str], values: Values) -> dict[str, Value]:
-    """Put each block where its goal is, and fingers that are in the way to the side."""
-    found = {
-        f"{tool}.{part}": values[f"{goal}.{part}"]
-        for goal, tool in targets.items()
-        for part in _POSE[1:]
-    }
-    joints, height = values["joint_positions"], float(values["robot_height"])
-    boxes = [[values[f"{goal}.{part}"] for part in _POSE] for goal in targets]
-    if any(fingers_reach(b[0], b[1], b[2], joints, height) for b in boxes):
-        found["joint_positions"] = np.array(hardware.ASIDE)
-    return found
 
 
 Part = tuple[str, dict[str, float]]

@@ -36,7 +36,7 @@ def inertia(structure: TriFinger, parameters: Parameters, body: str) -> Floats:
     if body in hardware.LINK_NAMES:
         index = hardware.LINK_NAMES.index(body) % hardware.LINKS_PER_FINGER
         return np.asarray(mass * np.array(hardware.INERTIAL[index].per_mass))
-    hull = structure.hull(body)
+    hull = dict(structure.hulls).get(body)
     if hull is not None:
         return np.asarray(mass * np.array(hull.moments))
     squares = parameters[body, "size"] ** 2

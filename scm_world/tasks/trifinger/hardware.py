@@ -1,7 +1,6 @@
 """The TriFinger robot: its published constants, its joint controller, and how finely time is cut.
 
-Nothing of it is what a backend would call its own; every backend realises the controller and must
-match it.
+Every backend realises the controller and must match it.
 
 Three fingers hang from a base above the table. Each is a chain of three hinges; the axes of the
 second and third are parallel. All numbers are those of the TriFinger-edu description as
@@ -22,11 +21,7 @@ import math
 from dataclasses import dataclass
 from typing import final
 
-import numpy as np
-
-from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.models.scene import Parameters
 from scm_world.variables import Box, part_of
 
 FINGERS = ("60", "120", "300")
@@ -63,10 +58,7 @@ RAISED = (-1.56, -0.08, -2.7) * 3  # [rad]
 ASIDE = (0.0, 1.5, -1.5) * 3  # [rad] stretched outward, the lower links hanging
 
 LINK_MASS = (1.0, 0.14854, 0.14854, 0.0307)  # [kg] links 0 to 3 of a finger
-TIP_MASS = 0.01  # [kg]
-TIP_CENTER = {"mujoco": TIP_ORIGIN, "bullet": (0.0, 0.0, 0.0)}
-"""Where its mass lies, in its own frame [m]. On MuJoCo that is 0.16 m beyond the tip, by mistake.
-It stays until policies are trained again: with the mass at the tip, grasps that held there slip."""
+TIP_MASS = 0.01  # [kg] in the origin of its frame
 TIP_INERTIA = (1.66666666667e-07,) * 3  # [kg m²]
 
 
@@ -129,7 +121,7 @@ LINK_COLORS = {"60": (0.6, 0.0, 0.0), "120": (0.0, 0.6, 0.0), "300": (0.0, 0.0, 
 
 
 def link_name(finger: str, index: int) -> str:
-    """Give the published name of a link.
+    """Return the published name of a link.
 
     Example:
         >>> link_name("60", 1)
@@ -175,7 +167,7 @@ class JointGroup:
         return (n,) if n > 1 else ()
 
     def cut(self, box: Box) -> Box:
-        """Give their part of a box of all nine."""
+        """Return their part of a box of all nine."""
         return box if self.shape == (N_JOINTS,) else part_of(box, self.where, N_JOINTS, self.shape)
 
 
@@ -191,22 +183,18 @@ def joints_of(resolution: str) -> tuple[JointGroup, ...]:
         >>> joints_of("joint")[8].action
         'finger_300_joint_2.action'
     """
-    if resolution == "vector":
-        return (JointGroup(slice(0, N_JOINTS), FINGERS, QUANTITIES, "action", "all fingers"),)
-    found = []
-    for index, finger in enumerate(FINGERS):
-        if resolution == "finger":
-            name, where = f"finger_{finger}", slice(3 * index, 3 * index + 3)
-            names = tuple(f"{name}.{quantity}" for quantity in QUANTITIES)
-            found.append(JointGroup(where, (finger,), names, f"{name}.action", f"finger {finger}"))
-            continue
-        for joint in range(3):
-            name, place = f"finger_{finger}_joint_{joint}", 3 * index + joint
-            names = tuple(f"{name}.{what}" for what in ("position", "velocity", "torque"))
-            of = f"joint {joint} of finger {finger}"
-            found.append(
-                JointGroup(slice(place, place + 1), (finger,), names, f"{name}.action", of)
-            )
+    found, size = [], {"vector": N_JOINTS, "finger": 3, "joint": 1}[resolution]
+    for first in range(0, N_JOINTS, size):
+        finger, joint = FINGERS[first // 3], first % 3
+        stem, of, names = f"finger_{finger}.", f"finger {finger}", QUANTITIES
+        if size == N_JOINTS:
+            stem, of = "", "all fingers"
+        elif size == 1:
+            stem, of = f"finger_{finger}_joint_{joint}.", f"joint {joint} of finger {finger}"
+            names = ("position", "velocity", "torque")
+        fingers = FINGERS if size == N_JOINTS else (finger,)
+        where, named = slice(first, first + size), tuple(stem + name for name in names)
+        found.append(JointGroup(where, fingers, named, f"{stem}action", of))
     return tuple(found)
 
 
@@ -215,9 +203,10 @@ TIMESTEP = 0.004  # [s] the unit in which ``frame_skip`` counts, for every prese
 
 @dataclass(frozen=True)
 class ControllerSpec:
-    """A proportional-derivative law with a safety filter, evaluated at every physics step.
+    """Published gains of a proportional-derivative law with a safety filter.
 
-    In ``joint_positions`` mode, with target q*, position q and velocity v of a joint::
+    The law is evaluated at every physics step. In ``joint_positions`` mode, with target q*,
+    position q and velocity v of a joint::
 
         tau = clip(clip(kp (q* - q) - kd v, ±limit) - safety v, ±limit)
 
@@ -237,39 +226,6 @@ class ControllerSpec:
     kd: tuple[float, float, float] = (0.1, 0.3, 0.001)
     safety: tuple[float, float, float] = (0.08, 0.08, 0.04)
     limit: float = 0.36
-
-    def torques(
-        self, command: Floats, positions: Floats, velocities: Floats, *, direct: bool = False
-    ) -> Floats:
-        """Evaluate the law.
-
-        Args:
-            command: Shape (9,) [rad], or [N m] if ``direct``.
-            positions: Joint positions, shape (9,) [rad].
-            velocities: Joint velocities, shape (9,) [rad/s].
-            direct: Whether torques are commanded.
-
-        Returns:
-            Joint torques, shape (9,) [N m].
-        """
-        wanted = command
-        if not direct:
-            gain, damping = np.tile(self.kp, 3), np.tile(self.kd, 3)
-            wanted = gain * (command - positions) - damping * velocities
-        inner = np.clip(wanted, -self.limit, self.limit)
-        damped = inner - np.tile(self.safety, 3) * velocities
-        safe: Floats = np.clip(damped, -self.limit, self.limit)
-        return safe
-
-
-def controller_spec(parameters: Parameters) -> ControllerSpec:
-    """Read the joint controller from parameters; gains that they lack are the usual ones."""
-    usual, found = ControllerSpec(), {}
-    names = {"kp": "position_gains", "kd": "velocity_gains", "safety": "safety_damping"}
-    for field, name in names.items():
-        value = parameters.get(("controller", name))
-        found[field] = getattr(usual, field) if value is None else tuple(value.tolist())
-    return ControllerSpec(**found, limit=float(parameters["controller", "torque_limit"]))
 
 
 @dataclass(frozen=True)
@@ -295,7 +251,7 @@ PRESET_NAMES = tuple(PRESETS)
 
 
 def preset(name: str) -> Preset:
-    """Look a preset up by its name.
+    """Return a preset by its name.
 
     Raises:
         UnknownOption: There is no such preset.

@@ -8,8 +8,8 @@ offset d. With the joints q0, q1, q2 of a finger, in the frame of its base::
     y' = -d                              y =  y' cos q0 + z' sin q0
     z' = -L (cos q1 + cos(q1 + q2))      z = -y' sin q0 + z' cos q0
 
-The functions without suffix speak numpy; the ones called ``…_kernel`` are compiled, write into
-arrays that are handed to them, and are there for other compiled code to call.
+The functions called ``…_kernel`` are compiled, for speed and for other compiled code to call: they
+do not check their arguments.
 
 Source:
     Derived from the joint origins in ``scm_world.tasks.trifinger.hardware``, which are those of
@@ -30,16 +30,11 @@ from scm_world._types import Floats
 from scm_world.tasks.trifinger import hardware
 
 N_FINGERS = len(hardware.FINGERS)
-FRAMES_PER_FINGER = 5
-"""Links 0 to 3, and the tip."""
-
 REACHED_TOLERANCE = 1e-8
 """How near the tip must be to count as there [m]: an angle at a singularity is no more exact."""
 
 _LEG = hardware.LEG_LENGTH
 _LATERAL = hardware.LATERAL_OFFSET
-_SHOULDER = hardware.JOINT_ORIGINS[1][1]  # [m] y of link 2 in link 1
-_KNEE = hardware.JOINT_ORIGINS[2][1]  # [m] y of link 3 in link 2
 _OFFSET = hardware.TABLE_OFFSET
 _LOW = hardware.JOINT_LOW[:3]
 _HIGH = hardware.JOINT_HIGH[:3]
@@ -47,8 +42,6 @@ _HIGH = hardware.JOINT_HIGH[:3]
 _YAW = tuple(hardware.WORLD_YAW + yaw for yaw in hardware.FINGER_YAW)
 _COS = tuple(math.cos(yaw) for yaw in _YAW)
 _SIN = tuple(math.sin(yaw) for yaw in _YAW)
-_COS_HALF = tuple(math.cos(yaw / 2) for yaw in _YAW)
-_SIN_HALF = tuple(math.sin(yaw / 2) for yaw in _YAW)
 _COS_WORLD, _SIN_WORLD = math.cos(hardware.WORLD_YAW), math.sin(hardware.WORLD_YAW)
 _BASE_X = tuple(_COS_WORLD * x - _SIN_WORLD * y for x, y, _ in hardware.FINGER_OFFSET)  # [m]
 _BASE_Y = tuple(_SIN_WORLD * x + _COS_WORLD * y for x, y, _ in hardware.FINGER_OFFSET)  # [m]
@@ -68,33 +61,51 @@ class Solution:
     reached: NDArray[np.bool_]
 
 
+Point = tuple[float, float, float]
+
+
 @njit(cache=True)
-def _tip(q0: float, q1: float, q2: float) -> tuple[float, float, float]:
-    """Place the tip of one finger in the frame of its base [m]."""
-    x = -_LEG * (math.sin(q1) + math.sin(q1 + q2))
-    z = -_LEG * (math.cos(q1) + math.cos(q1 + q2))
+def _place(q0: float, q1: float, q2: float, aside: float, middle: float, lower: float) -> Point:
+    """Compute a point of a finger in the frame of its base [m]; see ``point_kernel``."""
+    x = -_LEG * (middle * math.sin(q1) + lower * math.sin(q1 + q2))
+    z = -_LEG * (middle * math.cos(q1) + lower * math.cos(q1 + q2))
     sine, cosine = math.sin(q0), math.cos(q0)
-    return x, z * sine - _LATERAL * cosine, z * cosine + _LATERAL * sine
+    return x, z * sine + aside * cosine, z * cosine - aside * sine
 
 
 @njit(cache=True)
-def tip_kernel(
-    finger: int, q0: float, q1: float, q2: float, height: float, out: Floats, i: int
-) -> None:
-    """Write the tip of one finger [m] into ``out[i : i + 3]``."""
-    x, y, z = _tip(q0, q1, q2)
-    out[i] = _COS[finger] * x - _SIN[finger] * y + _BASE_X[finger]
-    out[i + 1] = _SIN[finger] * x + _COS[finger] * y + _BASE_Y[finger]
-    out[i + 2] = z + height - _OFFSET
+def point_kernel(
+    finger: int, angles: Floats, height: float, aside: float, middle: float, lower: float
+) -> Point:
+    """Compute a point of a finger [m].
+
+    Args:
+        finger: Its number.
+        angles: Of its three joints, shape (3,) [rad].
+        height: Of the robot [m].
+        aside: How far the point lies along the axis of the second joint [m].
+        middle: How far along the middle link, as a share of its length.
+        lower: How far along the lower link, as a share of its length.
+    """
+    x, y, z = _place(angles[0], angles[1], angles[2], aside, middle, lower)
+    right = _COS[finger] * x - _SIN[finger] * y + _BASE_X[finger]
+    return right, _SIN[finger] * x + _COS[finger] * y + _BASE_Y[finger], z + height - _OFFSET
 
 
 @njit(cache=True)
-def forward_kernel(joint_positions: Floats, height: float, out: Floats) -> None:
-    """Write the tips (9,) [m] that ``forward`` returns into ``out``."""
+def tip_kernel(finger: int, angles: Floats, height: float) -> Point:
+    """Compute the tip of one finger [m]; see ``point_kernel``."""
+    return point_kernel(finger, angles, height, -_LATERAL, 1.0, 1.0)
+
+
+@njit(cache=True)
+def forward_kernel(joint_positions: Floats, height: float) -> Floats:
+    """Compute what ``forward`` returns."""
+    tips = np.empty(3 * N_FINGERS)
     for finger in range(N_FINGERS):
         i = 3 * finger
-        q0, q1, q2 = joint_positions[i], joint_positions[i + 1], joint_positions[i + 2]
-        tip_kernel(finger, q0, q1, q2, height, out, i)
+        tips[i], tips[i + 1], tips[i + 2] = tip_kernel(finger, joint_positions[i : i + 3], height)
+    return tips
 
 
 @njit(cache=True)
@@ -141,7 +152,7 @@ def _solve(x: float, y: float, z: float, near: Floats, i: int, joint_positions: 
     for branch in range(4):
         q0, q1, q2 = _branch(x, y, z, -1.0 if branch < 2 else 1.0, -1.0 if branch % 2 else 1.0)
         q0, q1, q2 = _clip(q0, 0), _clip(q1, 1), _clip(q2, 2)
-        tip_x, tip_y, tip_z = _tip(q0, q1, q2)
+        tip_x, tip_y, tip_z = _place(q0, q1, q2, -_LATERAL, 1.0, 1.0)
         gap = math.hypot(math.hypot(tip_x - x, tip_y - y), tip_z - z)
         turn = (q0 - near[i]) ** 2 + (q1 - near[i + 1]) ** 2 + (q2 - near[i + 2]) ** 2
         reached = gap <= REACHED_TOLERANCE
@@ -157,13 +168,10 @@ def _solve(x: float, y: float, z: float, near: Floats, i: int, joint_positions: 
 
 @njit(cache=True)
 def inverse_kernel(
-    targets: Floats,
-    height: float,
-    near: Floats,
-    joint_positions: Floats,
-    reached: NDArray[np.bool_],
-) -> None:
-    """Write what ``inverse`` returns into ``joint_positions`` (9,) and ``reached`` (3,)."""
+    targets: Floats, height: float, near: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Compute the joint positions (9,) and whether fingers reach (3,) that ``inverse`` returns."""
+    joint_positions, reached = np.empty(3 * N_FINGERS), np.empty(N_FINGERS, dtype=np.bool_)
     for finger in range(N_FINGERS):
         i = 3 * finger
         for joint in range(3):
@@ -174,78 +182,15 @@ def inverse_kernel(
         z = targets[i + 2] - height + _OFFSET
         finite = math.isfinite(x) and math.isfinite(y) and math.isfinite(z)
         reached[finger] = finite and _solve(x, y, z, near, i, joint_positions)
+    return joint_positions, reached
 
 
-@njit(cache=True)
-def _place(
-    positions: Floats, frame: int, finger: int, x: float, y: float, z: float, base: float
-) -> None:
-    """Write one origin, given in the frame of the finger's base, in the world [m]."""
-    positions[frame, 0] = _COS[finger] * x - _SIN[finger] * y + _BASE_X[finger]
-    positions[frame, 1] = _SIN[finger] * x + _COS[finger] * y + _BASE_Y[finger]
-    positions[frame, 2] = z + base
-
-
-@njit(cache=True)
-def _orient(
-    orientations: Floats, frame: int, finger: int, abduction: float, flexion: float
-) -> None:
-    """Write the quaternion of Rz(yaw) Rx(-abduction) Ry(flexion), with w >= 0."""
-    sine, cosine = math.sin(-abduction / 2.0), math.cos(abduction / 2.0)
-    x, y = _COS_HALF[finger] * sine, _SIN_HALF[finger] * sine
-    z, w = _SIN_HALF[finger] * cosine, _COS_HALF[finger] * cosine
-    sine, cosine = math.sin(flexion / 2.0), math.cos(flexion / 2.0)
-    sign = 1.0 if w * cosine - y * sine >= 0.0 else -1.0
-    orientations[frame, 0] = sign * (x * cosine - z * sine)
-    orientations[frame, 1] = sign * (y * cosine + w * sine)
-    orientations[frame, 2] = sign * (z * cosine + x * sine)
-    orientations[frame, 3] = sign * (w * cosine - y * sine)
-
-
-@njit(cache=True)
-def link_frames_kernel(
-    joint_positions: Floats, height: float, positions: Floats, orientations: Floats
-) -> None:
-    """Write what ``link_frames`` returns into ``positions`` (15, 3), ``orientations`` (15, 4)."""
-    base = height - _OFFSET
-    for finger in range(N_FINGERS):
-        i, frame = 3 * finger, FRAMES_PER_FINGER * finger
-        q0, q1, q2 = joint_positions[i], joint_positions[i + 1], joint_positions[i + 2]
-        sine, cosine = math.sin(q0), math.cos(q0)
-        knee_x, knee_z = -_LEG * math.sin(q1), -_LEG * math.cos(q1)
-        knee_y = _SHOULDER + _KNEE
-        tip_x, tip_y, tip_z = _tip(q0, q1, q2)
-        _place(positions, frame, finger, 0.0, 0.0, 0.0, base)
-        _place(positions, frame + 1, finger, 0.0, 0.0, 0.0, base)
-        _place(positions, frame + 2, finger, 0.0, _SHOULDER * cosine, -_SHOULDER * sine, base)
-        y, z = knee_y * cosine + knee_z * sine, knee_z * cosine - knee_y * sine
-        _place(positions, frame + 3, finger, knee_x, y, z, base)
-        _place(positions, frame + 4, finger, tip_x, tip_y, tip_z, base)
-        _orient(orientations, frame, finger, 0.0, 0.0)
-        _orient(orientations, frame + 1, finger, q0, 0.0)
-        _orient(orientations, frame + 2, finger, q0, q1)
-        _orient(orientations, frame + 3, finger, q0, q1 + q2)
-        _orient(orientations, frame + 4, finger, q0, q1 + q2)
-
-
-@njit(cache=True)
-def frames_of_rows(
-    joint_positions: Floats, heights: Floats, positions: Floats, orientations: Floats
-) -> None:
-    """Write what ``link_frames`` returns for each row, shapes (n, 15, 3) and (n, 15, 4)."""
-    for row in range(len(positions)):
-        joints = joint_positions[min(row, len(joint_positions) - 1)]
-        height = heights[min(row, len(heights) - 1)]
-        link_frames_kernel(joints, height, positions[row], orientations[row])
-
-
-def forward(joint_positions: ArrayLike, height: float, out: Floats | None = None) -> Floats:
+def forward(joint_positions: ArrayLike, height: float) -> Floats:
     """Compute where the fingertips are.
 
     Args:
         joint_positions: Shape (9,) [rad].
         height: Of the robot, measured from the plane below the table top [m].
-        out: Written into and returned, shape (9,); a new array if not given.
 
     Returns:
         The origins of the three tip frames, shape (9,) [m], z from the table top.
@@ -255,8 +200,7 @@ def forward(joint_positions: ArrayLike, height: float, out: Floats | None = None
         >>> forward(hardware.REST, hardware.NOMINAL_HEIGHT)[:3].round(4).tolist()
         [-0.0595, 0.1586, 0.0559]
     """
-    tips = np.empty(3 * N_FINGERS) if out is None else out
-    forward_kernel(_nine(joint_positions, "joint_positions"), float(height), tips)
+    tips: Floats = forward_kernel(_nine(joint_positions, "joint_positions"), float(height))
     return tips
 
 
@@ -290,29 +234,8 @@ def inverse(targets: ArrayLike, height: float, near: ArrayLike) -> Solution:
         >>> inverse(np.full(9, 2.0), hardware.NOMINAL_HEIGHT, hardware.REST).reached.tolist()
         [False, False, False]
     """
-    joint_positions = np.empty(3 * N_FINGERS)
-    reached = np.empty(N_FINGERS, dtype=np.bool_)
     wanted, close = _nine(targets, "targets"), _nine(near, "near")
-    inverse_kernel(wanted, float(height), close, joint_positions, reached)
-    return Solution(joint_positions, reached)
-
-
-def link_frames(joint_positions: ArrayLike, height: float) -> tuple[Floats, Floats]:
-    """Compute the frames of all links: links 0 to 3 and the tip, finger by finger.
-
-    Args:
-        joint_positions: Shape (9,) [rad].
-        height: Of the robot, measured from the plane below the table top [m].
-
-    Returns:
-        Origins, shape (15, 3) [m], z from the table top; and unit quaternions (x, y, z, w) with
-        w >= 0, shape (15, 4).
-    """
-    n_frames = N_FINGERS * FRAMES_PER_FINGER
-    positions, orientations = np.empty((n_frames, 3)), np.empty((n_frames, 4))
-    angles = _nine(joint_positions, "joint_positions")
-    link_frames_kernel(angles, float(height), positions, orientations)
-    return positions, orientations
+    return Solution(*inverse_kernel(wanted, float(height), close))
 
 
 def _nine(values: ArrayLike, name: str) -> Floats:

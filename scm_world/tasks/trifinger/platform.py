@@ -16,7 +16,7 @@ Source:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.metadata import version
 from importlib.util import find_spec
 from typing import Any, ClassVar, final
@@ -24,12 +24,13 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.base import Capabilities, EngineSnapshot, InMemory
+from scm_world.backends import Capabilities, EngineSnapshot, register
+from scm_world.backends.base import InMemory
 from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
 from scm_world.geometry.rotations import quaternion_product, to_rotation_vector
 from scm_world.models.scene import Difference, Parameters, Scene
-from scm_world.tasks.trifinger import fake, hardware
-from scm_world.tasks.trifinger.hardware import controller_spec
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.grasping.bodies import turn_about_z
 from scm_world.tasks.trifinger.kinematics import forward, inverse
 from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.tasks.trifinger.system import TriFinger
@@ -37,9 +38,6 @@ from scm_world.tasks.trifinger.system import TriFinger
 CUBE = 0.065  # [m] edge of the platform's cube
 TURN = math.radians(-48.0)  # of this package's world about z, so that the fingers lie alike
 NEAR, SMALL = 1e-4, 1e-6  # [m] of inverse kinematics, [rad] of derivatives
-WRITTEN = ("mass", "friction")
-"""Of the cube. Other frictions, gravity and the controller are written, too."""
-
 OWN: Mapping[str, Any] = {
     "tool_block.mass": 0.094,
     "position_gains": (15.0, 15.0, 9.0),
@@ -52,6 +50,7 @@ of bounds here): an intervention that sets them, on any backend, tells how much 
 
 
 @final
+@register
 class TriFingerPlatform(InMemory):
     """One cube and the TriFinger Pro, for playing policies.
 
@@ -65,17 +64,13 @@ class TriFingerPlatform(InMemory):
     """
 
     name: ClassVar[str] = "trifinger_platform"
-    capabilities: ClassVar[Capabilities] = Capabilities(snapshot="replay")
+    capabilities: ClassVar[Capabilities] = Capabilities()
     _platform: Any
 
     def __init__(self) -> None:
         if find_spec("trifinger_simulation") is None:
             raise MissingEngine(self.name, "pip install 'scm-world[trifinger]'")
-
-    @property
-    def version(self) -> str:
-        """Version of the platform's simulation."""
-        return version("trifinger_simulation")
+        self.version = version("trifinger_simulation")
 
     def build(self, scene: Scene) -> None:
         """Keep the scene; the platform is started with the first step.
@@ -100,14 +95,10 @@ class TriFingerPlatform(InMemory):
         """
         if difference.structure is not None:
             raise UnknownOption("scene of the TriFinger platform", "another one", ("one cube",))
-        self._fits(self._structure, difference.parameters)
+        self._fits(self.structure, difference.parameters)
         super().apply(difference)
         if difference:
             self._begin()
-
-    def inertia(self, body: str) -> Floats:
-        """Compute the principal moments of inertia of a solid cube, shape (3,) [kg m²]."""
-        return fake.inertia(self._structure, self._parameters, body)
 
     def step(self, command: Floats, substeps: int) -> None:
         """Let the fingertips go where a command would bring those of this package's robot.
@@ -115,7 +106,7 @@ class TriFingerPlatform(InMemory):
         Raises:
             EngineFailure: Torques are commanded, or a number is not finite.
         """
-        if self._structure.torques:
+        if self.structure.torques:
             advice = "use action_mode='joint_positions', or relative to them"
             raise EngineFailure(f"the platform takes joint positions only; {advice}", self.name)
         if self._platform is None:
@@ -129,13 +120,13 @@ class TriFingerPlatform(InMemory):
 
     def snapshot(self) -> EngineSnapshot:
         """Save where the platform began, and all commands since."""
-        scene = Scene(self._structure, dict(self._parameters), self._state.copy())
-        return self.sealed((scene, self._first.copy(), list(self._played)))
+        scene = Scene(self.structure, dict(self._parameters), self._state.copy())
+        return EngineSnapshot.of(self, (scene, self._first.copy(), list(self._played)))
 
     def restore(self, snapshot: EngineSnapshot) -> None:
         """Go back to a snapshot; the commands before it are repeated with the next step."""
-        scene, first, played = self.opened(snapshot)
-        super().restore(self.sealed(scene))
+        scene, first, played = snapshot.opened(self)
+        super().restore(EngineSnapshot.of(self, scene))
         self._begin()
         self._first, self._played[:] = first.copy(), played
 
@@ -151,7 +142,7 @@ class TriFingerPlatform(InMemory):
         for key, value in parameters.items():
             body, name = key
             free = name == "color" or body == "controller" or key == ("world", "gravity")
-            free |= body in structure.blocks and name in WRITTEN
+            free |= body in structure.blocks and name in ("mass", "friction")
             free |= name == "friction" and body in ("floor", "stage", "robot")
             if not free and not np.array_equal(value, usual[key]):
                 asked, only = f"{body}.{name} on the TriFinger platform", usual[key].tolist()
@@ -182,33 +173,29 @@ class TriFingerPlatform(InMemory):
         import pybullet
 
         found, client = self._parameters, robot._pybullet_client_id
-        block, cube = self._structure.blocks[0], self._platform.cube._object_id
-        change: dict[str, float] = {name: float(found[block, name]) for name in WRITTEN}
-        pybullet.changeDynamics(
-            cube, -1, mass=change["mass"], lateralFriction=change["friction"],
-            physicsClientId=client,
-        )  # fmt: skip
-        surfaces = {
-            "floor": [(getattr(robot._table_id, "_object_id", robot._table_id), -1)],
-            "stage": [(robot._containment_id, -1)],
-            "robot": [(robot.finger_id, link) for link in robot.pybullet_link_indices],
-        }
-        for name, parts in surfaces.items():
-            for body, link in parts:
-                pybullet.changeDynamics(
-                    body, link, lateralFriction=float(found[name, "friction"]),
-                    physicsClientId=client,
-                )  # fmt: skip
+
+        def write(bodies: Iterable[tuple[Any, int]], name: str, **more: float) -> None:
+            more["lateralFriction"] = float(found[name, "friction"])
+            for body, link in bodies:
+                pybullet.changeDynamics(body, link, physicsClientId=client, **more)
+
+        block, table = self.structure.blocks[0], robot._table_id
+        write([(self._platform.cube._object_id, -1)], block, mass=float(found[block, "mass"]))
+        write([(getattr(table, "_object_id", table), -1)], "floor")
+        write([(robot._containment_id, -1)], "stage")
+        write([(robot.finger_id, link) for link in robot.pybullet_link_indices], "robot")
         pybullet.setGravity(*turned(found["world", "gravity"], 1), physicsClientId=client)
-        spec = controller_spec(found)
-        robot.position_gains, robot.velocity_gains = np.tile(spec.kp, 3), np.tile(spec.kd, 3)
-        robot.safety_kd, robot.max_motor_torque = np.tile(spec.safety, 3), spec.limit
+        law = {key[1]: value for key, value in found.items() if key[0] == "controller"}
+        robot.position_gains = np.tile(law["position_gains"], 3)
+        robot.velocity_gains = np.tile(law["velocity_gains"], 3)
+        robot.safety_kd = np.tile(law["safety_damping"], 3)
+        robot.max_motor_torque = float(law["torque_limit"])
 
     def _play(self, command: Floats, substeps: int) -> None:
         """Hold a command, and read what the platform observes then."""
         platform = self._platform
         wanted = platform.Action(position=self._posed(command, self._joints))
-        for _ in range(round(substeps * self._structure.timestep / platform.get_time_step())):
+        for _ in range(round(substeps * self.structure.timestep / platform.get_time_step())):
             at = platform.append_desired_action(wanted)
         robot, seen = platform.get_robot_observation(at), platform.get_camera_observation(at)
         self._joints = np.array(robot.position)
@@ -234,7 +221,7 @@ class TriFingerPlatform(InMemory):
         state.positions[0], state.orientations[0] = place, facing
 
     def _posed(self, joints: Floats, near: Floats) -> Floats:
-        """Give the platform's joint positions with the tips of those of this package's robot."""
+        """Return the platform's joint positions with the tips of those of this package's robot."""
         from trifinger_simulation.trifingerpro_limits import robot_position as limits
 
         kinematics = self._platform.simfinger.kinematics
@@ -249,7 +236,7 @@ class TriFingerPlatform(InMemory):
         return found
 
     def _ours(self, joints: Floats, near: Floats) -> Floats:
-        """Give the joint positions of this package's robot with the tips of the platform."""
+        """Return the joint positions of this package's robot with the tips of the platform."""
         tips = np.array(self._platform.forward_kinematics(joints))
         height = float(self._parameters["robot", "height"])
         return inverse(turned(tips, -1).ravel(), height, near).joint_positions
@@ -257,10 +244,7 @@ class TriFingerPlatform(InMemory):
 
 def turned(points: Any, sign: int) -> Floats:
     """Turn points about z: 1 to the platform's world, -1 back."""
-    cos, sin = math.cos(TURN), sign * math.sin(TURN)
-    turned: Floats = np.asarray(points) @ np.array(
-        [[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]
-    )
+    turned: Floats = np.asarray(points) @ turn_about_z(sign * TURN).T
     return turned
 
 

@@ -87,6 +87,7 @@ class Reaching(TriFingerTask):
     )
     paper_weights = {FRACTION: 0.0}  # noqa: RUF012 # a constant
     ready_terms = shaping.REACHING
+    seconds = 5.0
     decided_by = (COUNT,)
     goal_causes = tuple(f"{name}.cylindrical_position" for name in GOALS)
 
@@ -106,11 +107,6 @@ class Reaching(TriFingerTask):
             for finger, place in given.items()
         )
         self.roots = (*scattering(number_of_obstacles),)
-
-    @property
-    def seconds(self) -> float:
-        """Five seconds [s]."""
-        return 5.0
 
     def arrange(self, values: Values) -> int:
         """Count the obstacles."""

@@ -21,20 +21,19 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from itertools import combinations, product
 from typing import Any, final
 
 import mujoco
-import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.backends.mujoco.fields import Field
+from scm_world.backends.mujoco.fields import numbers
 from scm_world.backends.mujoco.reading import read_model
-from scm_world.backends.mujoco.slots import Slot, first, place, turn
+from scm_world.backends.mujoco.slots import Finder, Slot, first, place, turn
 from scm_world.backends.mujoco.trees import NOTHING, Couplings, Effect
 from scm_world.geometry.hulls import Hull
-from scm_world.models.model import Model
+from scm_world.models.model import Model, Parameter
 from scm_world.models.scene import State
 from scm_world.tasks.trifinger import fake, hardware
 from scm_world.tasks.trifinger.cameras import VIEWS
@@ -66,6 +65,8 @@ MOUNT = hardware.Capsule((0.012, 0.0, 0.0), (-0.004, 0.0, 0.0), 0.0235)
 """How link 0 looks; its published mesh is a frame that hides the arena from above."""
 
 SHAPES = ("upper", "middle", "lower", "tip")  # in the order of the links 1, 2, 3 and 3
+LINK_SHAPES = (("base",), ("upper",), ("middle",), ("lower", "tip"))
+"""The shapes of links 0 to 3 of a finger; the base touches nothing."""
 
 CONTACT = {"fast": (0.010, 1.0), "precise": (0.004, 1.0)}
 """Time constant [s] and damping ratio of contacts, by preset."""
@@ -84,13 +85,13 @@ _SPEC = ControllerSpec()
 _OBSTACLE_POSE = {"pos": (0.1, 0.2, 0.3), "quat": (0.9, 0.1, 0.2, 0.3)}
 """MuJoCo fixes poses of zero for good."""
 
+AHEAD = (0.0, 0.0, 0.0, 1.0)  # the orientation of something that is not turned
 _ROLLING_FRICTION = 1e-4  # not in force: contacts have four dimensions
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class TriFinger(Model):
-    """The robot with blocks and obstacles.
+@dataclass(frozen=True, kw_only=True)
+class Parts:
+    """What there is, and how it is commanded.
 
     Attributes:
         blocks: Names of the movable blocks, in the order of the state.
@@ -99,8 +100,8 @@ class TriFinger(Model):
             and fingertips collide with them.
         hulls: The movable blocks that are no boxes, each with its convex shape.
         torques: Whether joint torques are commanded [N m], and not joint positions [rad].
+        resolution: Whether all joints, those of a finger, or each are a state; see ``joints_of``.
         published: Whether Bullet realises the bodies of the predecessor; see ``published``.
-        instead: What Bullet realises then.
     """
 
     blocks: tuple[str, ...] = ()
@@ -108,7 +109,14 @@ class TriFinger(Model):
     obstacles: tuple[str, ...] = ()
     hulls: tuple[tuple[str, Hull], ...] = ()
     torques: bool = False
+    resolution: str = RESOLUTIONS[0]
     published: bool = False
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class TriFinger(Model, Parts):
+    """The robot with blocks and obstacles."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how it is made, so that pickling costs little."""
@@ -117,27 +125,14 @@ class TriFinger(Model):
     @property
     def with_(self) -> Callable[..., TriFinger]:
         """A function that makes this model with some arguments of ``trifinger`` replaced."""
-        names = [row.name for row in self.states]
-        return partial(
-            trifinger,
-            blocks=self.blocks,
-            preset=self.preset,
-            obstacles=self.obstacles,
-            hulls=self.hulls,
-            torques=self.torques,
-            resolution=next(r for r in RESOLUTIONS if joints_of(r)[0].names[0] in names),
-            published=self.published,
-        )
-
-    def hull(self, block: str) -> Hull | None:
-        """Return the shape of a block that is no box; None for a box."""
-        return next((hull for name, hull in self.hulls if name == block), None)
+        return partial(trifinger, **{name: getattr(self, name) for name in _PARTS})
 
     def empty_state(self) -> State:
         """Return a state to read into."""
         return PhysicalState(self.layout)
 
 
+_PARTS = tuple(Parts.__dataclass_fields__)
 START = "start"
 """The keyframe in which fingers and blocks are clear of one another."""
 COLUMNS, ROWS = 3, 2
@@ -153,12 +148,13 @@ def trifinger(
     hulls: tuple[tuple[str, Hull], ...] = (),
     *,
     torques: bool = False,
-    resolution: str = "vector",
+    resolution: str = RESOLUTIONS[0],
     published: bool = False,
 ) -> TriFinger:
     """Return the model of the robot with some blocks and obstacles; it is made once in a process.
 
-    Its parameters are, with the friction of a contact as the product of those of its two bodies:
+    The arguments are those of ``Parts``. The parameters of the model are, with the friction of a
+    contact as the product of those of its two bodies:
 
     ======================  ==========================================
     element                 properties
@@ -175,39 +171,30 @@ def trifinger(
     every obstacle          ``size`` (3,) [m], ``friction``, ``color`` (3,), ``position`` (3,)
                             [m], ``orientation`` (4,)
     ======================  ==========================================
-
-    Args:
-        blocks: See ``TriFinger``.
-        preset: See ``TriFinger``.
-        obstacles: See ``TriFinger``.
-        hulls: See ``TriFinger``.
-        torques: See ``TriFinger``.
-        resolution: Whether all joints, those of a finger, or each are a state; see ``joints_of``.
-        published: See ``TriFinger``.
     """
-    parts = _Parts(blocks, preset, obstacles, hulls, torques)
-    read = _read(parts, resolution)
-    described = {name: getattr(read, name) for name in read.__dataclass_fields__}
-    described["digest"] += f" {published}"
-    instead = partial(_read, replace(parts, engine="bullet", published=published), resolution)
-    described |= {"instead": instead, "views": VIEWS, "fake": fake}
-    return TriFinger(
-        **described,
+    parts = Parts(
         blocks=blocks,
         preset=preset,
         obstacles=obstacles,
         hulls=hulls,
         torques=torques,
+        resolution=resolution,
         published=published,
     )
+    read = _read(replace(parts, published=False))
+    described = {name: getattr(read, name) for name in read.__dataclass_fields__}
+    described["digest"] += f" {published}"
+    instead = partial(_read, parts) if published else None
+    described |= {"instead": instead, "views": VIEWS, "fake": fake}
+    return TriFinger(**described, **vars(parts))
 
 
 @lru_cache(maxsize=64)
-def _read(parts: _Parts, resolution: str) -> Model:
-    """Compile what there is, and describe it."""
+def _read(parts: Parts) -> Model:
+    """Compile what there is, and describe it; ``published`` is the variant of the predecessor."""
     states: dict[str, list[str]] = {}
     for index, what in enumerate(("position", "velocity", "actuator_torque")):
-        for group in joints_of(resolution):
+        for group in joints_of(parts.resolution):
             joints = range(group.where.start, group.where.stop)
             states[group.names[index]] = [f"{_JOINT_NAMES[i]}.{what}" for i in joints]
     for block in parts.blocks:
@@ -219,7 +206,7 @@ def _read(parts: _Parts, resolution: str) -> Model:
         keyframe=START,
         states=states,
         controls=[f"{joint}_servo" for joint in _JOINT_NAMES],
-        bindings=partial(_bindings, parts=parts),
+        bindings=lambda mj, data, trees: (one for one, _ in _rows(mj, data, trees, parts)),
         frame="world",
         part_of={tip_name(finger): link_name(finger, 3) for finger in FINGERS},
     )
@@ -230,36 +217,19 @@ MOTION = ("cartesian_position", "orientation", "linear_velocity", "angular_veloc
 _JOINT_NAMES = tuple(link_name(finger, index) for finger in FINGERS for index in (1, 2, 3))
 
 
-@final
-@dataclass(frozen=True)
-class _Parts:
-    """What there is, and how it is commanded; see ``TriFinger``.
-
-    ``published`` is the variant of the predecessor; ``engine`` decides where the mass of a
-    fingertip lies.
-    """
-
-    blocks: tuple[str, ...]
-    preset: Preset
-    obstacles: tuple[str, ...]
-    hulls: tuple[tuple[str, Hull], ...]
-    torques: bool
-    published: bool = False
-    engine: str = "mujoco"
-
-
-def _compiled(parts: _Parts) -> mujoco.MjModel:
+def _compiled(parts: Parts) -> mujoco.MjModel:
     """Compile what there is, with the default of every parameter, and with the start."""
     hulls = dict(parts.hulls)
     spec = mujoco.MjSpec()
     spec.modelname = "scm_world"
     spec.compiler.degree = False
+    spec.default.geom.contype = spec.default.geom.conaffinity = 0  # pairs say what touches
     _write_options(spec, parts)
     floor = spec.worldbody.add_body(name=FLOOR)
-    _add_shape(floor, FLOOR, type=_PLANE, size=(WALL_RADIUS, WALL_RADIUS, 0.1))
+    floor.add_geom(name=FLOOR, type=_PLANE, size=(WALL_RADIUS, WALL_RADIUS, 0.1))
     box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": (_BLOCK_HALF,) * 3}
     for name in parts.obstacles:
-        _add_shape(spec.worldbody.add_body(name=name), name, **box, **_OBSTACLE_POSE)
+        spec.worldbody.add_body(name=name).add_geom(name=name, **box, **_OBSTACLE_POSE)
     _add_wall(spec.worldbody)
     _add_robot(spec, parts)
     for name in parts.blocks:
@@ -269,28 +239,24 @@ def _compiled(parts: _Parts) -> mujoco.MjModel:
         body.inertia = (_BLOCK_MASS / 6 * (2 * _BLOCK_HALF) ** 2,) * 3
         body.explicitinertial = True
         if hull is None:
-            _add_shape(body, name, **box)
+            body.add_geom(name=name, **box)
         else:  # MuJoCo moves a mesh into a frame of its own and the shape back by as much
             mesh = spec.add_mesh(name=name)
             mesh.uservert = [number for vertex in hull.vertices for number in vertex]
             mesh.userface = [index for face in hull.faces for index in face]
-            _add_shape(body, name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
-    contact, slide = (table[parts.preset.name] for table in (CONTACT, SLIDING))
-    gripping = spec.default
-    sliding = spec.add_default("sliding", gripping)
-    for kind, friction in ((gripping, contact), (sliding, slide)):
-        pair = kind.pair
-        pair.condim, pair.margin, pair.gap = 4, 0.0, 0.0
-        pair.solref, pair.solreffriction = contact, friction
-        pair.friction = (1.0, 1.0, SPINNING_FRICTION, _ROLLING_FRICTION, _ROLLING_FRICTION)
+            body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
+    spec.add_numeric(name="bullet_explicit_servos", size=1, data=[1.0])
     pairs = contact_pairs(parts)
-    if parts.engine == "bullet":
-        spec.add_numeric(name="bullet_explicit_servos", size=1, data=[1.0])
     if parts.published:
         alter(spec)
         pairs = touching(parts.blocks, parts.obstacles)
+    contact, sliding = (table[parts.preset.name] for table in (CONTACT, SLIDING))
+    pair = spec.default.pair
+    pair.condim, pair.margin, pair.gap, pair.solref = 4, 0.0, 0.0, contact
+    pair.friction = (1.0, 1.0, SPINNING_FRICTION, _ROLLING_FRICTION, _ROLLING_FRICTION)
     for one, other, slides in pairs:
-        spec.add_pair(sliding if slides else gripping, geomname1=one, geomname2=other)
+        reference = sliding if slides else contact
+        spec.add_pair(geomname1=one, geomname2=other, solreffriction=reference)
     start = [*hardware.REST]
     for index in range(len(parts.blocks)):
         layer, spot = divmod(index, COLUMNS * ROWS)
@@ -298,57 +264,16 @@ def _compiled(parts: _Parts) -> mujoco.MjModel:
         x = SPACING * (column - (min(len(parts.blocks), COLUMNS) - 1) / 2)
         start += [x, 0.09 * row, _BLOCK_HALF + LAYER * layer, 1.0, 0.0, 0.0, 0.0]
     spec.add_key(name=START, qpos=start)
-    model, defaults = spec.compile(), _defaults(parts)
+    model = spec.compile()
     if parts.published:
         restore(model)
     scratch = mujoco.MjData(model)
-    for bound in _bindings(model, Couplings(model), parts=parts):
+    for bound, default in _rows(model, scratch, Couplings(model), parts):
         slot = bound.slot(model, scratch)  # type: ignore[misc] # every binding has one
-        slot.write(np.asarray(defaults[bound.name], dtype=np.float64))
+        slot.write(np.asarray(default, dtype=np.float64))
     couple(model)
     mujoco.mj_setConst(model, scratch)
     return model
-
-
-def _defaults(parts: _Parts) -> dict[str, object]:
-    """Return the published default of every parameter, by name."""
-    surface = {"floor": (0.31, 0.27, 0.25), "stage": (0.95, 0.95, 0.95)}
-    values: dict[str, object] = {
-        "world.gravity": (0.0, 0.0, -9.81),
-        "world.restitution": 0.0,
-        "world.spinning_friction": SPINNING_FRICTION,
-        "robot.height": hardware.NOMINAL_HEIGHT,
-        "robot.friction": 0.5,
-        "robot.joint_damping": 0.0,
-        "controller.position_gains": _SPEC.kp,
-        "controller.velocity_gains": _SPEC.kd,
-        "controller.safety_damping": _SPEC.safety,
-        "controller.torque_limit": _SPEC.limit,
-    }
-    for finger in FINGERS:
-        for index, mass in enumerate(hardware.LINK_MASS):
-            values[f"{link_name(finger, index)}.mass"] = mass
-            values[f"{link_name(finger, index)}.color"] = hardware.LINK_COLORS[finger]
-    for name, color in surface.items():
-        values |= {f"{name}.friction": 0.5, f"{name}.color": color}
-    for block in parts.blocks:
-        values |= {f"{block}.mass": _BLOCK_MASS, f"{block}.size": (2.0 * _BLOCK_HALF,) * 3}
-        values |= {f"{block}.friction": 1.0, f"{block}.color": (1.0, 0.0, 0.0)}
-    for index, name in enumerate(parts.obstacles):
-        values |= {f"{name}.size": (0.01,) * 3, f"{name}.friction": 0.5}
-        values |= {f"{name}.color": (0.0,) * 3, f"{name}.orientation": (0.0, 0.0, 0.0, 1.0)}
-        values[f"{name}.position"] = (0.02 * index - 0.1, 0.15, 0.005)
-    return values
-
-
-def shape_name(finger: str, shape: str) -> str:
-    """Name a collision shape of the robot."""
-    return f"{finger}/{shape}"
-
-
-def base_name(finger: str) -> str:
-    """Name the frame from which a finger hangs."""
-    return f"{finger}/base"
 
 
 def tip_name(finger: str) -> str:
@@ -356,53 +281,33 @@ def tip_name(finger: str) -> str:
     return f"robot_finger_{finger}_tip"
 
 
-def wall_name(segment: int) -> str:
-    """Name a segment of the ring."""
-    return f"{STAGE}/{segment}"
-
-
-def inside_name(segment: int) -> str:
-    """Name what is seen of a segment of the ring."""
-    return f"{wall_name(segment)}/inside"
-
-
-def link_shapes(finger: str, index: int) -> tuple[str, ...]:
-    """List the shapes that belong to a link; the base has one that touches nothing."""
-    shapes = {0: ("base",), 1: ("upper",), 2: ("middle",), 3: ("lower", "tip")}[index]
-    return tuple(shape_name(finger, shape) for shape in shapes)
-
-
-def contact_pairs(parts: _Parts) -> Iterator[tuple[str, str, bool]]:
+def contact_pairs(parts: Parts) -> Iterator[tuple[str, str, bool]]:
     """List which shapes can touch, and whether they slide (True) or grip (False).
 
     Yields:
         Two shapes, and whether their friction is the soft one.
     """
-    walls, blocks = [wall_name(i) for i in range(WALL_SEGMENTS)], parts.blocks
+    walls, blocks = [f"{STAGE}/{i}" for i in range(WALL_SEGMENTS)], parts.blocks
     for i, block in enumerate(blocks):
         yield FLOOR, block, True
         yield from ((fixed, block, True) for fixed in (*walls, *parts.obstacles))
         yield from ((block, other, True) for other in blocks[i + 1 :])
         for finger in FINGERS:
-            yield from ((shape_name(finger, shape), block, False) for shape in SHAPES)
+            yield from ((f"{finger}/{shape}", block, False) for shape in SHAPES)
     for finger in FINGERS:
         yield from (
-            (fixed, shape_name(finger, shape), False)
+            (fixed, f"{finger}/{shape}", False)
             for fixed in (FLOOR, *parts.obstacles)
             for shape in SHAPES[1:]
         )
         # Nothing but a tip reaches the ring: the knee stays within 0.232 m of the center.
-        yield from ((wall, shape_name(finger, "tip"), False) for wall in walls)
-    for i, finger in enumerate(FINGERS):
-        for other in FINGERS[i + 1 :]:
-            yield from (
-                (shape_name(finger, mine), shape_name(other, its), False)
-                for mine in SHAPES[1:]
-                for its in SHAPES[1:]
-            )
+        yield from ((wall, f"{finger}/tip", False) for wall in walls)
+    for finger, other in combinations(FINGERS, 2):
+        for mine, its in product(SHAPES[1:], repeat=2):
+            yield f"{finger}/{mine}", f"{other}/{its}", False
 
 
-def _write_options(spec: mujoco.MjSpec, parts: _Parts) -> None:
+def _write_options(spec: mujoco.MjSpec, parts: Parts) -> None:
     """Write everything that concerns the whole simulation."""
     option = spec.option
     option.timestep = parts.preset.timestep
@@ -428,11 +333,6 @@ def _write_options(spec: mujoco.MjSpec, parts: _Parts) -> None:
     option.enableflags = 0  # sleeping islands, in particular, cannot be restored exactly
 
 
-def _add_shape(body: mujoco.MjsBody, name: str, **options: Any) -> None:
-    """Add a shape that touches what pairs say."""
-    body.add_geom(name=name, contype=0, conaffinity=0, **options)
-
-
 def _add_wall(world: mujoco.MjsBody) -> None:
     stage = world.add_body(name=STAGE)
     outer = WALL_RADIUS + WALL_THICKNESS
@@ -440,9 +340,8 @@ def _add_wall(world: mujoco.MjsBody) -> None:
     center = WALL_RADIUS + WALL_THICKNESS / 2
     for i in range(WALL_SEGMENTS):
         angle = 2 * math.pi * i / WALL_SEGMENTS
-        _add_shape(
-            stage,
-            wall_name(i),
+        stage.add_geom(
+            name=f"{STAGE}/{i}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
             pos=(center * math.cos(angle), center * math.sin(angle), WALL_HEIGHT / 2),
             quat=_yaw(angle),
@@ -450,9 +349,8 @@ def _add_wall(world: mujoco.MjsBody) -> None:
             group=UNSEEN,
         )
         w, _, _, z = _yaw(angle)
-        _add_shape(  # seen from within only
-            stage,
-            inside_name(i),
+        stage.add_geom(  # seen from within only
+            name=f"{STAGE}/{i}/inside",
             type=_PLANE,
             pos=(WALL_RADIUS * math.cos(angle), WALL_RADIUS * math.sin(angle), WALL_HEIGHT / 2),
             quat=(w, z, -w, z),
@@ -460,7 +358,7 @@ def _add_wall(world: mujoco.MjsBody) -> None:
         )
 
 
-def _add_robot(spec: mujoco.MjSpec, parts: _Parts) -> None:
+def _add_robot(spec: mujoco.MjSpec, parts: Parts) -> None:
     """Hang each finger from the world; then add nine servos or motors, and nine dampers.
 
     MuJoCo works in the frame of the center of mass of a kinematic tree. With a tree per finger,
@@ -470,7 +368,7 @@ def _add_robot(spec: mujoco.MjSpec, parts: _Parts) -> None:
     height, world = hardware.NOMINAL_HEIGHT - hardware.TABLE_OFFSET, spec.worldbody
     hub = world.add_body(name=ROBOT, pos=(0.0, 0.0, height))
     ellipsoid = mujoco.mjtGeom.mjGEOM_ELLIPSOID
-    _add_shape(hub, ROBOT, type=ellipsoid, size=HUB_HALVES, rgba=HUB_COLOR)
+    hub.add_geom(name=ROBOT, type=ellipsoid, size=HUB_HALVES, rgba=HUB_COLOR)
     cos, sin = math.cos(hardware.WORLD_YAW), math.sin(hardware.WORLD_YAW)
     for finger, (x, y, z), yaw in zip(
         FINGERS, hardware.FINGER_OFFSET, hardware.FINGER_YAW, strict=True
@@ -481,8 +379,8 @@ def _add_robot(spec: mujoco.MjSpec, parts: _Parts) -> None:
         }
         fixed = world.add_body(name=link_name(finger, 0), **pose)
         _set_inertial(fixed, 0)
-        _add_capsule(fixed, shape_name(finger, "base"), MOUNT)
-        body = world.add_body(name=base_name(finger), **pose)
+        _add_capsule(fixed, f"{finger}/base", MOUNT)
+        body = world.add_body(name=f"{finger}/base", **pose)
         for index in (1, 2, 3):
             name = link_name(finger, index)
             body = body.add_body(name=name, pos=hardware.JOINT_ORIGINS[index - 1])
@@ -499,12 +397,12 @@ def _add_robot(spec: mujoco.MjSpec, parts: _Parts) -> None:
                 actfrcrange=(-_SPEC.limit, _SPEC.limit),
             )
             name = SHAPES[index - 1]
-            _add_capsule(body, shape_name(finger, name), hardware.COLLISION[name])
+            _add_capsule(body, f"{finger}/{name}", hardware.COLLISION[name])
         tip = body.add_body(name=tip_name(finger), pos=hardware.TIP_ORIGIN)
         tip.mass, tip.inertia, tip.explicitinertial = hardware.TIP_MASS, hardware.TIP_INERTIA, True
-        tip.ipos = hardware.TIP_CENTER[parts.engine]
+        tip.ipos = (0.0, 0.0, 0.0)  # MuJoCo takes ``pos`` where none is said
         tip.add_site(name=tip_name(finger), group=UNSEEN)
-        _add_capsule(tip, shape_name(finger, "tip"), hardware.COLLISION["tip"])
+        _add_capsule(tip, f"{finger}/tip", hardware.COLLISION["tip"])
     for purpose, limit in (("servo", _SPEC.limit), ("safety", 0.0)):
         motor = float(parts.torques and purpose == "servo")
         for joint in _JOINT_NAMES:
@@ -531,111 +429,118 @@ def _set_inertial(body: mujoco.MjsBody, index: int) -> None:
 
 
 def _add_capsule(body: mujoco.MjsBody, name: str, capsule: hardware.Capsule) -> None:
-    _add_shape(
-        body,
-        name,
-        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        fromto=(*capsule.start, *capsule.end),
-        size=(capsule.radius, 0.0, 0.0),
-    )
+    ends, size = (*capsule.start, *capsule.end), (capsule.radius, 0.0, 0.0)
+    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=ends, size=size)
 
 
 def _yaw(angle: float) -> tuple[float, float, float, float]:
-    """Give the MuJoCo quaternion (w, x, y, z) of a turn about z."""
+    """Return the MuJoCo quaternion (w, x, y, z) of a turn about z."""
     return (math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2))
 
 
 # --- bindings ----------------------------------------------------------------------------------
 
 
-def _bindings(mj: mujoco.MjModel, trees: Couplings, *, parts: _Parts) -> Iterator[Field]:
-    """List the parameters: what each is, where it is written, and on which trees it acts."""
+GAINS: tuple[tuple[Any, ...], ...] = (
+    ("position_gains", _SPEC.kp, "N m/rad", ("gainprm", 0, 0, 1.0), ("biasprm", 0, 1, -1.0)),
+    ("safety_damping", _SPEC.safety, "N m s/rad", ("biasprm", N_JOINTS, 2, -1.0)),
+    ("velocity_gains", _SPEC.kd, "N m s/rad", ("biasprm", 0, 2, -1.0)),
+)
+"""Name, default and unit; then array, first actuator, column and sign of each place."""
+
+Row = tuple[Parameter, object]
+"""A parameter, and its default."""
+
+
+def _rows(mj: mujoco.MjModel, data: mujoco.MjData, trees: Couplings, parts: Parts) -> Iterator[Row]:
+    """List the parameters: what each is, where it is written, on which trees it acts, default."""
     fingers = [trees.tree(mj.body(link_name(finger, 1)).id) for finger in FINGERS]
     everything, touching = trees.always(trees.every), trees.touching(trees.every)
-    robot = trees.always(fingers)
+    touched, robot = trees.touching(fingers), trees.always(fingers)
 
     def row(
-        name: str, unit: str, slot: Callable[..., Slot], effect: Effect, doc: str, **rest: Any
-    ) -> Field:
-        element, _, attribute = name.rpartition(".")
-        return Field(
-            "binding", element, attribute, unit, doc, slot, lambda: effect, name=name, **rest
-        )
+        name: str, default: object, unit: str, slot: Finder, effect: Effect, doc: str, **rest: Any
+    ) -> Row:
+        now, (always, contact) = slot(mj, data).read(), effect
+        bounds = numbers(now), -math.inf, math.inf
+        made = Parameter(name, unit, now.shape, *bounds, doc, always, contact, slot=slot, **rest)
+        return made, default
 
-    def color(element: str, shapes: Sequence[str]) -> Field:
-        slot = partial(_color, shapes=tuple(shapes))
-        return row(f"{element}.color", "1", slot, NOTHING, "Red, green and blue.", visual=True)
+    def color(element: str, default: object, shapes: Sequence[str]) -> Row:
+        slot, doc = partial(_color, shapes=tuple(shapes)), "Red, green and blue."
+        return row(f"{element}.color", default, "1", slot, NOTHING, doc, visual=True)
 
-    def friction(element: str, shapes: Sequence[str], effect: Effect) -> Field:
-        slot = partial(_friction, shapes=tuple(shapes))
-        return row(f"{element}.friction", "1", slot, effect, "Factor of all its contacts.")
+    def friction(element: str, default: float, shapes: Sequence[str], effect: Effect) -> Row:
+        slot, doc = partial(_friction, shapes=tuple(shapes)), "Factor of all its contacts."
+        return row(f"{element}.friction", default, "1", slot, effect, doc)
 
-    yield row("world.gravity", "m/s^2", _gravity, everything, "Acceleration of free fall.")
+    down, free = (0.0, 0.0, -9.81), "Acceleration of free fall."
+    yield row("world.gravity", down, "m/s^2", _gravity, everything, free)
     rigid = partial(_restitution, rigid=CONTACT[parts.preset.name])
-    yield row("world.restitution", "1", rigid, touching, "Speed after an impact over that before.")
-    spins = partial(_spinning, parts=parts)
-    yield row("world.spinning_friction", "m", spins, touching, "Torsional, of every contact.")
-    touched = trees.touching(fingers)
-    yield row("robot.height", "m", _height, touched, "Height of the base; see ``hardware``.")
-    links = [s for f in FINGERS for i in range(4) for s in link_shapes(f, i)]
-    yield friction("robot", links, touched)
-    yield row("robot.joint_damping", "N m s/rad", _damping, robot, "Of every joint.")
-    gains: dict[str, Any] = {"safety_damping": (("biasprm", N_JOINTS, 2, -1.0),)}
-    if not parts.torques:
-        gains["position_gains"] = (("gainprm", 0, 0, 1.0), ("biasprm", 0, 1, -1.0))
-        gains["velocity_gains"] = (("biasprm", 0, 2, -1.0),)
-    for name, places in sorted(gains.items()):
-        unit = "N m/rad" if name == "position_gains" else "N m s/rad"
-        slot = partial(_gains, places=places)
-        yield row(f"controller.{name}", unit, slot, robot, "Of the three joints of a finger.")
-    yield row("controller.torque_limit", "N m", _limit, robot, "Largest torque of a joint.")
+    doc = "Speed after an impact over that before."
+    yield row("world.restitution", 0.0, "1", rigid, touching, doc)
+    spins, doc = partial(_spinning, parts=parts), "Torsional, of every contact."
+    yield row("world.spinning_friction", SPINNING_FRICTION, "m", spins, touching, doc)
+    doc = "Height of the base; see ``hardware``."
+    yield row("robot.height", hardware.NOMINAL_HEIGHT, "m", _height, touched, doc)
+    links = [f"{f}/{shape}" for f in FINGERS for shapes in LINK_SHAPES for shape in shapes]
+    yield friction("robot", 0.5, links, touched)
+    yield row("robot.joint_damping", 0.0, "N m s/rad", _damping, robot, "Of every joint.")
+    for name, gain, unit, *places in GAINS[1:2] if parts.torques else GAINS:
+        slot, doc = partial(_gains, places=places), "Of the three joints of a finger."
+        yield row(f"controller.{name}", gain, unit, slot, robot, doc)
+    doc = "Largest torque of a joint."
+    yield row("controller.torque_limit", _SPEC.limit, "N m", _limit, robot, doc)
     for tree, finger in zip(fingers, FINGERS, strict=True):
         for index, inertial in enumerate(hardware.INERTIAL):
-            link = link_name(finger, index)
-            slot = partial(_scaled_mass, body=link, per_mass=inertial.per_mass)
+            link, mass = link_name(finger, index), hardware.LINK_MASS[index]
+            scaled = partial(_scaled_mass, body=link, per_mass=inertial.per_mass)
             effect = trees.always([tree]) if index else NOTHING
-            yield row(f"{link}.mass", "kg", slot, effect, "Its inertia scales with it.")
-            yield color(link, link_shapes(finger, index))
-    walls = [wall_name(i) for i in range(SIDES if parts.published else WALL_SEGMENTS)]
-    insides = [inside_name(i) for i in range(WALL_SEGMENTS)]
-    for name, shapes, seen in ((FLOOR, [FLOOR], [FLOOR]), (STAGE, walls, insides)):
-        yield friction(name, shapes, touching)
-        yield color(name, seen)
+            yield row(f"{link}.mass", mass, "kg", scaled, effect, "Its inertia scales with it.")
+            shapes = [f"{finger}/{shape}" for shape in LINK_SHAPES[index]]
+            yield color(link, hardware.LINK_COLORS[finger], shapes)
+    walls = [f"{STAGE}/{i}" for i in range(SIDES if parts.published else WALL_SEGMENTS)]
+    insides = [f"{STAGE}/{i}/inside" for i in range(WALL_SEGMENTS)]
+    yield friction(FLOOR, 0.5, [FLOOR], touching)
+    yield color(FLOOR, (0.31, 0.27, 0.25), [FLOOR])
+    yield friction(STAGE, 0.5, walls, touching)
+    yield color(STAGE, (0.95, 0.95, 0.95), insides)
+    hulls, size = dict(parts.hulls), (2.0 * _BLOCK_HALF,) * 3
     for name in parts.blocks:
-        tree, hull = trees.tree(mj.body(name).id), dict(parts.hulls).get(name)
+        tree, slot = trees.tree(mj.body(name).id), partial(_box, name=name, quantity="mass")
         own, contact = trees.always([tree]), trees.touching([tree])
-        slot = (
-            partial(_box, name=name, quantity="mass")
-            if hull is None
-            else partial(_scaled_mass, body=name, per_mass=hull.moments)
-        )
+        if name in hulls:
+            slot = partial(_scaled_mass, body=name, per_mass=hulls[name].moments)
         # A free body falls and tumbles as it does whatever its mass is.
-        yield row(f"{name}.mass", "kg", slot, contact, "Its inertia follows.")
-        if hull is None:
+        yield row(f"{name}.mass", _BLOCK_MASS, "kg", slot, contact, "Its inertia follows.")
+        if name not in hulls:
             slot = partial(_box, name=name, quantity="size")
-            yield row(f"{name}.size", "m", slot, own, "Full edge lengths; the inertia follows.")
-        yield friction(name, [name], contact)
-        yield color(name, [name])
-    for name in parts.obstacles:
+            doc = "Full edge lengths; the inertia follows."
+            yield row(f"{name}.size", size, "m", slot, own, doc)
+        yield friction(name, 1.0, [name], contact)
+        yield color(name, (1.0, 0.0, 0.0), [name])
+    for index, name in enumerate(parts.obstacles):
         effect = trees.contact_of(mj.geom(name).id)
-        for what, unit in (("size", "m"), ("position", "m"), ("orientation", "1")):
+        center = (0.02 * index - 0.1, 0.15, 0.005)
+        for what, default in (("size", (0.01,) * 3), ("position", center), ("orientation", AHEAD)):
+            unit = "m" if default is not AHEAD else "1"
+            nature: Any = "real" if default is not AHEAD else "rotation"
             slot = partial(_obstacle, name=name, quantity=what)
-            nature: Any = "rotation" if what == "orientation" else "real"
-            yield row(f"{name}.{what}", unit, slot, effect, "Of the box.", nature=nature)
-        yield friction(name, [name], effect)
-        yield color(name, [name])
+            yield row(f"{name}.{what}", default, unit, slot, effect, "Of the box.", kind=nature)
+        yield friction(name, 0.5, [name], effect)
+        yield color(name, (0.0,) * 3, [name])
 
 
 def _gravity(mj: mujoco.MjModel, _: Any) -> Slot:
     return place(mj.opt.gravity)
 
 
-def _spinning(mj: mujoco.MjModel, _: Any, *, parts: _Parts) -> Slot:
+def _spinning(mj: mujoco.MjModel, _: Any, *, parts: Parts) -> Slot:
     if parts.published:
         weights = spinning_weights(mj, parts.blocks, parts.obstacles)
     else:
         weights = np.ones(mj.ngeom)
-    view, base = mj.geom_friction[:, 1], mj.geom(shape_name(FINGERS[0], "base")).id
+    view, base = mj.geom_friction[:, 1], mj.geom(f"{FINGERS[0]}/base").id
     own = view[base, ...]
 
     def write(value: Floats) -> None:
@@ -645,9 +550,9 @@ def _spinning(mj: mujoco.MjModel, _: Any, *, parts: _Parts) -> Slot:
 
 
 def _height(mj: mujoco.MjModel, _: Any) -> Slot:
-    hanging = [name for finger in FINGERS for name in (base_name(finger), link_name(finger, 0))]
-    names = [ROBOT, *hanging]
-    heights, offset = [mj.body_pos[mj.body(n).id, 2, ...] for n in names], hardware.TABLE_OFFSET
+    names = [name for finger in FINGERS for name in (f"{finger}/base", link_name(finger, 0))]
+    heights = [mj.body_pos[mj.body(name).id, 2, ...] for name in (ROBOT, *names)]
+    offset = hardware.TABLE_OFFSET
     return place(*heights, to=lambda z: z - offset, back=lambda z: z + offset, constant=True)
 
 
@@ -661,11 +566,8 @@ def _limit(mj: mujoco.MjModel, _: Any) -> Slot:
     return place(*ranges, to=lambda limit: np.array([-limit, limit]), back=lambda r: r[0, 1])
 
 
-def _gains(mj: mujoco.MjModel, _: Any, *, places: tuple[tuple[str, int, int, float], ...]) -> Slot:
-    """Find a number for each joint of a finger, shape (3,); all fingers have the same.
-
-    ``places`` are array, first actuator, column and sign of each copy.
-    """
+def _gains(mj: mujoco.MjModel, _: Any, *, places: Sequence[tuple[str, int, int, float]]) -> Slot:
+    """Find a number for each joint of a finger, shape (3,); all fingers have the same."""
     views = [
         (getattr(mj, f"actuator_{array}")[start : start + N_JOINTS, column], sign)
         for array, start, column, sign in places
@@ -708,17 +610,16 @@ def _box(mj: mujoco.MjModel, _: Any, *, name: str, quantity: str) -> Slot:
     mass, inertia = mj.body_mass[body, ...], mj.body_inertia[body]
     half = mj.geom_size[mj.geom(name).id]
 
-    def weigh(value: Floats) -> None:
-        mass[...] = value
-        _fill_box(float(mass), half, inertia)
+    def write(value: Floats) -> None:
+        if quantity == "mass":
+            mass[...] = value
+        else:
+            half[:] = 0.5 * value
+        (x, y, z), third = (half * half).tolist(), float(mass) / 3.0
+        inertia[:] = third * (y + z), third * (z + x), third * (x + y)  # m/12 (b² + c²)
 
-    def resize(value: Floats) -> None:
-        np.multiply(value, 0.5, out=half)
-        _fill_box(float(mass), half, inertia)
-
-    if quantity == "mass":
-        return Slot(weigh, mass.copy, constant=True)
-    return Slot(resize, lambda: 2.0 * half, constant=True)
+    read = mass.copy if quantity == "mass" else lambda: 2.0 * half
+    return Slot(write, read, constant=True)
 
 
 def _obstacle(mj: mujoco.MjModel, _: Any, *, name: str, quantity: str) -> Slot:
@@ -729,14 +630,6 @@ def _obstacle(mj: mujoco.MjModel, _: Any, *, name: str, quantity: str) -> Slot:
     if quantity == "orientation":
         return turn(mj.geom_quat[shape])
     return place(mj.geom_size[shape], to=lambda v: 0.5 * v, back=lambda v: 2.0 * v, constant=True)
-
-
-@numba.njit("void(f8, f8[::1], f8[::1])", cache=True)
-def _fill_box(mass: float, half: Floats, inertia: Floats) -> None:
-    """Give a solid box its moments of inertia, m/12 (b² + c²)."""
-    for axis in range(3):
-        b, c = half[(axis + 1) % 3], half[(axis + 2) % 3]
-        inertia[axis] = mass / 3.0 * (b * b + c * c)
 
 
 def _restitution(mj: mujoco.MjModel, _: Any, *, rigid: tuple[float, float]) -> Slot:
@@ -773,15 +666,7 @@ patch of contact gives two thirds of its radius."""
 
 def couple(mj: mujoco.MjModel) -> None:
     """Write the product of its two frictions into every contact pair, and its spinning friction."""
-    _couple(mj.geom_friction, mj.pair_geom1, mj.pair_geom2, mj.pair_friction)
-
-
-@numba.njit("void(f8[:, ::1], i4[::1], i4[::1], f8[:, ::1])", cache=True)
-def _couple(
-    factors: Floats, first: NDArray[np.int32], second: NDArray[np.int32], pairs: Floats
-) -> None:
-    for i in range(first.shape[0]):
-        product = factors[first[i], 0] * factors[second[i], 0]
-        pairs[i, 0] = product
-        pairs[i, 1] = product
-        pairs[i, 2] = min(factors[first[i], 1], SPINNING_LIMIT * product)
+    factors, first = mj.geom_friction, mj.pair_geom1
+    both = factors[first, 0] * factors[mj.pair_geom2, 0]
+    mj.pair_friction[:, :2] = both[:, None]
+    mj.pair_friction[:, 2] = np.minimum(factors[first, 1], SPINNING_LIMIT * both)

@@ -64,15 +64,11 @@ def view(
     quarters = round(yaw / QUARTER)
     own = yaw - quarters * QUARTER
     cos, sin = math.cos(own), math.sin(own)
-    out = np.empty(SIZE)
-    for point in range(4):
-        at = 3 * point
-        if point < 3:
-            x, y, z = tips[at] - position[0], tips[at + 1] - position[1], tips[at + 2] - position[2]
-        else:
-            x, y = goal_position[0] - position[0], goal_position[1] - position[1]
-            z = goal_position[2] - position[2]
-        out[at], out[at + 1], out[at + 2] = cos * x + sin * y, cos * y - sin * x, z
+    out, points = np.empty(SIZE), np.empty((4, 3))
+    points[:3], points[3] = tips.reshape(3, 3), goal_position
+    points -= position
+    x, y = points[:, 0], points[:, 1]
+    out[0:12:3], out[1:12:3], out[2:12:3] = cos * x + sin * y, cos * y - sin * x, points[:, 2]
     first, second = (up + 1) % 3, (up + 2) % 3
     if int(quarters) % 2 != 0:
         first, second = second, first

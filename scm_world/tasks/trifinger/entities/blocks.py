@@ -160,7 +160,7 @@ class ToolBlock(Entity):
                 return kind.state(f"{name}.{what}", default, doc)
             value = numbers.IDENTITY if what == "orientation" else default
             start = Function(constantly, constants={"value": value})
-            how = {"on_set": restart, "start": start, "restart": restart}
+            how: dict[str, Any] = {"on_set": restart, "start": start, "restart": restart}
             return kind.state(f"{name}.{what}", default, doc, **how)
 
         kind, paint = looks(name, "block", numbers.BLOCK_COLOR, hull)

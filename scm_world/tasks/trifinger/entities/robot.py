@@ -71,27 +71,21 @@ MOVES = (
 @njit(cache=True)
 def tips(joint_positions: Floats, robot_height: Value) -> Floats:
     """Compute the three fingertips from the joints, shape (9,) [m]."""
-    found = np.empty(9)
-    forward_kernel(joint_positions, scalar(robot_height), found)
+    found: Floats = forward_kernel(joint_positions, scalar(robot_height))
     return found
 
 
 @njit(cache=True)
 def finger_tip(joint_positions: Floats, robot_height: Value, finger: float) -> Floats:
     """Compute the tip of one finger from its three joints, shape (3,) [m]."""
-    found = np.empty(3)
-    q0, q1, q2 = joint_positions[0], joint_positions[1], joint_positions[2]
-    tip_kernel(int(finger), q0, q1, q2, scalar(robot_height), found, 0)
-    return found
+    return np.array(tip_kernel(int(finger), joint_positions, scalar(robot_height)))
 
 
 @njit(cache=True)
 def joints_tip(q0: Value, q1: Value, q2: Value, robot_height: Value, finger: float) -> Floats:
     """Compute the tip of one finger from the angle of each joint, shape (3,) [m]."""
-    found = np.empty(3)
-    height = scalar(robot_height)
-    tip_kernel(int(finger), scalar(q0), scalar(q1), scalar(q2), height, found, 0)
-    return found
+    angles = np.array([scalar(q0), scalar(q1), scalar(q2)])
+    return np.array(tip_kernel(int(finger), angles, scalar(robot_height)))
 
 
 STREAM = "actuators"
@@ -110,7 +104,6 @@ class RobotCommands(Commands):
         self._by_tips = action_mode == "end_effector_positions"
         low, high = ACTIONS[action_mode][1].bounds((N_JOINTS,), {})
         self._half = (high - low) / 2.0
-        self._joints, self._reached = np.empty(N_JOINTS), np.empty(3, dtype=np.bool_)
 
     def applies(self, values: Values) -> bool:
         """Return whether fingertips are commanded, or the actuators have noise."""
@@ -124,8 +117,7 @@ class RobotCommands(Commands):
             action = action + noise * self._half * drawn
         if self._by_tips:
             height = float(values["robot_height"])
-            inverse_kernel(action, height, vector[:N_JOINTS], self._joints, self._reached)
-            action = self._joints
+            action, _ = inverse_kernel(action, height, vector[:N_JOINTS])
         return action
 
 
@@ -214,13 +206,16 @@ def _moving(quantity: int, joints: JointGroup, start: tuple[float, ...]) -> Meas
     if quantity == 0 and not joints.shape:
         doc = "Angle of {}."
     default = start[joints.where] if quantity == 0 else (0.0,) * len(start[joints.where])
-    spaces = {"bounds": kind.bounds, "a": kind.a, "b": kind.b} if quantity == 0 else {}
+    spaces: dict[str, Any] = {}
+    if quantity == 0:
+        whole = {"bounds": kind.bounds, "a": kind.a, "b": kind.b}
+        spaces = {space: joints.cut(box) for space, box in whole.items()}
     return replace(kind, shape=joints.shape).state(
         joints.names[quantity],
         default if joints.shape else default[0],
         doc.format(joints.of),
         settable_state=quantity < 2,
-        **{space: joints.cut(box) for space, box in spaces.items()},
+        **spaces,
     )
 
 

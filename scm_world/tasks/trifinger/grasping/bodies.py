@@ -200,10 +200,6 @@ class Sight:
         """See a block, a goal or an obstacle."""
         return body_of(name, self._values)
 
-    def goals(self) -> list[Cuboid]:
-        """Read all goals."""
-        return [self.body(goal) for _, goal in self.pairs]
-
     def solid(self) -> dict[str, Cuboid]:
         """See everything that fingers could run into, by name."""
         return {name: self.body(name) for name in self._solid}
@@ -226,6 +222,6 @@ class Sight:
         return FIRM + MARGIN * self.burden(tool)
 
 
-def unit(world: Any) -> tuple[int, int]:
-    """Say which episode this is."""
-    return world.noise.seed, world.episode
+def instant(world: Any) -> tuple[int, int, int]:
+    """Return which episode it is, as seed and number, and which of its control steps."""
+    return world.noise.seed, world.episode, world.index

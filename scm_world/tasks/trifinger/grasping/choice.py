@@ -33,16 +33,14 @@ PARTS = (1.0, 0.5, 0.0)
 """Shares of a turn that may be made before a block is put down on the way."""
 
 LESS = (0.75, 0.5, 0.25, 0.0)
-"""Shares of a turn that may be made instead, where the block is held in the end."""
+"""Shares of a turn that may be made instead, where there is one block: no grip can make the whole
+turn then, and putting the block down on the way takes so long that an episode mostly ends."""
 
 STOPS = [
     np.array([radius * math.cos(angle), radius * math.sin(angle)])
     for radius in RINGS
     for angle in np.linspace(0.0, 2.0 * math.pi, 12 if radius else 1, endpoint=False)
 ]
-
-Job = tuple[str, Move]
-"""A block, and how it is brought where."""
 
 
 @final
@@ -66,8 +64,8 @@ class Choice:
             if self._hangs(tool, goal) or self._bodies[tool].fills(self._goals[goal]) < enough
         ]
 
-    def job(self) -> Job | None:
-        """Choose the lowest goal that is not filled; None if nothing can be done."""
+    def move(self) -> Move | None:
+        """Choose how to fill the lowest goal that is not filled; None if nothing can be done."""
         for tool, goal in self._todo:
             if self._waits(tool, goal):
                 continue
@@ -75,14 +73,18 @@ class Choice:
             release = not self._hangs(tool, goal)
             end = end.at(end.place + HOVER * last, end.yaw)
             turned = turns(start, end)
+            for share in (1.0, *LESS) if self._alone else (1.0,):
+                ways = [
+                    (start.at(end.place, start.yaw + share * turn), share * turn) for turn in turned
+                ]
+                fair = [way for way in ways if share == 1.0 or way[0].fills(end) > FAIR]
+                move = self._best(start, fair, release=release)
+                if move is not None:
+                    return move
             ways = [(start.at(end.place, start.yaw + turn), turn) for turn in turned]
-            move = self._best(tool, start, ways, release=release)
-            if move is None and self._alone:
-                move = self._turned_less(tool, start, end, turned)
-            move = move or self._detour(tool, ways, release=release)
-            job = (tool, move) if move is not None else self._make_way(tool, end)
-            if job is not None:
-                return job
+            move = self._detour(start, ways, release=release) or self._make_way(start, end)
+            if move is not None:
+                return move
         return None
 
     def _hangs(self, tool: str, goal: str) -> bool:
@@ -107,79 +109,58 @@ class Choice:
     def _others(self, tool: str) -> list[Cuboid]:
         return [body for name, body in self._bodies.items() if name != tool]
 
-    def _best(self, tool: str, start: Cuboid, ways: Iterable[Way], *, release: bool) -> Move | None:
-        planner = Planner(self._sight.hand, self._sight.joints, self._others(tool))
-        return planner.best(start, ways, wanted=self._sight.wanted(tool), release=release)
+    def _best(self, start: Cuboid, ways: Iterable[Way], *, release: bool) -> Move | None:
+        planner = Planner(self._sight.hand, self._sight.joints, self._others(start.name))
+        return planner.best(start, ways, wanted=self._sight.wanted(start.name), release=release)
 
-    def _turned_less(
-        self, tool: str, start: Cuboid, end: Cuboid, turned: Iterable[float]
-    ) -> Move | None:
-        """Find a way on which a block is turned too little to fill its goal, but fills it fairly.
-
-        No grip can make the whole turn then. Putting the block down on the way takes so long that
-        an episode mostly ends before it is at its goal.
-        """
-        for share in LESS:
-            ways = [
-                (start.at(end.place, start.yaw + share * turn), share * turn) for turn in turned
-            ]
-            fair = [way for way in ways if way[0].fills(end) > FAIR]
-            move = self._best(tool, start, fair, release=False)
+    def _make_way(self, start: Cuboid, end: Cuboid) -> Move | None:
+        """Move a block that stands where another one should go, or where its fingers would be."""
+        depth = {
+            other: max(self._bodies[other].depth_in(place, flat=True) for place in (end, start))
+            for other, _ in self._todo
+            if other != start.name
+        }
+        for other in sorted(depth, key=lambda name: -depth[name]):
+            move = self._detour(self._bodies[other], []) if depth[other] > -NEAR else None
             if move is not None:
                 return move
         return None
 
-    def _make_way(self, tool: str, end: Cuboid) -> Job | None:
-        """Move a block that stands where another one should go, or where its fingers would be."""
-        start = self._bodies[tool]
-        depth = {
-            other: max(self._bodies[other].depth_in(place, flat=True) for place in (end, start))
-            for other, _ in self._todo
-            if other != tool
-        }
-        for other in sorted(depth, key=lambda name: -depth[name]):
-            move = self._detour(other, []) if depth[other] > -NEAR else None
-            if move is not None:
-                return other, move
-        return None
-
-    def _detour(self, tool: str, ways: list[Way], *, release: bool = True) -> Move | None:
+    def _detour(self, start: Cuboid, ways: list[Way], *, release: bool = True) -> Move | None:
         """Find a way to put a block down from where it can be carried on, or out of the way.
 
         Args:
-            tool: The block.
+            start: The block.
             ways: Where it should go in the end; nowhere if empty.
             release: Whether it is let go there.
         """
-        start = self._bodies[tool]
-        for stop, turn in self._stops(tool, ways):
-            move = self._best(tool, start, [(stop, turn)], release=True)
+        for stop, turn in self._stops(start, ways):
+            move = self._best(start, [(stop, turn)], release=True)
             rest = [(end, full - turn) for end, full in ways]
             if move is not None and (
-                not ways or self._best(tool, stop, rest, release=release) is not None
+                not ways or self._best(stop, rest, release=release) is not None
             ):
                 return move
         return None
 
-    def _stops(self, tool: str, ways: list[Way]) -> Iterator[Way]:
+    def _stops(self, start: Cuboid, ways: list[Way]) -> Iterator[Way]:
         """List places where a block may be put down, the shortest detours first."""
-        start, tried = self._bodies[tool], 0
-        end, full = ways[0] if ways else (start, 0.0)
+        tried, (end, full) = 0, ways[0] if ways else (start, 0.0)
         first, last = start.place[:2], end.place[:2]
         for place in sorted(STOPS, key=lambda at: math.dist(first, at) + math.dist(at, last)):
             for part in PARTS if ways else PARTS[-1:]:
                 turn = part * full
                 stop = start.at(np.array([*place, start.half[2]]), start.yaw + turn)
                 moved, turned = math.dist(first, stop.place[:2]), abs(stop.yaw - start.yaw)
-                if self._is_free(tool, stop) and (moved > MOVED or turned > TURNED):
+                if self._is_free(stop) and (moved > MOVED or turned > TURNED):
                     tried += 1
                     yield stop, turn
                 if tried == TRIES:
                     return
 
-    def _is_free(self, tool: str, stop: Cuboid) -> bool:
+    def _is_free(self, stop: Cuboid) -> bool:
         """Return whether a block can stand somewhere, with room for fingers and beside goals."""
-        near = ((body, ROOM) for body in self._others(tool))
+        near = ((body, ROOM) for body in self._others(stop.name))
         wide = ((body, ASIDE) for body in self._goals.values())
         return not any(
             stop.depth_in(body, margin=margin, flat=True) > 0.0

@@ -12,7 +12,13 @@ import numpy as np
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ActionError
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, smallest, turn_about_z, unit
+from scm_world.tasks.trifinger.grasping.bodies import (
+    Cuboid,
+    Sight,
+    instant,
+    smallest,
+    turn_about_z,
+)
 from scm_world.tasks.trifinger.grasping.choice import Choice
 from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand
 from scm_world.tasks.trifinger.grasping.ways import (
@@ -93,7 +99,7 @@ class Feedback:
             problem = "a grasp needs joint or fingertip positions as actions, not torques"
             raise ActionError(problem, world.action_mode)
         program = self._programs.get(world)
-        if program is None or not program.goes_on(world):
+        if program is None or program.next != instant(world):
             program = self._programs[world] = Program(world)
         command = program.command(world)
         return program.hand.tips(command) if "effector" in world.action_mode else command
@@ -122,35 +128,35 @@ class Program:
 
     Args:
         world: With blocks that have goals.
+
+    Attributes:
+        next: The instant whose command comes next.
     """
 
     def __init__(self, world: Any) -> None:
         self._sight = Sight(world)
-        self._tool: str | None = None
         self._move: Move | None = None
         self._goals = np.empty((0, 4))  # for which the job was chosen
         self._idle = self._waiting = self._back = 0
         self._opens = False
-        self._unit, self._next = unit(world), world.index
+        self.next = instant(world)
 
     @property
     def hand(self) -> Hand:
         """The robot."""
         return self._sight.hand
 
-    def goes_on(self, world: Any) -> bool:
-        """Tell whether the present is the step after the last one."""
-        return bool(world.index == self._next and self._unit == unit(world))
-
     def memory(self) -> Floats:
         """Say what is remembered; see ``Feedback.memory``."""
         used = self._move.grip.used if self._move is not None else (False,) * 3
-        taken = [self._move is not None and tool == self._tool for tool, _ in self._sight.pairs]
+        name = self._move.start.name if self._move is not None else None
+        taken = [tool == name for tool, _ in self._sight.pairs]
         return np.where([*taken, *used, self._opens, self._back > 0], 1.0, -1.0)
 
     def command(self, world: Any) -> Floats:
         """Give the joint positions to command now, shape (9,) [rad]."""
-        sight, self._next = self._sight, world.index + 1
+        sight, (seed, episode, index) = self._sight, self.next
+        self.next = seed, episode, index + 1
         sight.look(world)
         hand, joints = sight.hand, sight.joints
         before = _commanded(world, sight)
@@ -165,7 +171,7 @@ class Program:
             place = tips.copy()
             place[:, 2] = np.maximum(tips[:, 2], 0.09)
             return self._to(place, TRAVEL, tips, before)
-        body, grip, used = self._body(), move.grip, move.grip.used
+        body, grip, used = sight.body(move.start.name), move.grip, move.grip.used
         own = body.own(tips)
         inward, away = np.sign(grip.inward), own - grip.touch
         across = -(away * inward).sum(axis=1)
@@ -190,40 +196,32 @@ class Program:
 
     # --- which block, and where to -----------------------------------------------------------
 
-    def _body(self) -> Cuboid:
-        return self._sight.body(str(self._tool))
-
     def _planned(self) -> Move | None:
         """Keep the job until the block has arrived or has fallen over, or a goal moves.
 
         Fingers that are stuck go back first.
         """
         move, self._idle = self._move, self._idle - 1
-        goals = np.array([[*goal.place, goal.yaw] for goal in self._sight.goals()])
+        pairs = self._sight.pairs
+        goals = np.array([[*g.place, g.yaw] for g in (self._sight.body(goal) for _, goal in pairs)])
         if move is not None:
-            body = self._body()
+            body = self._sight.body(move.start.name)
             error = math.dist(move.end.place, body.place), abs(self._turn(move, body))
             stuck = self._waiting > STUCK
             if stuck:
                 self._back = RETREAT
             self._opens |= move.release and bool((np.array(error) < ARRIVED).all())
-            done = self._opens and self._open(move, body)
+            tips = self._sight.hand.tips(self._sight.joints).reshape(3, 3)
+            away = np.abs(tips - self._place(move, body, 0.0))[move.grip.used].max(axis=1)
+            done = self._opens and away.min() > 0.8 * move.grip.opening
             moved = not np.array_equal(goals, self._goals)
             if stuck or done or moved or math.hypot(*body.lean) > 0.6:
                 move = self._move = None
                 self._idle = 0
         if move is None and self._idle <= 0 and self._back <= 0:
             self._idle, self._waiting, self._opens = AGAIN, 0, False
-            self._tool, self._move = Choice(self._sight).job() or (self._tool, None)
-            self._goals = goals
+            self._move, self._goals = Choice(self._sight).move(), goals
         return self._move
-
-    def _open(self, move: Move, body: Cuboid) -> bool:
-        """Tell whether fingers have let go."""
-        used = move.grip.used
-        tips = self._sight.hand.tips(self._sight.joints).reshape(3, 3)
-        away = np.abs(tips - self._place(move, body, 0.0))[used].max(axis=1)
-        return bool(away.min() > 0.8 * move.grip.opening)
 
     @staticmethod
     def _turn(move: Move, body: Cuboid) -> float:
@@ -278,7 +276,7 @@ class Program:
     def _carry(self, move: Move, body: Cuboid, tips: Floats, before: Floats) -> Floats:
         """Press, and bring the block nearer to its end."""
         sight, grip = self._sight, move.grip
-        hand, joints, tool = sight.hand, sight.joints, str(self._tool)
+        hand, joints, tool = sight.hand, sight.joints, body.name
         used, shares = grip.used, np.abs(grip.inward).max(axis=1)
         wanted, strength, follows = sight.wanted(tool), move.strength, 1.0
         turn = turn_about_z(body.yaw).T
@@ -286,7 +284,9 @@ class Program:
             strength = float(hand.strengths(joints[None], (grip.inward @ turn)[None])[0])
             follows = float(np.interp(body.bottom, OFF, (0.0, 1.0)))
         press = min(PRESS if wanted < LIGHT else FIRMLY * wanted, strength)
-        if not grip.firm and move.over and self._lands(move, body):
+        far = math.dist(body.place[:2], move.end.place[:2])
+        lands = far < 2.0 * LANDING and max(body.bottom, move.end.bottom) < LANDING
+        if not grip.firm and move.over and lands:  # near the floor, and near a goal on it
             press *= 1.0 - SOFT * min(math.hypot(*body.lean) / TILTED, 1.0)
         forces = press * grip.inward @ turn
         forces[:, 2] += sight.weight(tool) * shares / shares.sum()
@@ -311,17 +311,11 @@ class Program:
         found = hand.bounded(hand.solve(aim.ravel(), joints) + more)
         return np.clip(found, before - PUSHED, before + PUSHED)
 
-    @staticmethod
-    def _lands(move: Move, body: Cuboid) -> bool:
-        """Return whether a block is near the floor and near its goal, which is on the floor."""
-        far = math.dist(body.place[:2], move.end.place[:2])
-        return far < 2.0 * LANDING and max(body.bottom, move.end.bottom) < LANDING
-
     def _speed(self, move: Move, body: Cuboid, press: float) -> tuple[Floats, float]:
         """Choose how a block moves in this control step, shape (3,) [m], and turns [rad]."""
         error, turn = move.end.place - body.place, self._turn(move, body)
         far = math.hypot(error[0], error[1])
-        burden = self._sight.burden(str(self._tool)) / max(press, 1e-9)
+        burden = self._sight.burden(body.name) / max(press, 1e-9)
         pace = CARRY * max(min(max((0.7 - burden) / 0.5, 0.0), 1.0) ** 2, 0.3)
         height, most, least = move.height, RISE, RISE
         below = height - float(body.place[2])
@@ -329,7 +323,7 @@ class Program:
             soon = self._passing(body, error, min(SOON, far))
             height = max(self._passing(body, error, far), float(body.half[2]) + CLEARANCE)
             below = soon - float(body.place[2]) if soon > 0.0 else 0.014 - body.bottom
-            spare = self._sight.friction(str(self._tool)) * press * max(1.0 - burden, 0.0)
+            spare = self._sight.friction(body.name) * press * max(1.0 - burden, 0.0)
             most, least = min(max(spare / STIFF, SLOWEST), FASTEST), SINK
         elif not move.over:
             below = min(below, 0.014 - body.bottom)

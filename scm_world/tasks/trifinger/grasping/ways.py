@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, solids, turn_about_z
-from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand
+from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand, poses
 
 LEVELS = (0.15, 0.4, 0.0)
 """How high the fingertips are above the middle of a block, in halves of its height."""
@@ -276,11 +276,14 @@ class Planner:
     def _poses(
         self, tips: Floats, near: Floats | None = None, *more: tuple[Cuboid, float]
     ) -> tuple[Floats, NDArray[np.bool_], Floats]:
-        """Find joints for fingertips, and how deep fingers then lie in anything; see ``Hand``."""
+        """Find joints for fingertips, and how deep fingers then lie in anything; see ``poses``."""
         rows = np.ascontiguousarray(tips).reshape(-1, 9)
         begin = np.tile(self._joints, (len(rows), 1)) if near is None else near
         clear = ((other, CLEAR) for other in self._others)
-        return self._hand.poses(rows, begin, solids((*clear, *more)))
+        found: tuple[Floats, NDArray[np.bool_], Floats] = poses(
+            rows, begin, self._hand.height, *solids((*clear, *more))
+        )
+        return found
 
 
 def _above(tips: Floats, table: Grip, height: float) -> Floats:
