@@ -186,8 +186,9 @@ class Leaks(Sound):
         """Push by the mass."""
         super().step(command, substeps)
         state, key = self.engine.read(), ("crate", "mass")
-        if "apart.cartesian_position" in state.layout.slices:
-            state.vector[state.layout.slices["apart.cartesian_position"]] += self.parameters([key])[key]
+        place = state.layout.slices.get("apart.cartesian_position")
+        if place is not None:
+            state.vector[place] += self.parameters([key])[key]
             self.engine.apply(Difference(state=state))
 
 
