@@ -70,8 +70,8 @@ class DeclaredTask(Task):
         terminated: The same for ``"terminated"``: whether the episode ends here.
         start: Where episodes begin: for states a value, or a space or distribution to draw from.
         observe: Names of the observed variables; all states if None.
-        goal: What is achieved, what is desired, and what follows from that: for ``goal_env``,
-            planners and ``sample_goal``.
+        goal: The variables that are achieved and desired, for ``goal_env``, planners and
+            ``sample_goal``.
 
     Raises:
         UnknownOption: An argument does not exist.
@@ -156,7 +156,7 @@ class ModelTask(DeclaredTask):
     Args:
         model: A path to an MJCF or URDF file, XML text, an ``MjSpec``, an ``MjModel``, or a
             ``Model`` that was read before.
-        name: Of the task; that of the model if None.
+        name: The name of the task; that of the model if None.
         expose: Patterns of the parameters that become variables (``"*.mass"``); all that are safe
             to change if None.
         spaces: For each variable a dictionary with ``a``, ``b``, ``bounds`` (spaces, or a pair of
@@ -221,7 +221,7 @@ class ModelTask(DeclaredTask):
         self._check_names()
 
     def _check_options(self) -> None:
-        """Check what was given as lists and dictionaries; a text alone is a list of one."""
+        """Check options that are lists or dictionaries; a text alone is a list of one."""
         names = "names", "or declared variables"
         for option, kinds, allowed in (
             ("expose", str, ("patterns such as '*.mass'",)),
@@ -251,7 +251,7 @@ class ModelTask(DeclaredTask):
                 raise UnknownOption("outcomes", name, known)
 
     def _steps(self) -> int:
-        """Give the length of a control step in physics steps."""
+        """Return the length of a control step in physics steps."""
         for option in ("seconds", "control_dt"):
             value = getattr(self, option)
             if value is not None and _numbers(option, value, ()) <= 0.0:
@@ -287,7 +287,7 @@ class ModelTask(DeclaredTask):
                     raise UnknownOption(f"spaces[{name!r}]", what, _OVERRIDES)
 
     def on(self, backend: Backend) -> Self:
-        """Give the same task with the parameters that a backend has."""
+        """Return the same task with the parameters that a backend has."""
         kept = tuple(
             row
             for row in self.system.parameters
@@ -304,7 +304,7 @@ class ModelTask(DeclaredTask):
         return other
 
     def idle(self, world: Any) -> Floats:
-        """Return the controls of the keyframe; zero, or what is nearest to it, if there is none."""
+        """Return the controls of the keyframe; zero, or the nearest ones, if there is none."""
         start = [row.default for row in self.system.inputs]
         return np.asarray(np.clip(start, world.action_low, world.action_high))
 

@@ -363,8 +363,8 @@ class BackendConformance(ABC):
         Between two steps each can be read, changed, saved, restored and stepped by itself.
         """
         commands = self.commands(scene.structure, 8 * COUNT).reshape(8, COUNT, -1)
-        other = list(self.others(scene).items())
-        given = [{**scene.parameters, **dict(other[:number])} for number in range(COUNT)]
+        values = list(self.others(scene).items())
+        given = [{**scene.parameters, **dict(values[:number])} for number in range(COUNT)]
         scenes = [scene.with_(parameters=parameters) for parameters in given]
         with ExitStack() as stack:
             alone, many = ([stack.enter_context(self.built(s)) for s in scenes] for _ in range(2))
