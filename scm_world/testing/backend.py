@@ -400,7 +400,8 @@ class BackendConformance(ABC):
             backend.apply(Difference(state=state))
             if together:
                 batch.step(np.array([0]), commands, self.substeps, state.vector[None].copy())
-            play(backend, commands, self.substeps)
+            else:
+                play(backend, commands, self.substeps)
 
 
 __all__ = ["MODEL", "BackendConformance", "play", "same"]
