@@ -189,9 +189,7 @@ class TriFingerTask(Task):
     @property
     def tools(self) -> tuple[str, ...]:
         """Names of the blocks that should be moved: one for each part."""
-        if self.block is not None:
-            return tuple(self.block.targets.values())
-        return tuple(f"tool_{name}" for name, _ in self.parts())
+        return tuple(f"tool_{name}" for name, _ in self.parts()) or tuple(self.targets.values())
 
     @property
     def targets(self) -> Mapping[str, str]:
@@ -321,7 +319,7 @@ class TriFingerTask(Task):
         }
         joints, height = values["joint_positions"], float(values["robot_height"])
         boxes = ([values[f"{goal}.{part}"] for part in building.POSE] for goal in self.targets)
-        if any(fingers_reach(*box, joints, height) for box in boxes):
+        if any(fingers_reach(b[0], b[1], b[2], joints, height) for b in boxes):
             found["joint_positions"] = np.array(hardware.ASIDE)
         return found
 

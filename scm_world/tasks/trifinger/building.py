@@ -142,7 +142,6 @@ def bodies(
         numbers.PART_SIZES.declare(f"{body}.size", None, "Full edge lengths.", *made.size)
         for body in (tool, goal)
     ]
-    a, b = numbers.places(numbers.half_height(f"{tool}.size"), airborne=airborne)
     block = ToolBlock(
         tool,
         size=sizes[0],
@@ -150,8 +149,7 @@ def bodies(
         spawn=made.start[1],
         spawn_from=made.start[0],
         spawn_again=True,
-        a=a,
-        b=b,
+        spaces=numbers.places(numbers.half_height(f"{tool}.size"), airborne=airborne),
     )
     pose = (
         goal_position(goal, parents=made.place[0], mechanism=made.place[1]),

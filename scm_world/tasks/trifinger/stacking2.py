@@ -81,12 +81,12 @@ def beside(size: Floats, orientation: Floats, *, place: Floats, other: Floats) -
 def goal_tower(place: tuple[float, float], orientation: Quaternion) -> Entity:
     """Describe the place of a tower of two blocks: its default radius and angle, and quaternion."""
     causes = (f"{TOWER}.polar", SIZE, f"{TOWER}.orientation")
-    a, b = numbers.places(Affine(parent=SIZE, index=2), airborne=False)
+    spaces = numbers.places(Affine(parent=SIZE, index=2), airborne=False)
     variables = (
         polar(TOWER, place),
         goal_position(TOWER, parents=causes, mechanism=Function(tower_center)),
         goal_orientation(TOWER, default=orientation),
-        *coordinates(TOWER, a=a, b=b),
+        *coordinates(TOWER, spaces=spaces),
     )
     return Entity(TOWER, variables)
 
@@ -188,13 +188,11 @@ class Stacking2(TriFingerTask):
     def _tool(self, index: int, start: Function) -> Entity:
         name, size = TOOLS[index], block_size(f"{TOOLS[index]}.size", SIZE, spaces=False)
         low, airborne = numbers.half_height(size.name), self.conventions.published_spaces
-        a, b = numbers.places(low, airborne=airborne)
         return ToolBlock(
             name,
             size=size,
             mass=block_mass(f"{name}.mass", default=self._mass),
             spawn=start,
-            a=a,
-            b=b,
+            spaces=numbers.places(low, airborne=airborne),
             orientation=self._turns[index],
         )

@@ -13,7 +13,7 @@ from scm_world.geometry import from_cylindrical, rotation_matrix
 from scm_world.geometry.hulls import Hull
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger.entities.blocks import ZERO, coordinates, looks
+from scm_world.tasks.trifinger.entities.blocks import ZERO, Spaces, coordinates, looks
 from scm_world.variables import Box, Function, Variable
 
 
@@ -81,8 +81,7 @@ class GoalBlock(Entity):
         size: The declaration of ``<name>.size`` [m].
         pose: Those of ``<name>.cartesian_position`` and ``<name>.orientation``, and of causes
             that belong to this goal alone.
-        a: Space A of the cylindrical position.
-        b: Space B of it.
+        spaces: A and B of the cylindrical position.
         yaw: Whether turns about z are in the spaces of the rotation vector.
         hull: Its shape, if it is not a box.
         inverse: Cartesian position where a cylindrical one is set.
@@ -94,14 +93,13 @@ class GoalBlock(Entity):
         *,
         size: Variable,
         pose: Iterable[Variable],
-        a: Box | None = None,
-        b: Box | None = None,
+        spaces: Spaces = (None, None),
         yaw: bool = True,
         hull: Hull | None = None,
         inverse: Callable[[Floats], Floats] = from_cylindrical,
     ) -> None:
         kind, paint = looks(name, "goal", numbers.GOAL_COLOR, hull)
-        others = coordinates(name, a=a, b=b, yaw=yaw, inverse=inverse)
+        others = coordinates(name, spaces=spaces, yaw=yaw, inverse=inverse)
         super().__init__(name, (kind, size, *pose, paint, *others), kind="goal", hull=hull)
 
 
@@ -116,6 +114,6 @@ def goal_sphere(
     )
     kind, paint = looks(name, "sphere", tint)
     pose = goal_position(name, default=position), goal_orientation(name)
-    a, b = numbers.places(numbers.half_height(size.name), airborne=True)
-    own = (kind, size, *pose, paint, *coordinates(name, a=a, b=b))
+    spaces = numbers.places(numbers.half_height(size.name), airborne=True)
+    own = (kind, size, *pose, paint, *coordinates(name, spaces=spaces))
     return Entity(name, own, kind="goal", shape="sphere")
