@@ -137,7 +137,7 @@ class Sabotaged(BackendWrapper):
             command = self.before(self, np.array(command), self.memory)
         self.engine.step(command, substeps)
         if self.after is not None:
-            state = self.engine.state()
+            state = self.engine.read()
             old = state.vector.copy()
             self.after(self, state.vector, self.memory)
             if (state.vector != old).any():
@@ -146,11 +146,11 @@ class Sabotaged(BackendWrapper):
     def snapshot(self) -> EngineSnapshot:
         """Save everything, with the memory or without it."""
         memory = copy.deepcopy(self.memory) if self.kept else None
-        return self.sealed((self.engine.snapshot(), memory, dict(self.asked)))
+        return EngineSnapshot.of(self, (self.engine.snapshot(), memory, dict(self.asked)))
 
     def restore(self, snapshot: EngineSnapshot) -> None:
         """Go back."""
-        inside, memory, asked = self.opened(snapshot)
+        inside, memory, asked = snapshot.opened(self)
         self.engine.restore(inside)
         self.asked = dict(asked)
         if memory is not None:

@@ -27,7 +27,7 @@ class SlowMotors(BackendWrapper):
     def step(self, command: np.ndarray, substeps: int) -> None:
         """Hold a command for some physics steps."""
         if "joint_positions" in self.structure.layout.names:  # a model of another kind has none
-            joints = self.state()["joint_positions"]
+            joints = self.read()["joint_positions"]
             command = np.clip(command, joints - AHEAD, joints + AHEAD)
         super().step(command, substeps)
 

@@ -17,20 +17,15 @@ from scm_world.backends.base import (
 from scm_world.errors import MissingEngine, UnknownOption
 from scm_world.models import Model
 
-BACKENDS = ("mujoco", "bullet", "step", "fake", "trifinger_platform")
-"""Names of the engines of this package; the last one only plays policies."""
-
 _CLASSES = {
     "mujoco": ("scm_world.backends.mujoco", "MujocoBackend", "mujoco>=3.17,<5"),
     "bullet": ("scm_world.backends.bullet", "BulletBackend", "pybullet==3.2.7"),
     "step": ("scm_world.backends.step", "StepFunction", "scm-world"),
     "fake": ("scm_world.backends.fake", "FakeBackend", "scm-world"),
-    "trifinger_platform": (
-        "scm_world.tasks.trifinger.platform",
-        "TriFingerPlatform",
-        "scm-world[trifinger]",
-    ),
 }
+
+BACKENDS = tuple(_CLASSES)
+"""Names of the engines of this package."""
 
 _REGISTERED: dict[str, type[Backend]] = {}
 

@@ -7,7 +7,7 @@ A backend holds one scene. It knows bodies, parameters and states, and nothing a
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, final
 
@@ -50,18 +50,18 @@ class ContactPoint:
 @final
 @dataclass(frozen=True)
 class Capabilities:
-    """What an engine promises.
+    """What an engine can do beyond the methods of a backend.
 
     Attributes:
         physics: Whether anything moves by itself.
-        batch: Whether many worlds can be stepped in one call.
-        snapshot: ``"exact"`` where the engine's own state is saved, ``"replay"`` where the
-            commands since the last canonical state are repeated. Both continue bit for bit.
+        supports: Whether the engine realises a parameter of a structure.
+        remarks: Given a backend and the old values of parameters that were changed, the changes
+            that have no effect, and why; one sentence each.
     """
 
     physics: bool = True
-    batch: bool = False
-    snapshot: str = "exact"
+    supports: Callable[[Structure, ParameterKey], bool] = lambda structure, key: True
+    remarks: Callable[[Any, Parameters], tuple[str, ...]] = lambda backend, before: ()
 
 
 @final
@@ -77,6 +77,73 @@ class EngineSnapshot:
     engine: str
     payload: Any
 
+    @classmethod
+    def of(cls, backend: Backend, payload: Any) -> EngineSnapshot:
+        """Return a snapshot of a backend, in its version."""
+        return cls(f"{backend.name} {backend.version}", payload)
+
+    def opened(self, backend: Backend) -> Any:
+        """Return the payload for a backend.
+
+        Raises:
+            SnapshotMismatch: It was taken by another engine, or another version of it.
+        """
+        here = f"{backend.name} {backend.version}"
+        if self.engine != here:
+            raise SnapshotMismatch(f"a snapshot of {self.engine} cannot be restored by {here}")
+        return self.payload
+
+
+class EngineBatch:
+    """Several scenes of one engine that are stepped in one call.
+
+    That is, bit for bit, the same as stepping one after another, which this class does.
+
+    Args:
+        backends: All of one class. Each can still be used by itself at any time.
+        threads: For an engine that steps several scenes together.
+
+    Attributes:
+        may_refuse: Whether a scene that fails can be as it was; if not, it has lost its state.
+    """
+
+    may_refuse: ClassVar[bool] = False
+
+    def __init__(self, backends: Sequence[Any], threads: int = 1) -> None:
+        self._backends = tuple(backends)
+
+    def step(self, which: Integers, commands: Floats, substeps: int, into: Floats) -> None:
+        """Hold commands for some physics steps.
+
+        Args:
+            which: Numbers of the scenes that are stepped, ascending, shape (m,).
+            commands: One for each scene, in the first columns of its row, shape (n, at least
+                n_commands).
+            substeps: How many steps of ``structure.timestep``.
+            into: Where their states are written afterwards: the vector of scene i into the first
+                columns of row i, shape (n, at least layout.size).
+
+        Raises:
+            EngineFailure: A scene lost its state, or is as it was, which the error lists in
+                ``unmoved``; all others were stepped.
+        """
+        failed: EngineFailure | None = None
+        unmoved: list[int] = []
+        for index in which.tolist():
+            backend = self._backends[index]
+            structure = backend.structure
+            try:
+                backend.step(commands[index, : structure.n_commands], substeps)
+            except EngineFailure as error:
+                said = f"scene {index} of the batch: {error}"
+                failed = failed or EngineFailure(said, error.engine)
+                unmoved += [index] if self.may_refuse else []
+            layout = structure.layout
+            backend.read(State(layout, into[index, : layout.size]))
+        if failed is not None:
+            failed.unmoved = tuple(unmoved)
+            raise failed
+
 
 class Backend(ABC):
     """A physics engine with one scene in it.
@@ -85,20 +152,20 @@ class Backend(ABC):
     ``EngineFailure``. Changes made between two calls of ``step`` take no time, and their result
     depends on the last ``step`` and on the final parameters and state only, not on the path: a
     change that is taken back leaves no trace, bit for bit.
+
+    Attributes:
+        name: Of the engine.
+        capabilities: What it can do beyond these methods.
+        batch: Made of backends of this class and a number of threads, it steps several scenes.
+        version: Of the engine.
+        structure: What was compiled: it says how large states and commands are.
     """
 
     name: ClassVar[str]
     capabilities: ClassVar[Capabilities]
-
-    @property
-    @abstractmethod
-    def version(self) -> str:
-        """Version of the engine."""
-
-    @property
-    @abstractmethod
-    def structure(self) -> Structure:
-        """What was compiled: it says how large states and commands are."""
+    batch: ClassVar[type[EngineBatch]] = EngineBatch
+    version: str
+    structure: Any
 
     @abstractmethod
     def build(self, scene: Scene) -> None:
@@ -113,27 +180,18 @@ class Backend(ABC):
 
     @abstractmethod
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Read parameters back from the engine itself, in the units of the scene."""
+        """Read parameters back from the engine itself, in the units of the scene.
 
-    @abstractmethod
-    def inertia(self, body: str) -> Floats:
-        """Read the principal moments of inertia of a body, shape (3,) [kg m²].
+        Also ``(body, "inertia")``, the principal moments of inertia of any body, shape (3,)
+        [kg m²], where they follow from other parameters.
 
         Raises:
-            UnknownOption: There is no such body.
+            UnknownOption: There is no such parameter.
         """
-
-    def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """Say which changes of parameters have no effect, and why; one sentence each.
-
-        Args:
-            before: The parameters that were changed, as they were.
-        """
-        return ()
 
     @abstractmethod
-    def read(self, into: State) -> None:
-        """Write the present state into an existing vector, without allocating."""
+    def read(self, into: Any = None) -> Any:
+        """Write the present state into an existing one, or a new one; return it."""
 
     @abstractmethod
     def step(self, command: Floats, substeps: int) -> None:
@@ -160,106 +218,8 @@ class Backend(ABC):
             SnapshotMismatch: It was taken by another engine.
         """
 
-    def supports(self, structure: Structure, key: ParameterKey) -> bool:
-        """Tell whether it realises a parameter of a structure."""
-        return True
-
     def close(self) -> None:  # noqa: B027 # most engines have nothing to free
         """Free what the engine holds. Closing twice is harmless."""
-
-    def state(self) -> Any:
-        """Read the present state into a new vector; the kind of state that the structure has."""
-        state = self.structure.empty_state()
-        self.read(state)
-        return state
-
-    @final
-    def sealed(self, payload: Any) -> EngineSnapshot:
-        """Give a snapshot of this engine, in this version."""
-        return EngineSnapshot(f"{self.name} {self.version}", payload)
-
-    @final
-    def opened(self, snapshot: EngineSnapshot) -> Any:
-        """Give what a snapshot holds.
-
-        Raises:
-            SnapshotMismatch: It was taken by another engine, or another version of this one.
-        """
-        here = f"{self.name} {self.version}"
-        if snapshot.engine != here:
-            raise SnapshotMismatch(f"a snapshot of {snapshot.engine} cannot be restored by {here}")
-        return snapshot.payload
-
-    @classmethod
-    def batch(cls, backends: Sequence[Backend], threads: int) -> EngineBatch:
-        """Give what steps several scenes of this engine in one call.
-
-        Args:
-            backends: All of this class. Each can still be used by itself at any time.
-            threads: That an engine may use which can step several scenes together.
-        """
-        return OneByOne(backends)
-
-
-class EngineBatch(ABC):
-    """Several scenes of one engine that are stepped in one call.
-
-    That is, bit for bit, the same as stepping one after another.
-
-    Attributes:
-        may_refuse: Whether a scene that fails can be as it was; if not, it has lost its state.
-    """
-
-    may_refuse: ClassVar[bool] = False
-
-    @abstractmethod
-    def step(self, which: Integers, commands: Floats, substeps: int, into: Floats) -> None:
-        """Hold commands for some physics steps.
-
-        Args:
-            which: Numbers of the scenes that are stepped, ascending, shape (m,).
-            commands: One for each scene, in the first columns of its row, shape (n, at least
-                n_commands).
-            substeps: How many steps of ``structure.timestep``.
-            into: Where their states are written afterwards: the vector of scene i into the first
-                columns of row i, shape (n, at least layout.size).
-
-        Raises:
-            EngineFailure: A scene lost its state, or is as it was, which the error says; all
-                others were stepped.
-        """
-
-
-@final
-class OneByOne(EngineBatch):
-    """Scenes of an engine that steps one at a time.
-
-    Args:
-        backends: The scenes.
-    """
-
-    def __init__(self, backends: Sequence[Backend]) -> None:
-        self._backends = tuple(backends)
-
-    def step(self, which: Integers, commands: Floats, substeps: int, into: Floats) -> None:
-        """Step the scenes one after another.
-
-        Raises:
-            EngineFailure: The first one of a scene; all were stepped.
-        """
-        failed: EngineFailure | None = None
-        for index in which.tolist():
-            backend = self._backends[index]
-            structure = backend.structure
-            try:
-                backend.step(commands[index, : structure.n_commands], substeps)
-            except EngineFailure as error:
-                said = f"scene {index} of the batch: {error}"
-                failed = failed or EngineFailure(said, error.engine)
-            layout = structure.layout
-            backend.read(State(layout, into[index, : layout.size]))
-        if failed is not None:
-            raise failed
 
 
 class BackendWrapper(Backend, ABC):
@@ -279,16 +239,13 @@ class BackendWrapper(Backend, ABC):
 
     def __init__(self, engine: Backend) -> None:
         self.engine = engine
+        self.version = f"{engine.name} {engine.version}"
 
-    @property
-    def version(self) -> str:
-        """Name and version of the engine inside."""
-        return f"{self.engine.name} {self.engine.version}"
-
-    @property
-    def structure(self) -> Structure:
-        """What was compiled."""
-        return self.engine.structure
+    def __getattr__(self, name: str) -> Any:
+        """Return what only the engine inside has, such as its structure."""
+        if name == "engine":  # while it is copied
+            raise AttributeError(name)
+        return getattr(self.engine, name)
 
     def build(self, scene: Scene) -> None:
         """Realise a scene from nothing."""
@@ -302,17 +259,9 @@ class BackendWrapper(Backend, ABC):
         """Read parameters back from the engine."""
         return self.engine.parameters(keys)
 
-    def inertia(self, body: str) -> Floats:
-        """Read the principal moments of inertia of a body, shape (3,) [kg m²]."""
-        return self.engine.inertia(body)
-
-    def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """Say which changes of parameters have no effect, and why."""
-        return self.engine.remarks(before)
-
-    def read(self, into: State) -> None:
-        """Write the present state into an existing vector."""
-        self.engine.read(into)
+    def read(self, into: Any = None) -> Any:
+        """Read the present state."""
+        return self.engine.read(into)
 
     def step(self, command: Floats, substeps: int) -> None:
         """Hold a command for some physics steps."""
@@ -324,15 +273,11 @@ class BackendWrapper(Backend, ABC):
 
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""
-        return self.sealed(self.engine.snapshot())
+        return EngineSnapshot.of(self, self.engine.snapshot())
 
     def restore(self, snapshot: EngineSnapshot) -> None:
-        """Go back to a snapshot.
-
-        Raises:
-            SnapshotMismatch: It was taken by another engine, or by the one inside alone.
-        """
-        self.engine.restore(self.opened(snapshot))
+        """Go back to a snapshot; one of the engine inside alone is refused."""
+        self.engine.restore(snapshot.opened(self))
 
     def close(self) -> None:
         """Free what the engine holds."""
@@ -342,22 +287,15 @@ class BackendWrapper(Backend, ABC):
 class InMemory(Backend, ABC):
     """What keeps a scene in memory: parameters in a dict, the state in a vector.
 
-    Only ``step`` and ``inertia`` are left to a class that derives from it.
+    Only ``step`` is left to a class that derives from it. Where a model has a ``fake``, that
+    computes moments of inertia.
     """
 
-    @property
-    def version(self) -> str:
-        """Version of the backend."""
-        return "1"
-
-    @property
-    def structure(self) -> Any:
-        """The structure of the scene."""
-        return self._structure
+    version = "1"
 
     def build(self, scene: Scene) -> None:
         """Keep the scene."""
-        self._structure, self._state = scene.structure, scene.structure.empty_state()
+        self.structure, self._state = scene.structure, scene.structure.empty_state()
         self._parameters: dict[ParameterKey, Floats] = {}
         self._keep(scene.parameters)
         self._place(scene.state)
@@ -371,34 +309,40 @@ class InMemory(Backend, ABC):
         """
         structure = difference.structure
         if structure is not None:
-            now = Scene(self._structure, self._parameters, self._state)
+            now = Scene(self.structure, self._parameters, self._state)
             difference = complete(now, structure, difference)
-            self._structure, self._state = structure, structure.empty_state()
-            structure.carried(self._state, now)  # what is reported stays
+            self.structure, self._state = structure, structure.empty_state()
+            self._state.carry(now.state)  # what is reported stays
             self._parameters = {}
         else:
-            self._check(difference.parameters)
             for key, value in difference.parameters.items():
-                if np.shape(value) != self._parameters[key].shape:
-                    name, shape = ".".join(key).strip("."), self._parameters[key].shape
-                    raise WrongShape(name, value, shape, np.shape(value))
+                shape = self._known(key).shape
+                if np.shape(value) != shape:
+                    raise WrongShape(".".join(key).strip("."), value, shape, np.shape(value))
         self._keep(difference.parameters)
         if difference.state is not None:
             self._place(difference.state)
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Give the parameters that were set.
+        """Return the parameters that were set.
 
         Raises:
             UnknownOption: There is no such parameter.
         """
-        keys = tuple(keys)
-        self._check(keys)
-        return {key: self._parameters[key].copy() for key in keys}
+        fake, found = getattr(self.structure, "fake", None), dict[ParameterKey, Floats]()
+        for key in keys:
+            body, what = key
+            if what == "inertia" and fake is not None and (body, "mass") in self._parameters:
+                found[key] = np.asarray(fake.inertia(self.structure, self._parameters, body))
+            else:
+                found[key] = self._known(key).copy()
+        return found
 
-    def read(self, into: State) -> None:
-        """Write the present state into an existing vector."""
+    def read(self, into: Any = None) -> Any:
+        """Write the present state into an existing one, or a new one."""
+        into = self.structure.empty_state() if into is None else into
         into.vector[:] = self._state.vector
+        return into
 
     def contacts(self) -> tuple[ContactPoint, ...]:
         """Nothing ever touches anything."""
@@ -406,17 +350,13 @@ class InMemory(Backend, ABC):
 
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""
-        scene = Scene(self._structure, dict(self._parameters), self._state.copy())
-        return self.sealed(scene)
+        scene = Scene(self.structure, dict(self._parameters), self._state.copy())
+        return EngineSnapshot.of(self, scene)
 
     def restore(self, snapshot: EngineSnapshot) -> None:
-        """Go back to a snapshot.
-
-        Raises:
-            SnapshotMismatch: It was taken by another engine.
-        """
-        scene: Scene = self.opened(snapshot)
-        self._structure, self._state = scene.structure, scene.state.copy()
+        """Go back to a snapshot."""
+        scene: Scene = snapshot.opened(self)
+        self.structure, self._state = scene.structure, scene.state.copy()
         self._parameters = {}
         self._keep(scene.parameters)
 
@@ -428,8 +368,9 @@ class InMemory(Backend, ABC):
         """Put everything where a state says; what is only reported stays."""
         np.copyto(self._state.vector, state.vector, where=self._state.layout.can_be_set)
 
-    def _check(self, keys: Iterable[ParameterKey]) -> None:
-        for key in keys:
-            if key not in self._parameters:
-                known = (".".join(known).strip(".") for known in self._parameters)
-                raise UnknownOption("parameter", ".".join(key).strip("."), known)
+    def _known(self, key: ParameterKey) -> Floats:
+        """Return a parameter as it is kept, or refuse the key."""
+        if key not in self._parameters:
+            known = (".".join(known).strip(".") for known in self._parameters)
+            raise UnknownOption("parameter", ".".join(key).strip("."), known)
+        return self._parameters[key]

@@ -24,33 +24,20 @@ class FakeBackend(InMemory):
     name: ClassVar[str] = "fake"
     capabilities: ClassVar[Capabilities] = Capabilities(physics=False)
 
-    def inertia(self, body: str) -> Floats:
-        """Compute the principal moments of inertia of a body, shape (3,) [kg m²].
-
-        Raises:
-            UnknownOption: There is no such body.
-        """
-        self._check([(body, "mass")])
-        custom = getattr(self._structure, "fake", None)
-        if custom is not None:
-            return np.asarray(custom.inertia(self._structure, self._parameters, body))
-        self._check([(body, "inertia")])
-        return self._parameters[body, "inertia"].copy()
-
     def step(self, command: Floats, substeps: int) -> None:
         """Advance time.
 
         Raises:
             EngineFailure: A number is not finite afterwards.
         """
-        custom = getattr(self._structure, "fake", None)
+        custom = getattr(self.structure, "fake", None)
         if custom is not None:
-            custom.move(self._structure, self._state, command, substeps * self._structure.timestep)
+            custom.move(self.structure, self._state, command, substeps * self.structure.timestep)
         if not np.isfinite(self._state.vector).all():
             raise EngineFailure("a number is not finite", self.name)
 
     def _place(self, state: State) -> None:
         super()._place(state)
-        custom = getattr(self._structure, "fake", None)
+        custom = getattr(self.structure, "fake", None)
         if custom is not None:
             custom.settle(self._state)

@@ -11,8 +11,8 @@ import numpy as np
 
 from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Floats, Integers, Value
-from scm_world.backends.base import Backend, Capabilities, EngineBatch, InMemory
-from scm_world.errors import EngineFailure, ModelError, UnknownOption
+from scm_world.backends.base import Capabilities, EngineBatch, InMemory
+from scm_world.errors import EngineFailure, ModelError
 from scm_world.models.model import Numbers
 from scm_world.models.scene import ParameterKey, Parameters, Scene, State, StateLayout
 
@@ -90,6 +90,10 @@ class StepModel:
     vectorized: bool = False
     signature: Literal["dicts", "arrays"] = "dicts"
 
+    bodies: ClassVar[tuple[str, ...]] = ()
+    readouts: ClassVar[tuple[str, ...]] = ()
+    refused: ClassVar[tuple[str, ...]] = ()
+
     @cached_property
     def digest(self) -> str:
         """Hash of the function and the tables."""
@@ -116,13 +120,6 @@ class StepModel:
         """Give the scene in which every parameter and every state has its default."""
         parameters = {quantity.key: quantity.value for quantity in self.parameters}
         return Scene(self, parameters, self.empty_state())
-
-    def carried(self, state: State, before: Scene) -> None:
-        """Copy the states that another structure has too, from a scene of it into a state."""
-        there = before.state.layout.slices
-        for name, where in self.layout.slices.items():
-            if name in there and there[name].stop - there[name].start == where.stop - where.start:
-                state.vector[where] = before.state.vector[there[name]]
 
     def advance(self, parameters: Floats, states: Floats, commands: Floats) -> Floats:
         """Take one step in several systems.
@@ -252,80 +249,13 @@ class StepModel:
 
 
 @final
-class StepFunction(InMemory):
-    """Realises a ``StepModel``.
-
-    Attributes:
-        numbers: The parameters in the order of declaration, flat, shape (p,).
-    """
-
-    name: ClassVar[str] = "step"
-    capabilities: ClassVar[Capabilities] = Capabilities(batch=True)
-    numbers: Floats
-
-    def build(self, scene: Scene) -> None:
-        """Keep the scene.
-
-        Raises:
-            ModelError: It is not that of a step function.
-        """
-        if not isinstance(scene.structure, StepModel):
-            raise ModelError(
-                [
-                    "the backend 'step' realises step functions only (World.from_step), not a "
-                    f"{type(scene.structure).__name__}; choose 'mujoco' or 'bullet'"
-                ]
-            )
-        super().build(scene)
-
-    def inertia(self, body: str) -> Floats:
-        """Refuse: a step function has no bodies.
-
-        Raises:
-            UnknownOption: Always.
-        """
-        raise UnknownOption("body", body, ("nothing: a step function has no bodies",))
-
-    def step(self, command: Floats, substeps: int) -> None:
-        """Hold a command, which is the action and the noise, for some steps.
-
-        Raises:
-            EngineFailure: See ``StepModel.advance``. The state is as before.
-        """
-        parameters, states, commands = self.numbers[None], self._state.vector[None], command[None]
-        for _ in range(substeps):
-            states = self._structure.advance(parameters, states, commands)
-        self._state.vector[:] = states[0]
-
-    @property
-    def vector(self) -> Floats:
-        """The state itself, flat, shape (s,)."""
-        vector: Floats = self._state.vector
-        return vector
-
-    def _keep(self, parameters: Parameters) -> None:
-        super()._keep(parameters)
-        parts = [self._parameters[quantity.key].ravel() for quantity in self._structure.parameters]
-        self.numbers = np.concatenate([*parts, np.empty(0)])
-
-    @classmethod
-    def batch(cls, backends: Sequence[Backend], threads: int) -> EngineBatch:
-        """Give what steps several systems, with one call of a vectorised function."""
-        return StepBatch(backends)
-
-
-@final
 class StepBatch(EngineBatch):
-    """Systems of step functions; a vectorised function is called once for all of them.
-
-    Args:
-        backends: All of them ``StepFunction``.
-    """
+    """Systems of step functions; a vectorised function is called once for all of them."""
 
     may_refuse: ClassVar[bool] = True
 
-    def __init__(self, backends: Sequence[Backend]) -> None:
-        self._backends: tuple[Any, ...] = tuple(backends)
+    def __init__(self, backends: Sequence[StepFunction], threads: int = 1) -> None:
+        super().__init__(backends, threads)
         self._compared: set[tuple[StepModel, int]] = set()
 
     def step(self, which: Integers, commands: Floats, substeps: int, into: Floats) -> None:
@@ -339,28 +269,26 @@ class StepBatch(EngineBatch):
         """
         failed: EngineFailure | None = None
         unmoved: list[int] = []
+        alone: list[int] = []
         together: dict[StepModel, list[int]] = {}
         for index in which.tolist():
-            together.setdefault(self._backends[index].structure, []).append(index)
+            model = self._backends[index].structure
+            (together.setdefault(model, []) if model.vectorized else alone).append(index)
         for model, rows in together.items():
-            members, size = [self._backends[row] for row in rows], model.layout.size
-            alone = not model.vectorized
-            if model.vectorized:
-                try:
-                    refused = self._together(model, members, commands[rows], substeps)
-                except EngineFailure:
-                    alone = True
-                else:
-                    failed = failed or refused
-                    unmoved += rows if refused else ()
-            for row, member in zip(rows, members, strict=True) if alone else ():
-                try:
-                    member.step(commands[row, : model.n_commands], substeps)
-                except EngineFailure as error:
-                    said = f"scene {row} of the batch: {error}"
-                    failed = failed or EngineFailure(said, error.engine)
-                    unmoved.append(row)
-            into[rows, :size] = [member.vector for member in members]
+            members = [self._backends[row] for row in rows]
+            try:
+                refused = self._together(model, members, commands[rows], substeps)
+            except EngineFailure:
+                alone += rows
+                continue
+            if refused:
+                failed = failed or refused
+                unmoved += rows
+            into[rows, : model.layout.size] = [member.vector for member in members]
+        try:
+            super().step(np.array(alone, dtype=np.int64), commands, substeps, into)
+        except EngineFailure as error:
+            failed, unmoved = failed or error, [*unmoved, *error.unmoved]
         if failed is not None:
             failed.unmoved = tuple(unmoved)
             raise failed
@@ -393,3 +321,54 @@ class StepBatch(EngineBatch):
         for member, vector in zip(members, states, strict=True):
             member.vector[:] = vector
         return None
+
+
+@final
+class StepFunction(InMemory):
+    """Realises a ``StepModel``.
+
+    Attributes:
+        numbers: The parameters in the order of declaration, flat, shape (p,).
+    """
+
+    name: ClassVar[str] = "step"
+    capabilities: ClassVar[Capabilities] = Capabilities()
+    batch: ClassVar[type[EngineBatch]] = StepBatch
+    numbers: Floats
+
+    def build(self, scene: Scene) -> None:
+        """Keep the scene.
+
+        Raises:
+            ModelError: It is not that of a step function.
+        """
+        if not isinstance(scene.structure, StepModel):
+            raise ModelError(
+                [
+                    "the backend 'step' realises step functions only (World.from_step), not a "
+                    f"{type(scene.structure).__name__}; choose 'mujoco' or 'bullet'"
+                ]
+            )
+        super().build(scene)
+
+    def step(self, command: Floats, substeps: int) -> None:
+        """Hold a command, which is the action and the noise, for some steps.
+
+        Raises:
+            EngineFailure: See ``StepModel.advance``. The state is as before.
+        """
+        parameters, states, commands = self.numbers[None], self._state.vector[None], command[None]
+        for _ in range(substeps):
+            states = self.structure.advance(parameters, states, commands)
+        self._state.vector[:] = states[0]
+
+    @property
+    def vector(self) -> Floats:
+        """The state itself, flat, shape (s,)."""
+        vector: Floats = self._state.vector
+        return vector
+
+    def _keep(self, parameters: Parameters) -> None:
+        super()._keep(parameters)
+        parts = [self._parameters[quantity.key].ravel() for quantity in self.structure.parameters]
+        self.numbers = np.concatenate([*parts, np.empty(0)])

@@ -112,12 +112,12 @@ def grouped(declaration: CompiledTask, group: str) -> list[str]:
     """
     model, task = declaration.model, declaration.task
     spaced = [v for v in _spaced(declaration) if v.name != PRESET]
-    blocks = declaration.composition.blocks
+    bodies = declaration.composition.movers()
     looks = [v.name for v in spaced if _like(v.name, LOOKS)]
     poses = [
         v.name
         for v in spaced
-        if v.name.partition(".")[0] in blocks and v.name.partition(".")[2] in POSE
+        if v.name.partition(".")[0] in bodies and v.name.partition(".")[2] in POSE
     ]
     goals = [name for name in task.goal.causes if name in model]
     match group:
@@ -143,7 +143,7 @@ def grouped(declaration: CompiledTask, group: str) -> list[str]:
                 and not _like(v.name, (*PLACES, "*euler_orientation", "goal_*", "sensor_noise"))
             ] + [name for name in ("blocks_mass",) if name in model]
     found = []
-    placed = poses if task.decided_by and blocks else ()
+    placed = poses if task.decided_by else ()
     for v in spaced:
         entity, _, quantity = v.name.rpartition(".")
         is_ours = v.name in placed or _like(v.name, OURS) or (entity == "" and v.role == "state")

@@ -46,7 +46,7 @@ from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.tasks import TASKS
-from scm_world.tasks.model import FILES
+from scm_world.tasks.factories import FILES
 from scm_world.work.executors import Executor, Processes, opened
 from scm_world.work.processes import PROCESS, Ended, TookTooLong, Worker
 

@@ -41,8 +41,7 @@ from scm_world.policies.scripted import as_policy
 from scm_world.queries.outcomes import Outcome, as_outcome
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.tasks import TASKS, Task, TriFingerTask, make_task
-from scm_world.tasks.factories import load_factory
-from scm_world.tasks.model import FILES
+from scm_world.tasks.factories import FILES, load_factory
 from scm_world.variables import Box, Derived, Draw, Exogenous, Function, Linear, Parent
 from scm_world.variables.distributions import Normal
 from scm_world.world import Simulation

@@ -33,8 +33,7 @@ from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task, tasks
-from scm_world.tasks.factories import refuse_untrusted
-from scm_world.tasks.model import is_model
+from scm_world.tasks.factories import is_model, refuse_untrusted
 from scm_world.variables.mechanisms import check_trusted
 
 

@@ -1,9 +1,8 @@
-"""Rotations, coordinates, and how boxes and capsules lie in one another: numbers only."""
+"""Rotations, coordinates, and the volumes that solids share: numbers only."""
 
 from scm_world.geometry.coordinates import from_cylindrical, to_cylindrical
-from scm_world.geometry.filling import overlap_fraction
-from scm_world.geometry.hulls import Hull, box_hull, extents, hull_of, hull_overlap, load_hull
-from scm_world.geometry.overlap import aabb_overlap_fraction, overlap_volume
+from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction
+from scm_world.geometry.hulls import Hull, extents, hull_of, hull_overlap, load_hull
 from scm_world.geometry.rotations import (
     angle_between,
     canonical,
@@ -18,7 +17,6 @@ __all__ = [
     "Hull",
     "aabb_overlap_fraction",
     "angle_between",
-    "box_hull",
     "canonical",
     "extents",
     "from_cylindrical",
@@ -27,7 +25,6 @@ __all__ = [
     "hull_overlap",
     "load_hull",
     "overlap_fraction",
-    "overlap_volume",
     "quaternion_inverse",
     "quaternion_product",
     "rotation_matrix",

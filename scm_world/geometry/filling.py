@@ -4,222 +4,207 @@ What is filled counts once, for the goal and the block that come first:
 
     V(∪G ∩ ∪B) = Σ_g Σ_b V(G_g ∩ B_b − (G_1 ∪ … ∪ G_{g-1} ∪ B_1 ∪ … ∪ B_{b-1})).
 
-Where nothing intersects, the terms are overlaps of two boxes. Elsewhere the block is cut as five
-tetrahedra: a plane makes at most six of one, whose volumes stay right however thin they are, so
-that coplanar faces are no special case.
+A convex solid is given by its edges, each twice: once along each of the two faces that it bounds,
+counterclockwise seen from outside. A row has the number of the face, and both ends: shape (n, 7)
+[m]. Their order does not matter. To cut a solid with a plane, each edge is cut by itself, and where
+a face was cut, one more edge closes it; the same edge, backwards, belongs to the new face. A point
+in which an edge meets the plane is computed in the same way for both faces, so that each face stays
+closed to the last bit, and coplanar faces are no special case.
 """
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
-
 import numpy as np
 from numba import njit
 
-from scm_world._types import ArrayLike, Floats, Integers
-from scm_world.geometry.arrays import copy_rows, rows
-from scm_world.geometry.overlap import WORKSPACE, overlap_kernel
-from scm_world.geometry.rotations import rotation_kernel
+from scm_world._types import ArrayLike, Floats
+from scm_world.geometry.rotations import rotation_kernel, rotation_matrix
 
-Boxes: TypeAlias = tuple[Floats, Floats, Floats]
-"""Full edge lengths, centers and quaternions (x, y, z, w), shapes (n, 3), (n, 3), (n, 4)."""
+NOTHING = 1e-15  # of the volume of a solid: a piece of it that can be left out
+_SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+_CUBE = np.array(
+    [
+        (2 * axis + (side < 0), *np.roll((side, *start), axis), *np.roll((side, *end), axis))
+        for axis in range(3)
+        for side in (1, -1)
+        for start, end in zip(_SQUARE, _SQUARE[side:] + _SQUARE[:side], strict=True)
+    ],
+    dtype=np.float64,
+)
+"""The edges of the cube from -1 to 1, shape (24, 7)."""
 
-SIDES = 6
-NOTHING = 1e-15  # of the volume of a box: a piece of it that can be left out
-_FIVE = np.array([[0, 3, 5, 6], [1, 0, 3, 5], [2, 0, 3, 6], [4, 0, 5, 6], [7, 3, 5, 6]])
-_NONE: Any = np.int64(0)
-_ONE: Any = np.int64(1)
-"""No literals: numba would compile a kernel once more for each of them."""
 
-
-@njit(cache=True)
-def _planes(size: Floats, position: Floats, orientation: Floats, out: Floats) -> None:
-    """Write normal and offset of the six sides; inside is ``normal · x <= offset``."""
-    rotation = np.empty((3, 3))
-    rotation_kernel(orientation, rotation)
-    for axis in range(3):
-        middle = 0.0
-        for k in range(3):
-            out[2 * axis, k] = rotation[k, axis]
-            out[2 * axis + 1, k] = -rotation[k, axis]
-            middle += rotation[k, axis] * position[k]
-        out[2 * axis, 3] = 0.5 * size[axis] + middle
-        out[2 * axis + 1, 3] = 0.5 * size[axis] - middle
+def _rows(values: ArrayLike, width: int) -> Floats:
+    """Copy rows of numbers, of which there may be none, so that no kernel is compiled twice."""
+    return np.array(values, dtype=np.float64, order="C").reshape(-1, width)
 
 
 @njit(cache=True)
-def _tetrahedra(size: Floats, position: Floats, orientation: Floats, out: Floats) -> None:
-    """Write a box as five tetrahedra, shape (5, 4, 3)."""
-    rotation = np.empty((3, 3))
-    rotation_kernel(orientation, rotation)
-    for t in range(5):
-        for n in range(4):
-            for k in range(3):
-                out[t, n, k] = position[k]
-                for axis in range(3):
-                    sign = 1.0 if (_FIVE[t, n] >> axis) & 1 else -1.0
-                    out[t, n, k] += 0.5 * sign * size[axis] * rotation[k, axis]
-
-
-@njit(cache=True)
-def _volume(corners: Floats) -> float:
-    """Give the volume of a tetrahedron, shape (4, 3)."""
-    total = 0.0
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        total += (corners[1, k] - corners[0, k]) * (
-            (corners[2, i] - corners[0, i]) * (corners[3, j] - corners[0, j])
-            - (corners[2, j] - corners[0, j]) * (corners[3, i] - corners[0, i])
-        )
-    return abs(total) / 6.0
-
-
-@njit(cache=True)
-def _wedge(wedge: Floats, out: Floats) -> None:
-    """Write a wedge between two triangles, shape (6, 3), as three tetrahedra."""
-    for t in range(3):
-        copy_rows(wedge[: 3 - t], out[t])
-        copy_rows(wedge[5 - t :], out[t, 3 - t :])
-
-
-@njit(cache=True)
-def _between(corners: Floats, heights: Floats, p: int, q: int, out: Floats) -> None:
-    """Write the point where the edge from p to q crosses the plane."""
-    along = heights[p] / (heights[p] - heights[q])
-    for k in range(3):
-        out[k] = corners[p, k] + along * (corners[q, k] - corners[p, k])
-
-
-@njit(cache=True)
-def _sort(corners: Floats, plane: Floats, heights: Floats, order: Integers) -> int:
-    """Measure four heights within a plane, list those inside first, and count them."""
-    inside, beyond = 0, 4
-    for n in range(4):
-        heights[n] = plane[3]
-        for k in range(3):
-            heights[n] -= plane[k] * corners[n, k]
-        if heights[n] >= 0.0:
-            order[inside] = n
-            inside += 1
-        else:
-            beyond -= 1
-            order[beyond] = n
-    return inside
-
-
-@njit(cache=True, error_model="numpy")
-def _split(corners: Floats, plane: Floats, out: Floats) -> int:
-    """Cut a tetrahedron into at most six.
+def box_kernel(
+    size: Floats, position: Floats, orientation: Floats, edges: Floats, planes: Floats
+) -> None:
+    """Write the edges of a box, shape (24, 7), and its planes, shape (6, 4).
 
     Args:
-        corners: Shape (4, 3).
-        plane: Normal and offset, shape (4,).
-        out: Where to write those inside from 0 on, those outside from 3 on, shape (6, 4, 3).
-
-    Returns:
-        How many are inside and, times ten, how many are outside.
+        size: Full edge lengths, shape (3,) [m].
+        position: Center, shape (3,) [m].
+        orientation: Quaternion (x, y, z, w), of any length.
+        edges: See the module.
+        planes: Unit outward normals and offsets; inside is ``normal · x <= offset``.
     """
-    heights, order = np.empty(4), np.empty(4, dtype=np.int64)
-    inside = _sort(corners, plane, heights, order)
-    if inside == 4:
-        copy_rows(corners, out[0])
-        return 1
-    if inside == 0:
-        copy_rows(corners, out[3])
-        return 10
-    wedge = np.empty((6, 3))
-    if inside == 2:
-        for side in range(2):
-            here, there = 2 * side, 2 - 2 * side
-            for n in range(2):
-                p = order[here + n]
-                copy_rows(corners[p : p + 1], wedge[3 * n :])
-                for m in range(2):
-                    _between(corners, heights, p, order[there + m], wedge[3 * n + 1 + m])
-            _wedge(wedge, out[3 * side : 3 * side + 3])
-        return 33
-    alone, first, tip, rest = (0, 1, 0, 3) if inside == 1 else (3, 0, 3, 0)
-    p = order[alone]
-    copy_rows(corners[p : p + 1], out[tip])
-    for n in range(3):
-        q = order[first + n]
-        copy_rows(corners[q : q + 1], wedge[n:])
-        _between(corners, heights, p, q, wedge[3 + n])
-    copy_rows(wedge[3:], out[tip, 1:])
-    _wedge(wedge, out[rest : rest + 3])
-    return 31 if inside == 1 else 13
+    rotation = np.empty((3, 3))
+    rotation_kernel(orientation, rotation)
+    for n in range(24):
+        edges[n, 0] = _CUBE[n, 0]
+        for end in (1, 4):
+            for k in range(3):
+                x = position[k]
+                for axis in range(3):
+                    x += 0.5 * _CUBE[n, end + axis] * size[axis] * rotation[k, axis]
+                edges[n, end + k] = x
+    for n in range(6):
+        axis, sign = n // 2, 1.0 - 2.0 * (n % 2)
+        planes[n, 3] = 0.5 * size[axis]
+        for k in range(3):
+            planes[n, k] = sign * rotation[k, axis]
+            planes[n, 3] += planes[n, k] * position[k]
 
 
 @njit(cache=True)
-def remainder_kernel(box: Floats, planes: Floats, kept: int) -> float:
-    """Compute how much of a box lies in some boxes and in none of some others.
+def _heights(edges: Floats, plane: Floats) -> Floats:
+    """Compute how far within a plane both ends of edges are, shape (n, 2) [m]."""
+    heights = np.empty((len(edges), 2))
+    for e in range(len(edges)):
+        for end in range(2):
+            heights[e, end] = plane[3]
+            for k in range(3):
+                heights[e, end] -= plane[k] * edges[e, 1 + 3 * end + k]
+    return heights
+
+
+@njit(cache=True)
+def _cut(edges: Floats, plane: Floats, sign: float) -> Floats:
+    """Keep the part of a solid that is within a plane (sign 1), or beyond it (sign -1)."""
+    n, faces = len(edges), 0
+    for e in range(n):
+        faces = max(faces, int(edges[e, 0]) + 1)
+    heights = _heights(edges, plane)
+    crossed, hubs = np.zeros(faces, dtype=np.bool_), np.empty((faces, 3))
+    kept, count = np.empty((3 * n, 7)), 0
+    for e in range(n):
+        start, end = sign * heights[e, 0], sign * heights[e, 1]
+        if start < 0.0 and end < 0.0:
+            continue
+        here, count = count, count + 1
+        for k in range(7):
+            kept[here, k] = edges[e, k]
+        if start >= 0.0 and end >= 0.0:
+            continue
+        face, inner, outer = int(edges[e, 0]), 1, 4
+        if start < 0.0:
+            inner, outer = 4, 1
+        along = max(start, end) / (max(start, end) - min(start, end))
+        for k in range(3):
+            step = edges[e, outer + k] - edges[e, inner + k]
+            kept[here, outer + k] = edges[e, inner + k] + along * step
+        if crossed[face]:
+            for k in range(3):  # from or to the point where the face was crossed first
+                kept[count, inner + k] = kept[count + 1, outer + k] = kept[here, outer + k]
+                kept[count, outer + k] = kept[count + 1, inner + k] = hubs[face, k]
+            kept[count, 0], kept[count + 1, 0] = face, faces
+            count += 2
+        else:
+            crossed[face] = True
+            for k in range(3):
+                hubs[face, k] = kept[here, outer + k]
+    return kept[:count]
+
+
+@njit(cache=True)
+def _volume(edges: Floats) -> float:
+    """Add up the pyramids over all faces, seen from one corner [m³]."""
+    faces = 0
+    for e in range(len(edges)):
+        faces = max(faces, int(edges[e, 0]) + 1)
+    first, total, a, b, c = np.full(faces, -1), 0.0, np.empty(3), np.empty(3), np.empty(3)
+    for e in range(len(edges)):
+        face = int(edges[e, 0])
+        if first[face] < 0:
+            first[face] = e
+        for k in range(3):
+            origin = edges[0, 1 + k]
+            a[k] = edges[first[face], 1 + k] - origin
+            b[k], c[k] = edges[e, 1 + k] - origin, edges[e, 4 + k] - origin
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            total += a[i] * (b[j] * c[k] - b[k] * c[j])
+    return total / 6.0
+
+
+@njit(cache=True)
+def _apart(edges: Floats, planes: Floats) -> bool:
+    """Tell whether a plane of one solid has the whole of another one beyond it."""
+    apart = False
+    for n in range(len(planes)):
+        apart = apart or _heights(edges, planes[n]).max() <= 0.0
+    return apart
+
+
+@njit(cache=True)
+def remainder_kernel(edges: Floats, within: Floats, others: Floats) -> float:
+    """Compute how much of a solid lies within some planes and in none of some other solids.
 
     Args:
-        box: As tetrahedra, shape (5, 4, 3) [m].
-        planes: Six of each of the other boxes, shape (6 n, 4).
-        kept: How many of them, from the first on, it must lie in.
+        edges: Of the solid, shape (n, 7) [m].
+        within: Planes, shape (m, 4).
+        others: Planes of each of the others, shape (k, p, 4).
 
     Returns:
         The volume [m³].
     """
-    stack = np.empty((5 + 6 * len(planes), 4, 3))
-    at = np.zeros(len(stack), dtype=np.int64)  # the plane that comes next
-    pieces, total, least = np.empty((6, 4, 3)), 0.0, 0.0
-    for t in range(5):
-        copy_rows(box[t], stack[t])
-        least += NOTHING * _volume(box[t])
-    height = 5
-    while height > 0:
-        height -= 1
-        plane = at[height]
-        if plane == len(planes):
-            total += _volume(stack[height])
-            continue
-        must = plane // SIDES < kept
-        count = _split(stack[height], planes[plane], pieces)
-        last = plane % SIDES == SIDES - 1
-        if must or not last:  # inside all six of a box that takes away, nothing remains
-            for n in range(count % 10):
-                if _volume(pieces[n]) > least:
-                    copy_rows(pieces[n], stack[height])
-                    at[height] = plane + 1
-                    height += 1
-        if not must:
-            for n in range(count // 10):
-                if _volume(pieces[3 + n]) > least:
-                    copy_rows(pieces[3 + n], stack[height])
-                    at[height] = SIDES * (plane // SIDES + 1)
-                    height += 1
+    if _apart(edges, within):
+        return 0.0
+    for n in range(len(within)):
+        edges = _cut(edges, within[n], 1.0)
+    total = _volume(edges)
+    if total <= 0.0:
+        return 0.0
+    least, pieces = NOTHING * total, [edges]
+    for other in range(len(others)):
+        planes, left = others[other], pieces[:0]
+        for piece in pieces:
+            if _apart(piece, planes):
+                left.append(piece)
+                continue
+            inner = piece
+            for n in range(len(planes)):
+                outer = _cut(inner, planes[n], -1.0)
+                if _volume(outer) > least:
+                    left.append(outer)
+                inner = _cut(inner, planes[n], 1.0)
+        pieces = left
+    total = 0.0
+    for piece in pieces:
+        total += _volume(piece)
     return total
 
 
 @njit(cache=True)
-def _before(
-    boxes: Boxes, i: int, candidates: Floats, planes: Floats, used: int, work: Floats
-) -> int:
-    """Write the sides of those candidates that come before a box and cross it.
-
-    Args:
-        boxes: Sizes, positions and quaternions.
-        i: The box.
-        candidates: Positive for each that counts, shape (n,).
-        planes: Where to write them.
-        used: How many rows hold planes already.
-        work: Scratch of shape ``WORKSPACE``, overwritten.
-
-    Returns:
-        How many rows hold planes now.
-    """
-    sizes, positions, orientations = boxes
-    box = (sizes[i], positions[i], orientations[i])
-    least = NOTHING * sizes[i, 0] * sizes[i, 1] * sizes[i, 2]
-    for j in range(i):
-        if candidates[j] > 0.0:
-            other = (sizes[j], positions[j], orientations[j])
-            if overlap_kernel(*box, *other, work) > least:
-                _planes(*other, planes[used : used + SIDES])
-                used += SIDES
-    return used
+def overlap_kernel(
+    size_a: Floats,
+    position_a: Floats,
+    orientation_a: Floats,
+    size_b: Floats,
+    position_b: Floats,
+    orientation_b: Floats,
+) -> float:
+    """Compute the volume that two boxes share [m³]; see ``box_kernel``."""
+    edges, planes = np.empty((2, 24, 7)), np.empty((2, 6, 4))
+    box_kernel(size_a, position_a, orientation_a, edges[0], planes[0])
+    box_kernel(size_b, position_b, orientation_b, edges[1], planes[1])
+    shared = remainder_kernel(edges[0], planes[1], planes[:0])
+    most = min(size_a[0] * size_a[1] * size_a[2], size_b[0] * size_b[1] * size_b[2])
+    return float(min(shared, most))
 
 
 @njit(cache=True)
@@ -244,32 +229,20 @@ def overlap_fraction_kernel(
     Returns:
         The fraction, in [0, 1].
     """
-    blocks = (sizes, positions, orientations)
-    goals = (goal_sizes, goal_positions, goal_orientations)
-    work, tetrahedra = np.empty(WORKSPACE), np.empty((5, 4, 3))
-    planes = np.empty((SIDES * (len(sizes) + len(goal_sizes)), 4))
-    shared, others = np.empty(len(sizes)), np.ones(len(goal_sizes))
+    n, m = len(sizes), len(goal_sizes)
+    edges, planes = np.empty((n + m, 24, 7)), np.empty((n + m, 6, 4))
+    for b in range(n):  # the last one first: what comes before block and goal lies side by side
+        at = n - 1 - b
+        box_kernel(sizes[b], positions[b], orientations[b], edges[at], planes[at])
+    for g in range(m):
+        at = n + g
+        box_kernel(goal_sizes[g], goal_positions[g], goal_orientations[g], edges[at], planes[at])
     wanted, filled = 0.0, 0.0
-    for g in range(len(goal_sizes)):
-        goal = (goal_sizes[g], goal_positions[g], goal_orientations[g])
-        _planes(*goal, planes[:SIDES])
-        first = _before(goals, g, others, planes, SIDES, work)
-        if first == SIDES:
-            wanted += goal_sizes[g, 0] * goal_sizes[g, 1] * goal_sizes[g, 2]
-        else:
-            _tetrahedra(*goal, tetrahedra)
-            wanted += remainder_kernel(tetrahedra, planes[SIDES:first], _NONE)
-        for b in range(len(sizes)):
-            block = (sizes[b], positions[b], orientations[b])
-            shared[b] = overlap_kernel(*block, *goal, work)
-            if shared[b] == 0.0:
-                continue
-            used = _before(blocks, b, shared, planes, first, work)
-            if used == SIDES:
-                filled += shared[b]
-            else:
-                _tetrahedra(*block, tetrahedra)
-                filled += remainder_kernel(tetrahedra, planes[:used], _ONE)
+    for g in range(m):
+        wanted += remainder_kernel(edges[n + g], planes[n + g], planes[n : n + g])
+        for b in range(n):
+            before = planes[n - b : n + g]
+            filled += remainder_kernel(edges[n - 1 - b], planes[n + g], before)
     return min(filled / wanted, 1.0) if wanted > 0.0 else 1.0
 
 
@@ -309,6 +282,56 @@ def overlap_fraction(
     Source:
         Ahmed et al., *CausalWorld*, ICLR 2021, "fractional success".
     """
-    blocks = (rows(sizes, 3), rows(positions, 3), rows(orientations, 4))
-    goals = (rows(goal_sizes, 3), rows(goal_positions, 3), rows(goal_orientations, 4))
+    blocks = (_rows(sizes, 3), _rows(positions, 3), _rows(orientations, 4))
+    goals = (_rows(goal_sizes, 3), _rows(goal_positions, 3), _rows(goal_orientations, 4))
     return float(overlap_fraction_kernel(*blocks, *goals))
+
+
+def _corners(sizes: ArrayLike, positions: ArrayLike, orientations: ArrayLike) -> Floats:
+    """Compute the lower and the upper corner of the axis-aligned hulls, shape (2, n, 3) [m]."""
+    half, center = 0.5 * _rows(sizes, 3), _rows(positions, 3)
+    spread = np.einsum("nij,nj->ni", np.abs(rotation_matrix(_rows(orientations, 4))), half)
+    return np.stack((center - spread, center + spread))
+
+
+def aabb_overlap_fraction(
+    sizes: ArrayLike,
+    positions: ArrayLike,
+    orientations: ArrayLike,
+    goal_sizes: ArrayLike,
+    goal_positions: ArrayLike,
+    goal_orientations: ArrayLike,
+) -> float:
+    """Compute the predecessor's fraction: axis-aligned hulls instead of boxes, and no cap.
+
+    A block that is turned covers more than it fills, and a goal that is turned is larger than
+    it is. Use it only to compare with published numbers.
+
+    Args:
+        sizes: Full edge lengths of the blocks, shape (n, 3) [m].
+        positions: Centers of the blocks, shape (n, 3) [m].
+        orientations: Quaternions (x, y, z, w) of the blocks, shape (n, 4).
+        goal_sizes: As ``sizes``, of the goals, shape (m, 3) [m].
+        goal_positions: Shape (m, 3) [m].
+        goal_orientations: Shape (m, 4).
+
+    Returns:
+        The fraction, at least zero; above one where blocks share a goal. Without goals, 1.0.
+
+    Example:
+        >>> cube, here, upright = [[1.0, 1.0, 1.0]], [[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 1.0]]
+        >>> turned = [[0.0, 0.0, np.sin(np.pi / 8), np.cos(np.pi / 8)]]
+        >>> aabb_overlap_fraction(cube, here, turned, cube, here, upright)
+        1.0
+
+    Source:
+        CausalWorld 1.2, ``task_generators/base_task.py``.
+    """
+    low, high = _corners(sizes, positions, orientations)
+    goal_low, goal_high = _corners(goal_sizes, goal_positions, goal_orientations)
+    wanted = float(np.sum(np.prod(goal_high - goal_low, axis=-1)))
+    if wanted == 0.0:
+        return 1.0
+    edges = np.minimum(high[:, None], goal_high) - np.maximum(low[:, None], goal_low)
+    shared = np.prod(np.maximum(edges, 0.0), axis=-1)  # (n, m)
+    return float(np.sum(shared)) / wanted

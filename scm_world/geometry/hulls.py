@@ -1,4 +1,4 @@
-"""Convex shapes that are no boxes."""
+"""Convex polyhedra."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
-from scm_world.geometry.arrays import compact
+from scm_world.geometry.filling import remainder_kernel
 from scm_world.geometry.rotations import from_rotation_matrix, rotation_matrix
 
 Vector = tuple[float, float, float]
@@ -129,36 +129,6 @@ def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
         raise ModelError([f"{file}: {problem}" for problem in error.problems]) from error
 
 
-def box_hull(size: ArrayLike) -> Hull:
-    """Give a box as a polyhedron.
-
-    Args:
-        size: Full edge lengths, shape (3,) [m].
-
-    Example:
-        >>> box_hull([1.0, 2.0, 3.0]).volume
-        6.0
-    """
-    edges = compact(size)
-    half = 0.5 * edges
-    signs = np.array(list(product((-1.0, 1.0), repeat=3)))  # corner 4 i + 2 j + k
-    planes = np.vstack([np.column_stack([s * np.eye(3), half]) for s in (1.0, -1.0)])
-    faces = []
-    for axis, step in enumerate((4, 2, 1)):
-        along, across = ((2, 1), (1, 4), (4, 2))[axis]
-        low = (0, across, along + across, along)
-        high = (step, step + along, step + along + across, step + across)
-        faces += [(p, q, r) for p, *fan in (low, high) for q, r in pairwise(fan)]
-    squares = edges**2
-    return Hull(
-        tuple(map(tuple, (signs * half).tolist())),
-        tuple(faces),
-        tuple(map(tuple, planes.tolist())),
-        float(np.prod(edges)),
-        tuple(((squares.sum() - squares) / 12.0).tolist()),
-    )
-
-
 def extents(hull: Hull) -> Floats:
     """Measure the box around a polyhedron in its own frame, shape (3,) [m]."""
     size: Floats = np.ptp(np.array(hull.vertices), axis=0)
@@ -175,9 +145,6 @@ def hull_overlap(
 ) -> float:
     """Compute the volume that two convex polyhedra share, exact to rounding.
 
-    It takes milliseconds: a linear program for a point inside both, and the hull of the corners of
-    what their half-spaces share.
-
     Args:
         hull_a: The first one.
         position_a: Its center of mass, shape (3,) [m].
@@ -190,35 +157,18 @@ def hull_overlap(
         The volume [m³], at least zero and at most that of the smaller one.
 
     Example:
-        >>> cube, upright = box_hull([1.0, 1.0, 1.0]), [0.0, 0.0, 0.0, 1.0]
+        >>> cube, upright = hull_of(np.indices((2, 2, 2)).reshape(3, 8).T), [0.0, 0.0, 0.0, 1.0]
         >>> round(hull_overlap(cube, [0.0, 0.0, 0.0], upright, cube, [0.5, 0.0, 0.0], upright), 9)
         0.5
     """
-    center, scale = np.asarray(position_b, dtype=np.float64), float(extents(hull_b).max())
-    normals, offsets, corners = [], [], []
-    for hull, position, orientation in (
-        (hull_a, position_a, orientation_a),
-        (hull_b, position_b, orientation_b),
-    ):
-        turn, planes = rotation_matrix(orientation).T, np.array(hull.planes)
-        shift = (np.asarray(position) - center) / scale
-        normals.append(planes[:, :3] @ turn)
-        offsets.append(planes[:, 3] / scale + normals[-1] @ shift)
-        corners.append(np.array(hull.vertices) @ turn / scale + shift)
-    for one, other in ((0, 1), (1, 0)):
-        if (normals[one] @ corners[other].T >= offsets[one][:, None] - THINNEST**2).all(1).any():
-            return 0.0
-    from scipy.optimize import linprog  # takes a fifth of a second
-    from scipy.spatial import ConvexHull, HalfspaceIntersection
-
-    sides = np.column_stack([np.vstack(normals), -np.concatenate(offsets)])
-    ball = np.column_stack([sides[:, :3], np.ones(len(sides))])  # the largest one that fits
-    found = linprog([0.0, 0.0, 0.0, -1.0], ball, -sides[:, 3], bounds=[(None, None)] * 4)
-    if found.x[3] <= THINNEST**2:
-        return 0.0
-    shared = HalfspaceIntersection(sides, found.x[:3]).intersections
-    volume = float(ConvexHull(shared).volume) * scale**3
-    return min(volume, hull_a.volume, hull_b.volume)
+    world = np.array(hull_a.vertices) @ rotation_matrix(orientation_a).T + np.asarray(position_a)
+    corners = (world - np.asarray(position_b)) @ rotation_matrix(orientation_b)
+    faces = np.array(hull_a.faces)
+    edges = np.empty((len(faces), 3, 7))
+    edges[:, :, 0] = np.arange(len(faces))[:, None]
+    edges[:, :, 1:4], edges[:, :, 4:] = corners[faces], corners[np.roll(faces, -1, axis=1)]
+    shared = remainder_kernel(edges.reshape(-1, 7), np.array(hull_b.planes), np.empty((0, 0, 4)))
+    return float(min(shared, hull_a.volume, hull_b.volume))
 
 
 def _polyhedron(cloud: Floats) -> tuple[Floats, Integers, Floats]:

@@ -123,20 +123,12 @@ def rotation_matrix(quaternion: ArrayLike) -> Floats:
         >>> rotation_matrix([0.0, 0.0, 1.0, 0.0]) @ [1.0, 0.0, 0.0]
         array([-1.,  0.,  0.])
     """
-    given = np.asarray(quaternion, dtype=np.float64)
-    x, y, z, w = _components(given)
-    scale = 2.0 / _squared_norm(given)[..., 0]
-    matrix = np.empty((*given.shape[:-1], 3, 3))
-    matrix[..., 0, 0] = 1.0 - scale * (y * y + z * z)
-    matrix[..., 0, 1] = scale * (x * y - z * w)
-    matrix[..., 0, 2] = scale * (x * z + y * w)
-    matrix[..., 1, 0] = scale * (x * y + z * w)
-    matrix[..., 1, 1] = 1.0 - scale * (x * x + z * z)
-    matrix[..., 1, 2] = scale * (y * z - x * w)
-    matrix[..., 2, 0] = scale * (x * z - y * w)
-    matrix[..., 2, 1] = scale * (y * z + x * w)
-    matrix[..., 2, 2] = 1.0 - scale * (x * x + y * y)
-    return matrix
+    given = np.array(quaternion, dtype=np.float64, order="C")
+    _components(given)
+    _squared_norm(given)
+    matrices = np.empty((*given.shape[:-1], 3, 3))
+    _rotations(given.reshape(-1, 4), matrices.reshape(-1, 3, 3))
+    return matrices
 
 
 def from_rotation_matrix(matrix: ArrayLike) -> Floats:
@@ -211,34 +203,13 @@ def to_rotation_vector(quaternion: ArrayLike) -> Floats:
     return vector
 
 
-def angle_between(p: ArrayLike, q: ArrayLike) -> Floats:
+@njit(cache=True)
+def angle_between(p: Floats, q: Floats) -> float:
     """Measure the angle of the rotation that leads from one orientation to the other.
 
     Args:
-        p: Shape (..., 4), of any length and sign.
-        q: Shape (..., 4), broadcast against ``p``.
-
-    Returns:
-        Shape (...) [rad], in [0, pi].
-
-    Example:
-        >>> angle_between([0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, -1.0]).item()
-        0.0
-    """
-    conjugate = np.asarray(p, dtype=np.float64) * (-1.0, -1.0, -1.0, 1.0)
-    turn = quaternion_product(conjugate, q)
-    sine = np.sqrt(np.sum(turn[..., :3] ** 2, axis=-1))
-    angle: Floats = 2.0 * np.arctan2(sine, np.abs(turn[..., 3]))
-    return angle
-
-
-@njit(cache=True)
-def angle_between_kernel(p: Floats, q: Floats) -> float:
-    """Measure the angle between two orientations, as ``angle_between`` does.
-
-    Args:
-        p: Quaternion, shape (4,).
-        q: Quaternion, shape (4,).
+        p: Quaternion of any length and sign, shape (4,).
+        q: The same.
 
     Returns:
         The angle [rad], in [0, pi].
@@ -270,3 +241,9 @@ def rotation_kernel(quaternion: Floats, matrix: Floats) -> None:
     matrix[2, 0] = scale * (x * z - y * w)
     matrix[2, 1] = scale * (y * z + x * w)
     matrix[2, 2] = 1.0 - scale * (x * x + y * y)
+
+
+@njit(cache=True)
+def _rotations(quaternions: Floats, matrices: Floats) -> None:
+    for n in range(len(quaternions)):
+        rotation_kernel(quaternions[n], matrices[n])

@@ -1,6 +1,6 @@
 """A backend-free description of any system: what moves, what can be set, what can be commanded."""
 
-from scm_world.models.model import Input, Model, Parameter, Readout, Row, StateRow
+from scm_world.models.model import Model, Parameter, Readout, Row, StateRow
 from scm_world.models.scene import (
     Difference,
     GoalRegion,
@@ -18,7 +18,6 @@ from scm_world.models.scene import (
 __all__ = [
     "Difference",
     "GoalRegion",
-    "Input",
     "Light",
     "Model",
     "Parameter",

@@ -62,20 +62,28 @@ class Parameter(Row):
     """A property of an element that holds until it is set again.
 
     Attributes:
-        key: The element and the property, as backends know it.
-        slot: For a binding: finds where the value is written, given MuJoCo's model and data; it can
-            be pickled. None for a field of the compiled model, which is found by its key.
+        slot: Finds where the value stands, given MuJoCo's model and data; it can be pickled. None
+            for what cannot be written.
         kind: ``"real"``, ``"rotation"`` (unit quaternion), ``"inertia"`` (principal moments, which
             obey the triangle inequality) or ``"switch"`` (0 or 1).
         visual: Whether it acts on pictures only.
         body: Number of the body whose mass, place or shape it belongs to; -1 if to none.
+        usual: Whether it is exposed unless something else is asked for.
+        refusal: Why it cannot be set, to be read after its name; empty if it can.
     """
 
-    key: ParameterKey = ("", "")
-    slot: Callable[[Any, Any], Any] | None = field(default=None, repr=False)
+    slot: Callable[[Any, Any], Any] | None = field(default=None, repr=False, compare=False)
     kind: Literal["real", "rotation", "inertia", "switch"] = "real"
     visual: bool = False
     body: int = -1
+    usual: bool = True
+    refusal: str = ""
+
+    @property
+    def key(self) -> ParameterKey:
+        """The element and the property, as backends know it."""
+        element, _, attribute = self.name.rpartition(".")
+        return element, attribute
 
 
 @final
@@ -103,12 +111,6 @@ class StateRow(Row):
     def reported(self) -> bool:
         """Whether the engine computes it in every step, so that it cannot be set."""
         return self.array == REPORTED
-
-
-@final
-@dataclass(frozen=True)
-class Input(Row):
-    """A number that a controller decides. Its bounds are the range of the actuator."""
 
 
 @final
@@ -164,7 +166,7 @@ class Model:
         timestep: Physics step [s].
         parameters: What can be set and holds.
         states: What moves, in the order of the state vector.
-        inputs: The components of a command, in order.
+        inputs: The components of a command, in order; their bounds are the ranges of actuators.
         readouts: What follows at lag 0 from the others; those that were asked for.
         trees: Names of the kinematic trees (bodies with one root), by number.
         refused: What cannot be set or exposed, by name, with the reason.
@@ -185,7 +187,7 @@ class Model:
     timestep: float
     parameters: tuple[Parameter, ...]
     states: tuple[StateRow, ...]
-    inputs: tuple[Input, ...]
+    inputs: tuple[Row, ...]
     readouts: tuple[Readout, ...] = ()
     trees: tuple[str, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
@@ -232,23 +234,20 @@ class Model:
         return tuple(body.name for body in self.bodies)
 
     def empty_state(self) -> State:
-        """Give a state to read into."""
+        """Return a state to read into."""
         return State(self.layout)
 
     def default_scene(self) -> Scene:
-        """Give the scene in which every parameter and every state has its default."""
+        """Return the scene in which every parameter and every state has its default."""
         return Scene(self, self.default_parameters(), self.empty_state())
 
+    def slots(self, mj: Any, data: Any) -> dict[ParameterKey, Any]:
+        """Find the places of all parameters in MuJoCo's model and data."""
+        return {row.key: row.slot(mj, data) for row in self.parameters if row.slot is not None}
+
     def default_parameters(self) -> dict[ParameterKey, Any]:
-        """Give the default of every parameter, by key."""
+        """Return the default of every parameter, by key."""
         return {
             row.key: np.array(np.broadcast_to(row.default, row.shape), dtype=np.float64)
             for row in self.parameters
         }
-
-    def carried(self, state: State, before: Scene) -> None:
-        """Copy the states that another structure has too, from a scene of it into a state."""
-        there = before.state.layout.slices
-        for name, where in self.layout.slices.items():
-            if name in there:
-                state.vector[where] = before.state.vector[there[name]]

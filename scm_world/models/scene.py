@@ -73,20 +73,27 @@ class State:
         return self.with_vector(self.vector.copy())
 
     def with_vector(self, vector: Floats) -> Self:
-        """Give a state of the same layout with other numbers."""
+        """Return a state of the same layout with other numbers."""
         other = object.__new__(type(self))
         other.layout, other.vector = self.layout, vector
         return other
 
     def __getitem__(self, name: str) -> Floats:
-        """Give one state by its name, as a view."""
+        """Return one state by its name, as a view."""
         return self.vector[self.layout.slices[name]]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.layout.names)
 
+    def carry(self, before: State) -> None:
+        """Copy the states that another one has, too: of one name and one size."""
+        there = before.layout.slices
+        for name, where in self.layout.slices.items():
+            if name in there and there[name].stop - there[name].start == where.stop - where.start:
+                self.vector[where] = before.vector[there[name]]
+
     def coincides(self, other: State) -> bool:
-        """Tell whether all numbers that can be set are the same."""
+        """Return whether all numbers that can be set are the same."""
         same = self.vector == other.vector
         return bool((same if same.all() else same | ~self.layout.can_be_set).all())
 
@@ -140,13 +147,10 @@ class Structure(Protocol):
         """Layout of the state; a ``StateLayout``."""
 
     def empty_state(self) -> Any:
-        """Give a state to read into; a ``State``."""
+        """Return a state to read into; a ``State``."""
 
     def default_scene(self) -> Scene:
-        """Give the scene in which every parameter and every state has its default."""
-
-    def carried(self, state: State, before: Scene) -> None:
-        """Copy the states that another structure has too, from a scene of it into a state."""
+        """Return the scene in which every parameter and every state has its default."""
 
 
 @final
@@ -296,5 +300,5 @@ def complete(now: Scene, structure: Structure, difference: Difference) -> Differ
     state = difference.state
     if state is None:
         state = default.state
-        structure.carried(state, now)
+        state.carry(now.state)
     return Difference(structure, {**default.parameters, **stays, **difference.parameters}, state)

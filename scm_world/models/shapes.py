@@ -154,7 +154,7 @@ class Shapes(NamedTuple):
         ]
 
     def joined(self, others: Shapes) -> Shapes:
-        """Put other shapes behind these."""
+        """Return these shapes, then others."""
         n = len(self.moves)
         columns = zip(self.table, others.table, strict=True)
         return Shapes(

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar, final
 from weakref import WeakKeyDictionary
 
+from scm_world.backends.base import EngineBatch
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.equations import Equations, Layout
@@ -38,7 +39,7 @@ class Twins:
 
     def __init__(self, world: Simulation) -> None:
         self._build, (self._kind, self.task, self.options, _), *_ = world.__reduce__()
-        self.batches = world.backend.capabilities.batch
+        self.batches = world.backend.batch is not EngineBatch
         self._clear()
 
     def _clear(self) -> None:
@@ -89,7 +90,7 @@ class Twins:
             finally:
                 for world in worlds:
                     if world.has_begun:
-                        world.backend.state()  # it comes back, and the batch can be forgotten
+                        world.backend.read()  # it comes back, and the batch can be forgotten
                 self._members = worlds + self._members
 
     @property

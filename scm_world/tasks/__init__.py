@@ -7,10 +7,14 @@ from collections.abc import Iterable
 from typing import Any, TypeVar
 
 from scm_world._arguments import enter
+from scm_world.errors import UnknownOption, blamed
+from scm_world.graph import SCM
 from scm_world.tasks.base import TIME, Conventions, Goal, Observation, Observed, Task, Timing
-from scm_world.tasks.model import ModelTask, model_task
+from scm_world.tasks.factories import is_model, load_factory
+from scm_world.tasks.model import ModelTask
 from scm_world.tasks.rewards import Common, term
 from scm_world.tasks.step import StepTask
+from scm_world.tasks.trifinger import platform as _platform  # noqa: F401 # registers its backend
 from scm_world.tasks.trifinger.base import HEAD, Building, TriFingerTask
 from scm_world.tasks.trifinger.conventions import CONVENTIONS
 from scm_world.tasks.trifinger.general import General
@@ -74,7 +78,7 @@ def register(kind: Kind) -> Kind:
 
 
 def tasks() -> dict[str, type[Task]]:
-    """Give all tasks that ``make_task`` knows: of this package, then those registered."""
+    """Return all tasks that ``make_task`` knows: of this package, then those registered."""
     return {**TASKS, **_REGISTERED}
 
 
@@ -82,17 +86,32 @@ def make_task(name: str, **options: Any) -> Task:
     """Create a registered task, or that of a model.
 
     Args:
-        name: One of ``tasks()``, a path to an MJCF or URDF file, or ``"module:function"`` for a
-            function that gives a task.
+        name: One of ``tasks()``, XML text, a path to an MJCF or URDF file, or
+            ``"module:function"`` for a function (of a module or a Python file) that returns a task
+            or a model.
         options: Arguments of its constructor.
 
     Raises:
         UnknownOption: There is no such task.
+        FunctionFailure: The function, or its module, raised an error.
     """
-    task = tasks().get(name)
-    if task is None:
-        return model_task(name, options, tasks)
-    return task(**options)
+    if name in (known := tasks()):
+        return known[name](**options)
+    if is_model(name):
+        return ModelTask(name, **options)
+    made = None
+    if ":" in name:
+        factory = load_factory(name)
+        with blamed(name):
+            made = factory(**options)
+        made = getattr(made, "task", made)  # of a world
+    if isinstance(made, SCM) or name.endswith(".json"):
+        commands = "discover, verify, graph, variables, effect, counterfactual or collect"
+        allowed = ("a function that gives a task, a model or a world", commands)
+        raise UnknownOption("command for a causal model without a backend", name, allowed)
+    if ":" in name:
+        return made if isinstance(made, Task) else ModelTask(made)
+    raise UnknownOption("task", name, (*known, "file.xml", "file.urdf", "module:function"))
 
 
 __all__ = [

@@ -294,7 +294,6 @@ class Task(ABC):
         decided_by: The shared variables that decide which entities there are.
         plan: The structure, from ``arrange``; None where that is always the same.
         absent: Entities that an intervention took away.
-        refused: Names that are not variables, each with the reason.
         n_actions: Number of components of an action, where it is the same in every mode.
         policies: Scripted policies of the task, by name.
         training: Fields of its learning recipe, such as ``{"steps": 200_000}``; those of an
@@ -325,7 +324,6 @@ class Task(ABC):
     decided_by: ClassVar[tuple[str, ...]] = ()
     plan: Hashable = None
     absent: frozenset[str] = frozenset()
-    refused: Mapping[str, str] = {}  # a constant
     n_actions: ClassVar[int | None] = None
     policies: ClassVar[Mapping[str, Callable[[], Any]]] = {}
     training: ClassVar[Mapping[str, Any]] = {}

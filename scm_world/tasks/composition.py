@@ -6,7 +6,8 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from functools import cached_property
+from typing import Any
 
 from numba import njit
 
@@ -22,7 +23,7 @@ from scm_world.models import (
     Structure,
 )
 from scm_world.models.camera import Camera
-from scm_world.models.scene import Overlap
+from scm_world.models.scene import TOLERANCE, Overlap
 from scm_world.variables import Box, Function, Integers, Measured, Parent, Variable
 from scm_world.variables.reserved import CONTROL_INDEX
 
@@ -37,7 +38,7 @@ class Entity:
             parents are those that act when something is set, and physics adds the others.
         parameters: The variables that set a physical parameter, each with which one.
         actions: What acts through commands, with the states that it acts on in every step.
-        kind: ``"block"``, ``"obstacle"`` or ``"goal"``: these can be taken away; else empty.
+        kind: What it is, such as ``"goal"``, where it can be taken away; else empty.
         hull: The shape of a block or goal that is not a box.
         shape: The shape of a goal without a hull: ``"box"`` or ``"sphere"``.
     """
@@ -46,7 +47,7 @@ class Entity:
     variables: tuple[Variable, ...]
     parameters: Mapping[str, ParameterKey] = field(default_factory=dict)
     actions: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    kind: Literal["", "block", "obstacle", "goal"] = ""
+    kind: str = ""
     hull: Hull | None = None
     shape: str = "box"
 
@@ -54,17 +55,17 @@ class Entity:
 class Commands(ABC):
     """The conversion of an action into a command of the backend, where they differ."""
 
-    @abstractmethod
     def applies(self, values: Values) -> bool:
-        """Tell whether it is needed, given the values of everything that physics does not move."""
+        """Return whether it is needed, given the values of all that physics does not move."""
+        return True
 
     @abstractmethod
     def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
-        """Give the command of one control step.
+        """Return the command of one control step.
 
         Args:
             action: All action variables, shape (n_actions,).
-            values: Of everything that physics does not move.
+            values: Those of everything that physics does not move.
             vector: The state.
             key: Where in the noise this control step draws.
 
@@ -73,44 +74,47 @@ class Commands(ABC):
         """
 
 
-class Composition(ABC):
-    """What the variables of a world mean to a backend: where causal and physical column meet.
+class Composition:
+    """What the variables of a world mean to a backend: rows of the tables of its system.
+
+    Args:
+        system: A ``Model`` or a ``StepModel``.
+        commands: What turns an action into a command; None where they are the same.
 
     Attributes:
+        system: Its tables of parameters, states and bodies.
+        commands: As above.
         entities: In the order of the observation.
-        blocks: Names of the movable blocks.
-        obstacles: Names of the obstacles.
-        hulls: The blocks that are no boxes.
+        bodies: Names of the bodies that can come and go. Their variables begin with these names.
+        hides_goals: Whether something that never moves may make goals impossible.
         solid: Whether no episode may begin with two bodies in one place.
-        commands: What turns an action into a command; None where they are the same.
     """
 
-    entities: tuple[Entity, ...] = ()
-    blocks: tuple[str, ...] = ()
-    obstacles: tuple[str, ...] = ()
-    hulls: tuple[tuple[str, Hull], ...] = ()
-    solid: bool = False
+    system: Any
     commands: Commands | None = None
+    entities: tuple[Entity, ...] = ()
+    bodies: tuple[str, ...] = ()
+    hides_goals: bool = False
+    solid: bool = False
 
-    @abstractmethod
+    def __init__(self, system: Any, commands: Commands | None = None) -> None:
+        self.system, self.commands = system, commands
+
     def structure(self, values: Values) -> Structure:
-        """Say what the backend has to compile; equal values give the same object."""
+        """Return what the backend has to compile; equal values give the same object."""
+        found: Structure = self.system
+        return found
 
-    @abstractmethod
     def parameters(self) -> Mapping[str, ParameterKey]:
-        """Say which variable sets which physical parameter."""
+        """Map variables to the physical parameters that they set."""
+        return {row.name: row.key for row in self.system.parameters}
 
-    @abstractmethod
-    def slices(self) -> Mapping[str, slice]:
-        """Say where each state stands in the state vector."""
+    @cached_property
+    def _meant(self) -> frozenset[tuple[int, int]]:
+        """The shapes that lie in one another in the pose of the file: they are meant to."""
+        from scm_world.backends.mujoco.overlaps import touching
 
-    @abstractmethod
-    def empty_state(self) -> Any:
-        """Return a state to read into; it is the same in every structure."""
-
-    def timestep(self, values: Values) -> float:
-        """Give the physics step [s]."""
-        return float(self.structure(values).timestep)
+        return touching(self.system.default_scene(), TOLERANCE)
 
     def overlaps(
         self,
@@ -121,16 +125,23 @@ class Composition(ABC):
     ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance.
 
+        Not listed are shapes that do so in the pose of the file.
+
         Args:
             scene: With complete parameters.
             tolerance: How deep is too deep [m]; what the task allows if None.
             asked: The variables that an intervention is on.
             enough: Where some lie deeper than this in one another, those alone may be listed [m].
         """
-        return ()
+        if not self.system.bodies:
+            return ()
+        from scm_world.backends.mujoco.overlaps import overlaps
 
-    def thin(self, candidates: Any, limit: float) -> None:  # noqa: B027 # may leave all
-        """Leave out candidates of which it is seen at once that they put bodies in one place.
+        tolerance = TOLERANCE if tolerance is None else tolerance
+        return overlaps(scene, tolerance, self._meant, max(enough, tolerance))
+
+    def thin(self, candidates: Any, limit: float) -> None:
+        """Leave out candidates that obviously put bodies in one place.
 
         Args:
             candidates: Draws of an intervention, with ``parameter``, ``state`` and ``keep``.
@@ -146,12 +157,19 @@ class Composition(ABC):
         return ()
 
     def touched(self) -> Mapping[str, tuple[str, ...]]:
-        """Map each body, as contacts name it, to the states that move it; none if it is fixed."""
-        return {}
+        """Map each body, as contacts name it, to the states of its tree; none if it is fixed."""
+        states = dict[int, list[str]]()
+        for row in self.system.states if self.system.bodies else ():
+            for tree in row.trees:
+                states.setdefault(tree, []).append(row.name)
+        return {body.name: (*states.get(body.tree, ()),) for body in self.system.bodies}
 
     def shaped(self) -> Mapping[str, str]:
         """Map parameters to the body whose contacts they shape, as far as that is known."""
-        return {}
+        if not self.system.bodies:
+            return {}
+        names = self.system.body_names
+        return {row.name: names[row.body] for row in self.system.parameters if row.body >= 0}
 
     def goals(self, values: Values) -> tuple[GoalRegion, ...]:
         """Describe all goals."""

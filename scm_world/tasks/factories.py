@@ -12,16 +12,20 @@ from typing import Any
 
 from scm_world.errors import FunctionFailure, UnknownOption, blamed
 from scm_world.graph import SCM
-from scm_world.tasks.model import is_model
 
+FILES = (".xml", ".mjcf", ".urdf")
+"""How the names of files end that are models."""
 OWN_TASKS = ("scm_world.tasks.model:ModelTask",)
 """What a file may name as its task in addition to registered ones: it reads a model."""
 
 
-def load_factory(reference: str) -> Callable[..., Any]:
-    """Import a function; of a causal model, return one that returns it.
+def is_model(source: str) -> bool:
+    """Return whether a text is that of a model, or names a file that is one."""
+    return source.lstrip().startswith("<") or source.lower().endswith(FILES)
 
-    Arguments and errors are those of ``load_named``.
+
+def load_factory(reference: str) -> Callable[..., Any]:
+    """Import a function, as ``load_named`` does; for a causal model, return one that returns it.
 
     Raises:
         UnknownOption: It is neither.

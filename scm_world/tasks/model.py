@@ -5,22 +5,20 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
-from functools import cached_property
-from typing import Any, Self, final
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping
+from typing import Any, Self
 
 import numpy as np
 from numba import njit
 
 from scm_world._types import Floats
 from scm_world.backends import Backend, read_model
-from scm_world.errors import UnknownOption, blamed
+from scm_world.errors import UnknownOption
 from scm_world.geometry import chains
-from scm_world.graph import SCM
-from scm_world.models import Model, ParameterKey, Readout, Row, State
-from scm_world.models.scene import TOLERANCE, Overlap, Scene
+from scm_world.models import Model, Readout, Row
 from scm_world.tasks.base import Goal, Observation, Observed, Task, Timing
-from scm_world.tasks.composition import Composition, clock
+from scm_world.tasks.composition import Commands, Composition, clock
 from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
 from scm_world.variables import (
     Action,
@@ -41,8 +39,6 @@ CONTROL_DT = 0.02
 """Length of a control step where none is asked for [s], to the next whole physics step."""
 
 REWARD = "reward"
-FILES = (".xml", ".mjcf", ".urdf")
-"""How the names of files end that are models."""
 START = "start"
 """What is drawn for the beginning of an episode is ``"<state>.start"``."""
 
@@ -50,75 +46,8 @@ _OVERRIDES = ("a", "b", "bounds", "default", "distribution", "doc")
 
 
 def same_value(value: Any) -> Any:
-    """Give the value itself."""
+    """Return the value itself."""
     return value
-
-
-@final
-class ModelComposition(Composition):
-    """What the variables of a model mean to a backend: rows of its tables.
-
-    Args:
-        model: The system.
-    """
-
-    def __init__(self, model: Model) -> None:
-        self._model = model
-
-    @cached_property
-    def _meant(self) -> frozenset[tuple[int, int]]:
-        """The shapes that lie in one another in the pose of the file: they are meant to."""
-        from scm_world.backends.mujoco.overlaps import touching
-
-        return touching(self._model.default_scene(), TOLERANCE)
-
-    def overlaps(
-        self,
-        scene: Scene,
-        tolerance: float | None = None,
-        asked: Iterable[str] = (),
-        enough: float = math.inf,
-    ) -> tuple[Overlap, ...]:
-        """List the bodies that lie deeper in one another than a tolerance [m].
-
-        Not listed are shapes that do so in the pose of the file. Nothing is listed of a model that
-        describes no bodies.
-        """
-        if not self._model.bodies:
-            return ()
-        from scm_world.backends.mujoco.overlaps import overlaps
-
-        tolerance = TOLERANCE if tolerance is None else tolerance
-        return overlaps(scene, tolerance, self._meant, max(enough, tolerance))
-
-    def structure(self, values: Mapping[str, Any]) -> Model:
-        """Give the model: it is compiled once."""
-        return self._model
-
-    def parameters(self) -> Mapping[str, ParameterKey]:
-        """Say which variable sets which physical parameter."""
-        return {row.name: row.key for row in self._model.parameters}
-
-    def slices(self) -> Mapping[str, slice]:
-        """Say where each state stands in the state vector."""
-        return self._model.layout.slices
-
-    def empty_state(self) -> State:
-        """Give a state to read into."""
-        return self._model.empty_state()
-
-    def touched(self) -> Mapping[str, tuple[str, ...]]:
-        """Map each body to the states of its tree; none if the model describes no bodies."""
-        model, states = self._model, dict[int, list[str]]()
-        for row in model.states:
-            for tree in row.trees:
-                states.setdefault(tree, []).append(row.name)
-        return {body.name: (*states.get(body.tree, ()),) for body in model.bodies}
-
-    def shaped(self) -> Mapping[str, str]:
-        """Map the parameters of bodies and shapes to the body."""
-        names = self._model.body_names
-        return {row.name: names[row.body] for row in self._model.parameters if row.body >= 0}
 
 
 class DeclaredTask(Task):
@@ -127,7 +56,7 @@ class DeclaredTask(Task):
     Every argument can also be an attribute of a class of your own.
 
     Args:
-        kind: Whose options there are in addition to those of this class.
+        kind: The class whose options there are in addition to those of this class.
         settings: Values of options.
 
     Raises:
@@ -135,6 +64,7 @@ class DeclaredTask(Task):
     """
 
     system: Any
+    commands: Commands | None = None
 
     outcomes: Iterable[Any] = ()
     reward: Any = None
@@ -155,21 +85,41 @@ class DeclaredTask(Task):
 
     @classmethod
     def options(cls) -> tuple[str, ...]:
-        """Name the options, without the first argument."""
+        """Return the names of the options, without the first argument."""
         _, *own = cls.__annotations__
-        _, *shared = DeclaredTask.__annotations__
+        _, _, *shared = DeclaredTask.__annotations__
         return (*own, *shared, "name")
-
-    def counted(self) -> list[Variable]:
-        """Declare reward, success and the end, as far as they are given."""
-        given = {name: getattr(self, name) for name in (REWARD, SUCCESS, TERMINATED)}
-        return [declared(name, one) for name, one in given.items() if one is not None]
 
     @property
     def observation(self) -> Observation:
         """The states, or the variables of ``observe``."""
         names = self.system.layout.names if self.observe is None else tuple(self.observe)
         return Observation(tuple(Observed(name, (-np.inf, np.inf)) for name in names))
+
+    @abstractmethod
+    def quantities(self) -> Iterable[Variable]:
+        """Declare parameters, actions and states."""
+
+    def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
+        """Declare the quantities of the system, and what counts.
+
+        Raises:
+            UnknownOption: Something that is not a variable is to be observed.
+        """
+        index, _ = clock(timing.steps, timing.control_period)
+        if self.commands is not None:  # noise goes by the control step: setting that is no cause
+            index = index.model_copy(update={"settable_state": False, "parents": ()})
+        own = (one for one in self.outcomes if not isinstance(one, str))
+        counted = {name: getattr(self, name) for name in (REWARD, SUCCESS, TERMINATED)}
+        variables = [
+            *(*self.quantities(), index, *map(_readout, self.system.readouts), *own),
+            *(declared(name, given) for name, given in counted.items() if given is not None),
+        ]
+        known = [variable.name for variable in variables]
+        for name in self.observe or ():
+            if name not in known:
+                raise UnknownOption("observe", name, known)
+        return Composition(self.system, self.commands), variables
 
 
 class ModelTask(DeclaredTask):
@@ -330,7 +280,9 @@ class ModelTask(DeclaredTask):
     def on(self, backend: Backend) -> Self:
         """Give the same task with the parameters that a backend has."""
         kept = tuple(
-            row for row in self.system.parameters if backend.supports(self.system, row.key)
+            row
+            for row in self.system.parameters
+            if backend.capabilities.supports(self.system, row.key)
         )
         if len(kept) == len(self.system.parameters):
             return self
@@ -342,68 +294,58 @@ class ModelTask(DeclaredTask):
         other.spaces = {name: given for name, given in self.spaces.items() if name not in gone}
         return other
 
-    @property
-    def refused(self) -> Mapping[str, str]:  # type: ignore[override] # it follows from the model
-        """Fields of the model that cannot be set, each with the reason."""
-        return dict(self.system.refused)
-
     def idle(self, world: Any) -> Floats:
         """Return the controls of the keyframe; zero, or what is nearest to it, if there is none."""
         start = [row.default for row in self.system.inputs]
         return np.asarray(np.clip(start, world.action_low, world.action_high))
 
-    def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
-        """Declare what the tables have, and what counts."""
+    def quantities(self) -> Iterable[Variable]:
+        """Declare what the tables of the model have."""
         system, ties = self.system, {variable.name: variable for variable in self.ties}
         parameters: list[Variable] = [
             self._tie(ties.pop(row.name), row) if row.name in ties else self._parameter(row)
             for row in system.parameters
         ]
+        yield from (*ties.values(), *parameters)
         actions = [self._action(row) for row in system.inputs]
-        together = [bundle("action", actions, doc="All controls.")] if len(actions) > 1 else []
-        seen = (row for row in system.parameters if not row.visual)
-        moving = (row for row in system.states if not row.reported)
-        effects = {row.name: (row.always, row.contact) for row in (*seen, *moving, *system.inputs)}
+        yield from actions
+        if len(actions) > 1:
+            yield bundle("action", actions, doc="All controls.")
+        acting = (
+            *(row for row in system.parameters if not row.visual),
+            *(row for row in system.states if not row.reported),
+            *system.inputs,
+        )
+        effects = {row.name: (row.always, row.contact) for row in acting}
         causes = causes_of(effects, {row.trees for row in system.states})
-        states: list[Variable] = []
         for row in system.states:
-            states += self._state(row, causes[row.trees])
-        index, _ = clock(timing.steps, timing.control_period)
-        readouts = [_readout(row) for row in system.readouts]
-        own = [one for one in self.outcomes if not isinstance(one, str)]
-        variables = [
-            *ties.values(), *parameters, *actions, *together, *states, index, *readouts, *own,
-            *self.counted(),
-        ]  # fmt: skip
-        check_observed(self.observe, variables)
-        return ModelComposition(system), variables
+            default = self.spaces.get(row.name, {}).get("default", row.default)
+            state = Measured(
+                **self._fields(row, row.kind),
+                default=_numbers(f"spaces[{row.name!r}]['default']", default, row.shape),
+                parents=Coupled(*causes[row.trees], ()),
+                settable_state=not row.reported,
+            )
+            yield from beginning(state, self.start.get(row.name))
 
     def _fields(self, row: Row, kind: str = "real") -> dict[str, Any]:
-        """Give what all kinds of declarations have in common, with what was asked for."""
-        given, where = dict(self.spaces.get(row.name, {})), f"spaces[{row.name!r}]"
-        low, high = (np.broadcast_to(end, row.shape) for end in (row.low, row.high))
-        bounded = bool(np.isfinite(low).any() or np.isfinite(high).any())
-        bounds = (
-            Rotations(keeps_sign=True)
-            if kind == "rotation"
-            else Integers(0, 1)
-            if kind == "switch"
-            else Box(row.low, row.high)
-            if bounded
-            else None
-        )
-        fields: dict[str, Any] = {
+        """Return what all kinds of declarations have in common, with what was asked for."""
+        given, where = self.spaces.get(row.name, {}), f"spaces[{row.name!r}]"
+        limited = np.isfinite(row.low).any() or np.isfinite(row.high).any()
+        box = Box(row.low, row.high) if limited else None
+        special = {"rotation": Rotations(keeps_sign=True), "switch": Integers(0, 1)}
+        bounds: Any = special.get(kind, box)
+        within = _space(f"{where}['bounds']", given.get("bounds", bounds), row.shape, bounds)
+        return {
             "name": row.name,
             "dtype": "integer" if kind == "switch" else "real",
             "unit": row.unit,
             "shape": row.shape,
             "doc": given.get("doc", row.doc),
-            "bounds": _space(f"{where}['bounds']", given.get("bounds", bounds), row.shape, bounds),
+            "bounds": within,
+            "a": _space(f"{where}['a']", given.get("a"), row.shape, within),
+            "b": _space(f"{where}['b']", given.get("b"), row.shape, within),
         }
-        for name in ("a", "b"):
-            option = f"{where}[{name!r}]"
-            fields[name] = _space(option, given.get(name), row.shape, fields["bounds"])
-        return fields
 
     def _parameter(self, row: Any) -> Exogenous:
         given = self.spaces.get(row.name, {})
@@ -428,17 +370,6 @@ class ModelTask(DeclaredTask):
                 f"spaces={{{row.name!r}: {{'bounds': (low, high)}}}}."
             )
         return Action(**fields)
-
-    def _state(self, row: Any, causes: Causes) -> Iterable[Variable]:
-        """Declare a state, and the variable that its beginning is drawn as, if it is."""
-        default = self.spaces.get(row.name, {}).get("default", row.default)
-        state = Measured(
-            **self._fields(row, row.kind),
-            default=_numbers(f"spaces[{row.name!r}]['default']", default, row.shape),
-            parents=Coupled(*causes, ()),
-            settable_state=not row.reported,
-        )
-        return beginning(state, self.start.get(row.name))
 
 
 Trees = frozenset[int]
@@ -502,35 +433,13 @@ def beginning(state: Measured, begin: Any) -> tuple[Variable, ...]:
     return drawn, state.model_copy(update={"parents": parents, "start": function})
 
 
-def check_observed(names: Iterable[str] | None, variables: Iterable[Variable]) -> None:
-    """Refuse to observe what is no variable.
-
-    Raises:
-        UnknownOption: With the name.
-    """
-    known = {variable.name for variable in variables}
-    for name in names or ():
-        if name not in known:
-            raise UnknownOption("observe", name, known)
-
-
 def _listed(value: Any) -> list[Any]:
     """List what was given, or the thing itself where it cannot be listed."""
     return list(value) if isinstance(value, Iterable) else [value, None]
 
 
 def _numbers(option: str, value: Any, shape: tuple[int, ...], wanted: str = "") -> Any:
-    """Give a number, or the numbers of all components.
-
-    Args:
-        option: What it was given for.
-        value: What was given.
-        shape: Of the variable.
-        wanted: What is allowed, where numbers may be infinite.
-
-    Raises:
-        UnknownOption: It is neither, or not finite.
-    """
+    """Return a number, or those of all components; ``wanted`` if they may be infinite."""
     try:
         numbers = np.broadcast_to(np.asarray(value, dtype=np.float64), shape)
     except (TypeError, ValueError):
@@ -542,18 +451,7 @@ def _numbers(option: str, value: Any, shape: tuple[int, ...], wanted: str = "") 
 
 
 def _space(option: str, given: Any, shape: tuple[int, ...], within: Any = None) -> Any:
-    """Read a space: a pair of ends stands for a box.
-
-    Args:
-        option: What it was given for.
-        given: The space; None for none.
-        shape: Of the variable.
-        within: The bounds, in which it must lie.
-
-    Raises:
-        UnknownOption: It is no space of this shape, its ends are the wrong way round, or it leaves
-            the bounds.
-    """
+    """Return a space that lies within bounds; a pair of ends stands for a box."""
     if given is None or given is within:
         return given
     size = int(np.prod(shape))
@@ -598,40 +496,3 @@ def _readout(row: Readout) -> Measured:
         mechanism=mechanism,
         doc=row.doc,
     )
-
-
-def is_model(source: str) -> bool:
-    """Tell whether a text is that of a model, or names a file that is one."""
-    return source.lstrip().startswith("<") or source.lower().endswith(FILES)
-
-
-def model_task(source: Any, options: Mapping[str, Any], known: Callable[[], Iterable[str]]) -> Task:
-    """Make the task of a file or of ``"module:factory"``.
-
-    Args:
-        source: XML text, a path that ends in .xml, .mjcf or .urdf, or a module (or Python file)
-            and a function in it that gives a task or a model.
-        options: Of ``ModelTask``, or arguments of the function.
-        known: Names the registered tasks, for the message.
-
-    Raises:
-        UnknownOption: It is none of these.
-        FunctionFailure: The function, or its module, raised an error.
-    """
-    from scm_world.tasks.factories import load_factory
-
-    if is_model(source):
-        return ModelTask(source, **options)
-    made = None
-    if ":" in source:
-        factory = load_factory(source)
-        with blamed(source):
-            made = factory(**options)
-        made = getattr(made, "task", made)  # of a world
-    if isinstance(made, SCM) or source.endswith(".json"):
-        commands = "discover, verify, graph, variables, effect, counterfactual or collect"
-        allowed = ("a function that gives a task, a model or a world", commands)
-        raise UnknownOption("command for a causal model without a backend", source, allowed)
-    if ":" in source:
-        return made if isinstance(made, Task) else ModelTask(made)
-    raise UnknownOption("task", source, (*known(), "file.xml", "file.urdf", "module:function"))

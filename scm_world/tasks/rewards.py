@@ -1,4 +1,4 @@
-"""What a step is worth: terms, weights, and the node of the graph that sums them up."""
+"""Rewards: terms, weights, and the node of the graph that sums them up."""
 
 from __future__ import annotations
 
@@ -62,56 +62,50 @@ def resolve(
     options: Common,
     terms: Iterable[Measured] = (),
 ) -> dict[str, float]:
-    """Work out the weight of every term.
+    """Compute the weight of every term.
 
     Args:
-        default: Of every dense term of the task in its order, and of the fractional success.
-        paper: Where the published training runs differ.
+        default: Weights of the dense terms of the task in their order, and of the fractional
+            success.
+        paper: Those of the published training runs, where they differ.
         options: What the user asked for.
         terms: Further ones; see ``further_terms``.
 
     Raises:
-        UnknownOption: A preset or a term that does not exist, a wrong number of weights, or one
-            that is no finite number.
+        UnknownOption: A preset or a term does not exist, or a weight is not a finite number.
     """
     asked = options.get("weights", "default")
-    own = {term.name: 0.0 for term in terms}
-    weights = {**default, **own}
-    if isinstance(asked, str):
-        if asked not in PRESETS:
-            raise UnknownOption("weights", asked, PRESETS)
-        weights.update(paper if asked == "paper" else {})
-    elif isinstance(asked, Mapping):
-        unknown = set(asked) - {*weights, SUCCESS}
-        if unknown:
-            raise UnknownOption("reward term", min(unknown), (*weights, SUCCESS))
-        weights.update({name: _weight(name, weight) for name, weight in asked.items()})
-    else:
-        raise UnknownOption("weights", asked, (*PRESETS, "a dictionary of terms and numbers"))
+    weights = {**default, **{term.name: 0.0 for term in terms}}
+    if isinstance(asked, Mapping):
+        known = {**weights, SUCCESS: 0.0}
+        weights |= {name: _weight(name, weight, known) for name, weight in asked.items()}
+    elif not isinstance(asked, str) or asked not in PRESETS:
+        dictionary = () if isinstance(asked, str) else ("a dictionary of terms and numbers",)
+        raise UnknownOption("weights", asked, (*PRESETS, *dictionary))
+    elif asked == "paper":
+        weights |= paper
     sparse = asked == "sparse" or options.get("activate_sparse_reward", False)
     if sparse or asked == "none":
         weights = dict.fromkeys(weights, 0.0)
-    own_weights: dict[str, float] = {}
+    own: dict[str, float] = {}
     if (given := options.get("dense_reward_weights")) is not None:
         dense = [name for name in default if name != FRACTION]
         if np.shape(given) != (len(dense),):
             raise UnknownOption("dense_reward_weights", given, (f"{len(dense)} numbers", *dense))
-        own_weights = {n: _weight(n, w) for n, w in zip(dense, given, strict=True)}
+        own = {name: _weight(name, weight) for name, weight in zip(dense, given, strict=True)}
     if (fraction := options.get("fractional_reward_weight")) is not None:
-        own_weights[FRACTION] = _weight("fractional_reward_weight", fraction)
-    if sparse and any(own_weights.values()):
-        named = {name: weight for name, weight in own_weights.items() if weight}
+        own[FRACTION] = _weight("fractional_reward_weight", fraction)
+    if sparse and any(own.values()):
+        named = {name: weight for name, weight in own.items() if weight}
         raise UnknownOption("weights of a sparse reward", named, ("none: it is 1 for success",))
-    weights.update(own_weights)
+    weights |= own
     return {**weights, SUCCESS: 1.0} if sparse else weights
 
 
-def _weight(name: str, weight: Any) -> float:
-    """Return a weight as a number.
-
-    Raises:
-        UnknownOption: It is not a finite number.
-    """
+def _weight(name: str, weight: Any, known: Mapping[str, float] | None = None) -> float:
+    """Return the weight of a term, of some known ones if they are given."""
+    if known is not None and name not in known:
+        raise UnknownOption("reward term", name, known)
     try:
         number = float(weight)
     except (TypeError, ValueError):
@@ -129,11 +123,11 @@ def further_terms(
     Args:
         asked: Any number of them; a name stands for one that is ready.
         known: Names of the terms that there are.
-        ready: What names may stand for.
+        ready: The terms that names may stand for.
 
     Raises:
-        UnknownOption: A name stands for none, or a term is no measured number with a mechanism, or
-            has the wrong name.
+        UnknownOption: A name is not one of those, or a term is not a measured number with a
+            mechanism, or its name is wrong.
     """
     single = isinstance(asked, str | Mapping) or not isinstance(asked, Iterable)
     offered = {term.name: term for term in ready}
@@ -153,15 +147,10 @@ def further_terms(
 
 
 def one_number(values: Values, name: str, terms: Iterable[str]) -> float:
-    """Give the value of a variable as a number.
-
-    Args:
-        values: Of the variable and of what it is made of.
-        name: Of the variable.
-        terms: Of what it is made of.
+    """Return the value of a variable, which is computed from terms, as a number.
 
     Raises:
-        ModelError: It is none; with the terms to blame.
+        ModelError: It is not a finite number; the terms that cause it are named.
     """
     try:
         number = float(values[name])
@@ -224,7 +213,7 @@ def reward(weights: Mapping[str, float]) -> Variable:
 
 
 def declared(name: str, given: Any) -> Variable:
-    """Declare what counts from a variable, or from a function and its parents.
+    """Declare reward, success or the end of an episode from a function and its parents.
 
     Args:
         name: ``"reward"``, ``"success"``, ``"terminated"`` or ``"fractional_success"``.
@@ -250,17 +239,13 @@ def declared(name: str, given: Any) -> Variable:
 
 def succeeded() -> Measured:
     """Declare success: more than nine tenths of the fractional success."""
-    return Measured(
-        name=SUCCESS,
-        dtype="integer",
-        bounds=Integers(0, 1),
-        parents=(FRACTION,),
-        mechanism=Function(above, constants={"threshold": FULFILLED}),
-        doc="1 where more than nine tenths of the goal are filled.",
-    )
+    above_most = Function(above, constants={"threshold": FULFILLED})
+    doc = "1 where more than nine tenths of the goal are filled."
+    form: dict[str, Any] = {"dtype": "integer", "bounds": Integers(0, 1), "doc": doc}
+    return Measured(name=SUCCESS, parents=(FRACTION,), mechanism=above_most, **form)
 
 
 @njit(cache=True)
 def above(value: Value, threshold: Value) -> int:
-    """Tell whether a number lies above a threshold, as 0 or 1."""
+    """Return whether a number lies above a threshold, as 0 or 1."""
     return int(scalar(value) > scalar(threshold))

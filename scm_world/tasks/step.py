@@ -12,10 +12,9 @@ from scm_world.backends import Backend
 from scm_world.backends.step import Quantity, StepModel
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import NoiseKey
-from scm_world.models import ParameterKey, State
 from scm_world.tasks.base import Timing
-from scm_world.tasks.composition import Commands, Composition, clock
-from scm_world.tasks.model import DeclaredTask, _numbers, beginning, check_observed
+from scm_world.tasks.composition import Commands, Composition
+from scm_world.tasks.model import DeclaredTask, _numbers, beginning
 from scm_world.variables import (
     Action,
     Box,
@@ -46,10 +45,6 @@ class ProcessNoise(Commands):
     ) -> None:
         self._drawn = [(name, source, shapes[name]) for name, source in sources.items()]
 
-    def applies(self, values: Values) -> bool:
-        """Tell that it is always needed."""
-        return True
-
     def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
         """Give the action and the noise of a control step, shape (n_commands,)."""
         drawn = [
@@ -57,35 +52,6 @@ class ProcessNoise(Commands):
             for name, source, shape in self._drawn
         ]
         return np.concatenate([action, *drawn])
-
-
-@final
-class StepComposition(Composition):
-    """What the variables of a step function mean to the backend: each one itself.
-
-    Args:
-        system: With the function.
-        noise: What draws the noise, if there is some.
-    """
-
-    def __init__(self, system: StepModel, noise: ProcessNoise | None) -> None:
-        self._system, self.commands = system, noise
-
-    def structure(self, values: Values) -> StepModel:
-        """Give the system, which is always the same."""
-        return self._system
-
-    def parameters(self) -> Mapping[str, ParameterKey]:
-        """Say which variable sets which parameter."""
-        return {quantity.name: quantity.key for quantity in self._system.parameters}
-
-    def slices(self) -> Mapping[str, slice]:
-        """Say where each state stands in the state vector."""
-        return self._system.layout.slices
-
-    def empty_state(self) -> State:
-        """Give a state to read into."""
-        return self._system.empty_state()
 
 
 class StepTask(DeclaredTask):
@@ -160,7 +126,7 @@ class StepTask(DeclaredTask):
             self.seconds = 100 * self.time_unit
         shapes = {state.name: state.shape for state in self.states}
         shapes = {name: shapes.get(name, _shape(given)) for name, given in self.noise.items()}
-        self._drawn = ProcessNoise(self.noise, shapes) if self.noise else None
+        self.commands = ProcessNoise(self.noise, shapes) if self.noise else None
         self.generated_graph = any(not _lagged(state) for state in self.states)
         self.system = StepModel(
             self.name,
@@ -252,7 +218,7 @@ class StepTask(DeclaredTask):
         return self
 
     def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
-        """Declare all variables, and say what they mean to the backend.
+        """Declare all variables, and what they mean to the backend.
 
         Raises:
             UnknownOption: A control step is to be several calls of the function: the declared
@@ -261,27 +227,23 @@ class StepTask(DeclaredTask):
         calls = round(timing.control_period / self.time_unit)
         if calls != 1:
             raise UnknownOption("frame_skip", calls, ("1: a control step is one call of step",))
-        given = [v.name for v in (*self.parameters, *self.states, *self.actions)]
-        states = [one for state in self.states for one in self._state(state, given)]
-        index, _ = clock(timing.steps, timing.control_period)
-        if self._drawn is not None:  # noise goes by the control step: setting that is no cause
-            index = index.model_copy(update={"settable_state": False, "parents": ()})
-        composition = StepComposition(self.system, self._drawn)
-        variables = [
-            *self.parameters, *self.actions, *states, index, *self.outcomes, *self.counted(),
-        ]  # fmt: skip
-        check_observed(self.observe, variables)
-        return composition, variables
+        return super().compose(timing)
 
-    def _state(self, state: Measured, given: Iterable[str]) -> Iterable[Variable]:
-        """Complete the declaration of a state, and declare what its beginning is drawn as."""
-        causes = (
-            *(_lagged(state) or (Parent(name, 1) for name in given)),
-            *(p for p in state.parents if p.when == "set"),
-        )
-        default = _numbers(state.name, 0.0 if state.default is None else state.default, state.shape)
-        fields = {"parents": causes, "settable_state": True, "default": default}
-        return beginning(state.model_copy(update=fields), self.start.get(state.name))
+    def quantities(self) -> Iterable[Variable]:
+        """Declare parameters, actions and states; of these the causes and the beginning, too."""
+        yield from (*self.parameters, *self.actions)
+        every = [Parent(v.name, 1) for v in (*self.parameters, *self.states, *self.actions)]
+        for state in self.states:
+            default = 0.0 if state.default is None else state.default
+            fields = {
+                "parents": (
+                    *(_lagged(state) or every),
+                    *(p for p in state.parents if p.when == "set"),
+                ),
+                "settable_state": True,
+                "default": _numbers(state.name, default, state.shape),
+            }
+            yield from beginning(state.model_copy(update=fields), self.start.get(state.name))
 
 
 def _lagged(state: Measured) -> tuple[Parent, ...]:

@@ -12,10 +12,7 @@ Subclass it in a test file, return a new backend, and pytest runs the rest::
 from __future__ import annotations
 
 import hashlib
-import os
 import pickle
-import subprocess
-import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -31,6 +28,7 @@ from scm_world.backends import Backend, EngineSnapshot, read_model
 from scm_world.errors import EngineFailure, SnapshotMismatch
 from scm_world.models import Difference, ParameterKey, Parameters, Scene, State
 from scm_world.models.scene import RANGES
+from scm_world.testing.model import elsewhere
 
 MODEL = """
 <mujoco model="conformance">
@@ -74,23 +72,21 @@ def same(first: Floats, second: Floats) -> bool:
 
 
 def play(backend: Backend, commands: Floats, substeps: int) -> Floats:
-    """Give commands, shape (n, n_commands); return the state after each one."""
+    """Apply commands, shape (n, n_commands); return the state after each one."""
     rows = []
     for command in commands:
         backend.step(command, substeps)
-        rows.append(backend.state().vector)
+        rows.append(backend.read().vector)
     return np.array(rows)
 
 
-_ELSEWHERE = """
-import hashlib, pickle, sys
-sys.path[:] = {path!r}
-from scm_world.testing.backend import play
-make, scene, arguments = pickle.load(sys.stdin.buffer)
-backend = make()
-backend.build(scene)
-print(hashlib.sha256(play(backend, *arguments).tobytes()).hexdigest())
-"""
+def played(kind: type[Backend], scene: Scene, commands: Floats, substeps: int) -> str:
+    """Hash the states of a new backend after each command."""
+    backend = kind()
+    backend.build(scene)
+    found = hashlib.sha256(play(backend, commands, substeps).tobytes()).hexdigest()
+    backend.close()
+    return found
 
 
 class BackendConformance(ABC):
@@ -117,9 +113,11 @@ class BackendConformance(ABC):
     # --- the scene; override these for another one ----------------------------------------------
 
     def busy(self) -> Scene:
-        """Describe a scene in which bodies touch: the default one of the model."""
+        """Return a scene in which bodies touch: the default one of the model."""
         model, backend = read_model(self.model), self.make()
-        kept = tuple(row for row in model.parameters if backend.supports(model, row.key))
+        kept = tuple(
+            row for row in model.parameters if backend.capabilities.supports(model, row.key)
+        )
         backend.close()
         return replace(model, parameters=kept).default_scene()
 
@@ -165,7 +163,7 @@ class BackendConformance(ABC):
 
     @pytest.fixture
     def scene(self) -> Scene:
-        """Describe the scene."""
+        """Provide the scene."""
         return self.busy()
 
     @pytest.fixture
@@ -177,22 +175,26 @@ class BackendConformance(ABC):
 
     @contextmanager
     def built(self, scene: Scene) -> Iterator[Backend]:
-        """Provide a new backend with a scene, and close it."""
+        """Provide a new backend with a scene, and close it; closing it twice is harmless."""
         backend = self.make()
         backend.build(scene)
         try:
             yield backend
         finally:
             backend.close()
+            backend.close()
 
     def play(self, backend: Backend, steps: int, seed: int = SEED) -> Floats:
-        """Give random commands; return the state after each one."""
-        commands = self.commands(backend.structure, steps, seed)
-        return play(backend, commands, self.substeps)
+        """Apply random commands; return the state after each one."""
+        return play(backend, self.commands(backend.structure, steps, seed), self.substeps)
 
-    def continued(self, backend: Backend, start: EngineSnapshot, steps: int = 10) -> Floats:
-        """Continue from a snapshot."""
+    def continued(
+        self, backend: Backend, start: EngineSnapshot, *changes: Difference, steps: int = 20
+    ) -> Floats:
+        """Continue from a snapshot with some changes."""
         backend.restore(start)
+        for change in changes:
+            backend.apply(change)
         return self.play(backend, steps)
 
     def others(self, scene: Scene) -> dict[ParameterKey, Floats]:
@@ -200,12 +202,16 @@ class BackendConformance(ABC):
         given = scene.parameters.items()
         return {key: self.other_value(scene.structure, key, value) for key, value in given}
 
-    # --- scenes ---------------------------------------------------------------------------------
+    def check_parameters(self, actual: Parameters, expected: Parameters) -> None:
+        """Compare parameters as engines keep them: colors with 32 bits or less."""
+        assert set(actual) == set(expected)
+        for key, value in expected.items():
+            tolerance = 1e-6 if key[1] in ("color", "rgba") else 1e-12
+            message = ".".join(key)
+            np.testing.assert_allclose(actual[key], value, 0.0, tolerance, err_msg=message)
+            assert actual[key].shape == value.shape
 
-    def test_equal_scenes_continue_alike(self, scene: Scene) -> None:
-        """Two backends with equal scenes move bit-identically."""
-        with self.built(scene) as first, self.built(scene) as second:
-            assert same(self.play(first, 40), self.play(second, 40))
+    # --- scenes ---------------------------------------------------------------------------------
 
     def test_building_forgets(self, backend: Backend, scene: Scene) -> None:
         """A used backend that is built again behaves like a new one."""
@@ -222,355 +228,211 @@ class BackendConformance(ABC):
             assert same(self.play(backend, 20), expected)
 
     def test_another_process_agrees(self, scene: Scene) -> None:
-        """A new process computes the same bits."""
-        arguments = self.commands(scene.structure, 30), self.substeps
-        with self.built(scene) as backend:
-            here = hashlib.sha256(play(backend, *arguments).tobytes()).hexdigest()
-            child = subprocess.run(  # noqa: S603 # our own interpreter, our own code
-                [sys.executable, "-c", _ELSEWHERE.format(path=[os.getcwd(), *sys.path])],
-                input=pickle.dumps((type(backend), scene, arguments)),
-                capture_output=True,
-                check=True,
-            )
-        assert child.stdout.decode().split()[-1] == here
+        """Another process computes the same bits."""
+        commands, kind = self.commands(scene.structure, 30), type(self.make())
+        here = played(kind, scene, commands, self.substeps)
+        assert elsewhere(played, kind, scene, commands, self.substeps) == here
 
     def test_two_backends_do_not_share_anything(self, scene: Scene) -> None:
-        """Two backends that take turns move like each one alone."""
-        scenes = (scene, scene.with_(parameters=self.others(scene)))
+        """Backends that take turns move like each one alone, and alike with equal scenes."""
+        other = scene.with_(parameters=self.others(scene))
         commands, alone = self.commands(scene.structure, 20), []
-        for each in scenes:
+        for each in (scene, other):
             with self.built(each) as backend:
                 alone.append(self.play(backend, 20))
-        with self.built(scenes[0]) as first, self.built(scenes[1]) as second:
+        assert same(*alone) != backend.capabilities.physics  # parameters act
+        with self.built(scene) as first, self.built(other) as second:
             for step, command in enumerate(commands):
                 for backend, expected in zip((first, second), alone, strict=True):
                     found = play(backend, command[None], self.substeps)[0]
                     assert same(found, expected[step])
 
-    def test_an_explosion_is_an_error(
-        self, backend: Backend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        """A state that is not finite is never returned."""
-        monkeypatch.chdir(tmp_path)  # engines may write a log
-        with pytest.raises(EngineFailure):
-            self.explode(backend, lambda: self.play(backend, 1))
-
-    def explode(self, backend: Backend, advance: Any) -> None:
-        """Set a velocity to infinity and continue."""
-        state = backend.state()
-        state.vector[np.flatnonzero(state.layout.can_be_set)[-1]] = np.inf
-        backend.apply(Difference(state=state))
-        advance()
-
-    def test_closing_twice(self, scene: Scene) -> None:
-        """Closing a backend twice is harmless."""
-        backend = self.make()
-        backend.build(scene)
-        backend.close()
-        backend.close()
-
-    # --- contacts -------------------------------------------------------------------------------
-
-    def test_a_scene_begins_without_contacts(self, scene: Scene) -> None:
-        """Contacts are those of the last physics step: there are none before the first."""
+    def test_contacts_are_those_of_the_last_step(self, scene: Scene) -> None:
+        """There are none before the first step; a change of the state does not change them."""
         with self.built(scene) as backend:
             assert backend.contacts() == ()
+            self.play(backend, 2, seed=1)
+            contacts = backend.contacts()
+            assert bool(contacts) == backend.capabilities.physics
+            for contact in contacts:
+                assert np.linalg.norm(contact.normal) == pytest.approx(1.0)
+            *_, changed = self.changed_states(backend.read())
+            backend.apply(Difference(state=changed))
+            assert [c.bodies for c in backend.contacts()] == [c.bodies for c in contacts]
 
-    def test_contacts_are_those_of_the_last_step(self, backend: Backend) -> None:
-        """They have unit normals, and a change of the state does not change them."""
-        contacts = backend.contacts()
-        assert bool(contacts) == backend.capabilities.physics
-        for contact in contacts:
-            assert np.linalg.norm(contact.normal) == pytest.approx(1.0)
-        *_, changed = self.changed_states(backend.state())
-        backend.apply(Difference(state=changed))
-        assert [c.bodies for c in backend.contacts()] == [c.bodies for c in contacts]
+    # --- changes --------------------------------------------------------------------------------
 
-    # --- parameters -----------------------------------------------------------------------------
-
-    def test_every_parameter_is_read_back(self, backend: Backend, scene: Scene) -> None:
-        """The engine reports each parameter as it was set, and a snapshot holds it."""
-        self.check_parameters(backend.parameters(scene.parameters), scene.parameters)
-        other = self.others(scene)
-        start = backend.snapshot()
-        backend.apply(Difference(parameters=other))
-        self.check_parameters(backend.parameters(other), other)
-        backend.restore(start)
-        self.check_parameters(backend.parameters(other), scene.parameters)
-
-    def check_parameters(self, actual: Parameters, expected: Parameters) -> None:
-        """Compare parameters as engines keep them: colors with 32 bits or less."""
-        assert set(actual) == set(expected)
-        for key, value in expected.items():
-            rough = key[1] in ("color", "rgba")
-            name, tolerance = ".".join(key), 1e-6 if rough else 1e-12
-            np.testing.assert_allclose(actual[key], value, rtol=0, atol=tolerance, err_msg=name)
-            assert actual[key].shape == value.shape
-
-    def test_a_parameter_changes_nothing_else(self, backend: Backend, scene: Scene) -> None:
-        """Setting one parameter leaves the state and every other parameter as they were."""
-        keys = tuple(scene.parameters)
-        state, before = backend.state(), backend.parameters(keys)
-        for key, value in self.others(scene).items():
+    def test_parameters_are_read_back(self, backend: Backend, scene: Scene) -> None:
+        """Each is reported as it was set, and leaves the state and all others as they were."""
+        keys, start, state = tuple(scene.parameters), backend.snapshot(), backend.read()
+        before, other = backend.parameters(keys), self.others(scene)
+        self.check_parameters(before, scene.parameters)
+        for key, value in other.items():
             backend.apply(Difference(parameters={key: value}))
             now = backend.parameters(keys)
+            self.check_parameters({key: now[key]}, {key: value})
             assert [k for k in keys if k != key and not same(now[k], before[k])] == []
-            assert backend.state() == state
+            assert backend.read() == state
             backend.apply(Difference(parameters={key: scene.parameters[key]}))
-
-    def test_a_change_taken_back_leaves_no_trace(self, backend: Backend, scene: Scene) -> None:
-        """Each parameter and state that is changed and restored has exactly no effect."""
-        start, state = backend.snapshot(), backend.state()
-        expected, traces = self.continued(backend, start, 2), []
-        for key, value in self.others(scene).items():
-            backend.restore(start)
-            backend.apply(Difference(parameters={key: value}))
-            backend.apply(Difference(parameters={key: scene.parameters[key]}))
-            if not same(self.play(backend, 2), expected):
-                traces.append(".".join(key))
-        for number, changed in enumerate((state, *self.changed_states(state))):
-            backend.restore(start)
-            backend.apply(Difference(state=changed))
-            backend.apply(Difference(state=state))
-            if backend.state() != state or not same(self.play(backend, 2), expected):
-                traces.append(f"state {number}")
-        assert traces == []
-
-    def test_changes_taken_back_leave_no_trace_for_long(
-        self, backend: Backend, scene: Scene
-    ) -> None:
-        """All of these changes together have exactly no effect on a whole episode."""
-        start, state = backend.snapshot(), backend.state()
-        expected = self.continued(backend, start, self.long)
+        backend.apply(Difference(parameters=other))
+        self.check_parameters(backend.parameters(keys), other)
         backend.restore(start)
-        for key, value in self.others(scene).items():
-            backend.apply(Difference(parameters={key: value}))
-        for changed in self.changed_states(state):
-            backend.apply(Difference(state=changed))
-        backend.apply(Difference(parameters=scene.parameters, state=state))
-        assert same(self.play(backend, self.long), expected)
-
-    def test_the_order_of_changes_is_irrelevant(self, backend: Backend, scene: Scene) -> None:
-        """All together, one by one, and with detours: the result is the same."""
-        start, other = backend.snapshot(), self.others(scene)
-        *_, state = self.changed_states(backend.state())
-
-        def at_once() -> None:
-            backend.apply(Difference(parameters=other, state=state))
-
-        def state_first() -> None:
-            backend.apply(Difference(state=state))
-            for key in sorted(other):
-                backend.apply(Difference(parameters={key: other[key]}))
-
-        def with_detours() -> None:
-            for key in sorted(other, reverse=True):
-                backend.apply(Difference(parameters={key: scene.parameters[key]}))
-                backend.apply(Difference(parameters={key: other[key]}))
-            for detour in self.changed_states(state):
-                backend.apply(Difference(state=detour))
-            backend.apply(Difference(state=state))
-
-        results = []
-        for path in (at_once, state_first, with_detours):
-            backend.restore(start)
-            path()
-            results.append(self.play(backend, 20))
-        assert same(results[0], results[1])
-        assert same(results[0], results[2])
-
-    def test_changes_equal_a_scene_built_so(self, scene: Scene) -> None:
-        """Before the first step, changing a scene and building the changed one are the same."""
-        other = self.others(scene)
-        *_, state = self.changed_states(scene.state)
-        changed = scene.with_(parameters=other, state=state)
-        with self.built(scene) as edited, self.built(changed) as new:
-            edited.apply(Difference(parameters=other, state=state))
-            assert edited.state() == new.state()
-            assert same(self.play(edited, 20), self.play(new, 20))
-
-    def test_parameters_act_where_there_is_physics(self, backend: Backend, scene: Scene) -> None:
-        """All of them together change the motion."""
-        start = backend.snapshot()
-        expected = self.continued(backend, start, 20)
-        backend.restore(start)
-        backend.apply(Difference(parameters=self.others(scene)))
-        assert same(self.play(backend, 20), expected) != backend.capabilities.physics
-
-    def test_a_body_that_touches_nothing_does_nothing(self, scene: Scene) -> None:
-        """It has exactly no effect on the others, nor they on it."""
-        slices, leaks = scene.state.layout.slices, []
-        mine = np.zeros(scene.state.vector.size, dtype=bool)
-        for name in slices:
-            mine[slices[name]] = name.startswith(self.apart)
-        with self.built(scene) as backend:
-            start = backend.snapshot()
-            expected = self.play(backend, 40)
-            for key, value in self.others(scene).items():
-                if key[0] in self.everywhere:
-                    continue
-                backend.restore(start)
-                backend.apply(Difference(parameters={key: value}))
-                untouched = ~mine if key[0].startswith(self.apart) else mine
-                if not same(self.play(backend, 40)[:, untouched], expected[:, untouched]):
-                    leaks.append(".".join(key))
-        assert leaks == []
-
-    # --- states and structures ------------------------------------------------------------------
+        self.check_parameters(backend.parameters(keys), scene.parameters)
 
     def test_a_state_is_read_back(self, backend: Backend) -> None:
         """The engine reports the state as it was set; what it reports stays that of the step."""
-        before = backend.state()
+        before = backend.read()
         fixed = ~before.layout.can_be_set
         for changed in self.changed_states(before):
             backend.apply(Difference(state=changed))
-            read = backend.state()
+            read = backend.read()
             np.testing.assert_allclose(read.settable(), changed.settable(), rtol=0, atol=1e-12)
             assert same(read.vector[fixed], before.vector[fixed])
 
-    def test_bodies_that_come_and_go_leave_no_trace(self, backend: Backend, scene: Scene) -> None:
-        """Changing the structure and taking it back has exactly no effect."""
-        start, now = backend.snapshot(), backend.state()
-        expected = self.continued(backend, start, 20)
-        for structure in self.other_structures(scene):
+    def test_a_change_taken_back_leaves_no_trace(self, backend: Backend, scene: Scene) -> None:
+        """It has exactly no effect, although a snapshot was restored in between."""
+        start, state, traces = backend.snapshot(), backend.read(), []
+        expected = self.continued(backend, start)
+        changes = [Difference(parameters={k: v}) for k, v in self.others(scene).items()]
+        changes += [Difference(state=changed) for changed in self.changed_states(state)]
+        changes += [Difference(structure=other) for other in self.other_structures(scene)]
+        for number, change in enumerate(changes):
             backend.restore(start)
-            backend.apply(Difference(structure=structure))
-            assert backend.structure == structure
-            backend.apply(Difference(scene.structure, scene.parameters, now))
-            assert backend.state() == now
-            assert same(self.play(backend, 20), expected)
+            backend.apply(change)
+            assert change.structure in (None, backend.structure)
+            saved = pickle.loads(pickle.dumps(backend.snapshot()))  # noqa: S301 # our own
+            structure = None if change.structure is None else scene.structure
+            back = Difference(structure, scene.parameters, state)
+            if not same(self.continued(backend, saved, back), expected):
+                traces.append((number, *change.parameters))
+        assert traces == []
 
-    # --- snapshots ------------------------------------------------------------------------------
+    def test_only_the_result_of_changes_counts(self, backend: Backend, scene: Scene) -> None:
+        """Together, one by one, or with detours; all taken back, nothing is left for long."""
+        start, before, other = backend.snapshot(), backend.read(), self.others(scene)
+        *_, state = self.changed_states(before)
+        alone = {key: Difference(parameters={key: other[key]}) for key in sorted(other)}
+        undone = {key: Difference(parameters={key: scene.parameters[key]}) for key in other}
+        detours = [Difference(state=detour) for detour in self.changed_states(state)]
+        end, result = Difference(state=state), Difference(parameters=other, state=state)
+        there_and_back = [c for k in alone for c in (alone[k], undone[k], alone[k])]
+        back = Difference(parameters=scene.parameters, state=before)
+        expected = self.continued(backend, start, steps=self.long)
+        found = self.continued(backend, start, result)
+        for path in ([end, *alone.values()], [*there_and_back[::-1], *detours, end]):
+            assert same(self.continued(backend, start, *path), found)
+            assert same(self.continued(backend, start, *path, back, steps=self.long), expected)
+        with self.built(scene) as edited, self.built(scene.with_(parameters=other)) as new:
+            edited.apply(Difference(parameters=other))
+            assert edited.read() == new.read()
+            assert same(self.play(edited, 20), self.play(new, 20))
 
-    def snapshots(self, backend: Backend, scene: Scene) -> Iterator[EngineSnapshot]:
-        """Take snapshots in all kinds of moments."""
-        yield backend.snapshot()
+    def test_a_body_that_touches_nothing_does_nothing(self, scene: Scene) -> None:
+        """It has exactly no effect on the others, nor they on it."""
+        layout, leaks = scene.state.layout, []
+        mine = np.zeros(layout.size, dtype=bool)
+        for name, where in layout.slices.items():
+            mine[where] = name.startswith(self.apart)
+        with self.built(scene) as backend:
+            start = backend.snapshot()
+            expected = self.continued(backend, start, steps=40)
+            for key, value in self.others(scene).items():
+                change = Difference(parameters={key: value})
+                untouched = ~mine if key[0].startswith(self.apart) else mine
+                found = self.continued(backend, start, change, steps=40)
+                if key[0] not in self.everywhere and (found != expected)[:, untouched].any():
+                    leaks.append(key)
+        assert leaks == []
+
+    # --- snapshots and batches -------------------------------------------------------------------
+
+    def moments(self, backend: Backend, scene: Scene) -> Iterator[None]:
+        """Change a backend in one way after another."""
+        yield
         backend.apply(Difference(parameters=self.others(scene)))
-        yield backend.snapshot()
-        *_, state = self.changed_states(backend.state())
+        yield
+        *_, state = self.changed_states(backend.read())
         backend.apply(Difference(state=state))
-        yield backend.snapshot()
+        yield
         self.play(backend, 3)
-        yield backend.snapshot()
+        yield
         for structure in self.other_structures(scene):
             backend.apply(Difference(structure=structure))
-            yield backend.snapshot()
+            yield
 
     def test_a_snapshot_continues_bit_for_bit(self, backend: Backend, scene: Scene) -> None:
         """From a snapshot, this, another and a pickled backend continue alike, repeatedly."""
-        for snapshot in self.snapshots(backend, scene):
-            state, touching = backend.state(), backend.contacts()
+        for _ in self.moments(backend, scene):
+            snapshot, state, touching = backend.snapshot(), backend.read(), backend.contacts()
             assert backend.snapshot() is not snapshot  # another one does not disturb
-            copy = pickle.loads(pickle.dumps(snapshot))  # noqa: S301 # our own
             expected = self.play(backend, 15)
-            backend.apply(Difference(state=backend.state()))
+            backend.apply(Difference(state=backend.read()))
             backend.restore(snapshot)
-            assert backend.state() == state
+            with pytest.raises(SnapshotMismatch):
+                backend.restore(EngineSnapshot("no engine 0", None))
+            assert backend.read() == state
             assert [c.bodies for c in backend.contacts()] == [c.bodies for c in touching]
             assert same(self.play(backend, 15), expected)
             with self.built(scene) as other:
                 self.play(other, 2)
-                assert same(self.continued(other, copy, 15), expected)
+                copy = pickle.loads(pickle.dumps(snapshot))  # noqa: S301 # our own
+                assert same(self.continued(other, copy, steps=15), expected)
             backend.restore(snapshot)
 
-    def test_a_snapshot_remembers_how_to_undo(self, backend: Backend) -> None:
-        """A change that was made before a snapshot can be taken back after it, without a trace."""
-        start, now = backend.snapshot(), backend.state()
-        expected = self.continued(backend, start, 10)
-        for changed in self.changed_states(now):
-            backend.restore(start)
-            backend.apply(Difference(state=changed))
-            backend.restore(pickle.loads(pickle.dumps(backend.snapshot())))  # noqa: S301
-            backend.apply(Difference(state=now))
-            assert same(self.play(backend, 10), expected)
-
-    def test_snapshots_of_another_engine_are_refused(self, backend: Backend) -> None:
-        """A snapshot of an engine that does not exist cannot be restored."""
-        state = backend.state()
-        with pytest.raises(SnapshotMismatch):
-            backend.restore(EngineSnapshot("no engine 0", None))
-        assert backend.state() == state
-
-    # --- batches --------------------------------------------------------------------------------
-
-    @pytest.fixture
-    def twice(self, scene: Scene) -> Iterator[tuple[list[Backend], list[Backend]]]:
-        """Provide scenes that differ in a parameter each, two of each kind."""
+    @contextmanager
+    def several(self, scene: Scene) -> Iterator[list[Backend]]:
+        """Provide scenes that differ in a parameter each."""
         other = list(self.others(scene).items())
         with ExitStack() as stack:
-
-            def several() -> list[Backend]:
-                scenes = [
-                    scene.with_(parameters={**scene.parameters, **dict(other[:number])})
-                    for number in range(COUNT)
-                ]
-                return [stack.enter_context(self.built(one)) for one in scenes]
-
-            yield several(), several()
+            changed = ({**scene.parameters, **dict(other[:number])} for number in range(COUNT))
+            yield [stack.enter_context(self.built(scene.with_(parameters=p))) for p in changed]
 
     @pytest.mark.parametrize("threads", [1, 2, 4])
-    def test_a_batch_is_one_after_another(
-        self, twice: tuple[list[Backend], list[Backend]], threads: int
-    ) -> None:
+    def test_a_batch_is_one_after_another(self, scene: Scene, threads: int) -> None:
         """Scenes that are stepped together do, bit for bit, what they do alone.
 
         Between two steps each can be read, changed, saved, restored and stepped by itself.
         """
-        alone, many = twice
-        batch = type(many[0]).batch(many, threads)
-        into = _table(many)
-        saved = [(one.snapshot(), other.snapshot()) for one, other in zip(alone, many, strict=True)]
-        commands = self.commands(many[0].structure, 8 * COUNT).reshape(8, COUNT, -1)
-        for step, rows in enumerate(commands):
-            which = np.arange(COUNT) if step % 3 else np.array([0, 2])
-            batch.step(which, rows, self.substeps, into)
-            for index in which.tolist():
-                play(alone[index], rows[index][None], self.substeps)
-                vector = alone[index].state().vector
-                np.testing.assert_array_equal(into[index, : vector.size], vector)
-            for number, backends in enumerate((alone, many)):
-                self._change_one(backends[1], step, saved[1][number])
-            for one, other in zip(alone, many, strict=True):
-                np.testing.assert_array_equal(other.state().vector, one.state().vector)
-            first, second = alone[step % COUNT].contacts(), many[step % COUNT].contacts()
-            assert [(c.bodies, c.force) for c in first] == [(c.bodies, c.force) for c in second]
+        commands = self.commands(scene.structure, 8 * COUNT).reshape(8, COUNT, -1)
+        with self.several(scene) as alone, self.several(scene) as many:
+            batch, into = type(many[0]).batch(many, threads), _table(scene)
+            saved = [backends[1].snapshot() for backends in (alone, many)]
+            changes = [self.moments(backends[1], scene) for backends in (alone, many)]
+            for step, rows in enumerate(commands):
+                which = np.arange(COUNT) if step % 3 else np.array([0, 2])
+                batch.step(which, rows, self.substeps, into)
+                for index in which.tolist():
+                    vector = play(alone[index], rows[index][None], self.substeps)[0]
+                    assert same(into[index, : vector.size], vector)
+                for backends, start, moments in zip((alone, many), saved, changes, strict=True):
+                    next(moments, None)
+                    if step == 6:
+                        backends[1].restore(start)
+                for one, other in zip(alone, many, strict=True):
+                    assert other.read() == one.read()
+                    touching = [[(c.bodies, c.force) for c in b.contacts()] for b in (one, other)]
+                    assert touching[0] == touching[1]
 
-    def _change_one(self, backend: Backend, step: int, start: EngineSnapshot) -> None:
-        """Change one of the scenes by itself, each time in another way."""
-        match step % 4:
-            case 0:
-                *_, state = self.changed_states(backend.state())
-                backend.apply(Difference(state=state))
-            case 1:
-                self.play(backend, 1)
-            case 2:
-                for structure in self.other_structures(Scene(backend.structure, {}, None)):
-                    if structure.layout.size <= backend.structure.layout.size:
-                        backend.apply(Difference(structure=structure))
-            case _:
-                backend.restore(start)
-
-    def test_an_explosion_in_a_batch_is_an_error(
-        self,
-        twice: tuple[list[Backend], list[Backend]],
-        tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch,
+    @pytest.mark.parametrize("together", [False, True])
+    def test_an_explosion_is_an_error(
+        self, scene: Scene, together: bool, monkeypatch: Any, tmp_path: Path
     ) -> None:
-        """A state that is not finite is never returned from a batch."""
+        """A state that is not finite is never returned, also not from a batch."""
         monkeypatch.chdir(tmp_path)  # engines may write a log
-        _, many = twice
-        batch = type(many[0]).batch(many, 2)
-        rows = self.commands(many[0].structure, COUNT)
-        with pytest.raises(EngineFailure):
-            self.explode(
-                many[1],
-                lambda: batch.step(np.arange(COUNT), rows, self.substeps, _table(many)),
-            )
+        with self.several(scene) as many:
+            batch, state = type(many[0]).batch(many, 2), many[1].read()
+            rows = self.commands(scene.structure, COUNT)
+            state.vector[np.flatnonzero(state.layout.can_be_set)[-1]] = np.inf
+            with pytest.raises(EngineFailure):  # noqa: PT012 # either of the two may notice it
+                many[1].apply(Difference(state=state))
+                if together:
+                    batch.step(np.arange(COUNT), rows, self.substeps, _table(scene))
+                many[1].step(rows[1], self.substeps)
 
 
-def _table(backends: list[Backend]) -> Floats:
-    width = max(backend.structure.layout.size for backend in backends)
-    return np.full((len(backends), width), np.nan)
+def _table(scene: Scene) -> Floats:
+    """Return room for the states of some scenes, and for more bodies."""
+    return np.full((COUNT, 2 * scene.structure.layout.size), np.nan)
 
 
 __all__ = ["MODEL", "BackendConformance", "play", "same"]

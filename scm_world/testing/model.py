@@ -37,7 +37,7 @@ from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world import Audit, Batch, Simulation
 
 SEED = 20_26
-_LINE = "digest "
+_LINE = "answer "
 
 
 def quantities(world: Simulation) -> tuple[str, ...]:
@@ -65,9 +65,8 @@ def nearby(world: Simulation, name: str) -> Iterator[Value]:
             inwards = 0.02 * (low + 0.37 * (high - low) - value)
             first = np.zeros(variable.shape)
             first.flat[0] = inwards.flat[0]
-            for shift in (inwards, 0.02 * (low - value), first, -first):
-                if shift.any():
-                    yield value + shift
+            shifts = inwards, 0.02 * (low - value), first, -first
+            yield from (value + shift for shift in shifts if shift.any())
         case Integers(high=most):
             yield np.where(value < most, value + 1, value - 1)
         case Categories(members=members):
@@ -109,14 +108,15 @@ def trajectory(world: Simulation, taken: Floats) -> Floats:
     return np.stack(found)
 
 
-def story(world: Simulation) -> bytes:
-    """Run two episodes with all kinds of interventions; return every number there was."""
-    seen = []
+def digests(world: Simulation, snapshot: Any) -> str:
+    """Hash the future of a snapshot, and two episodes with all kinds of interventions."""
+    world.restore(snapshot)
+    seen = [trajectory(world, actions(world, 20, 7)).tobytes()]
     for episode in range(2):
         world.reset(seed=SEED + episode)
-        names = quantities(world)
-        spaced = [name for name in names if world.model.declared(name).a is not None]
-        real = [name for name in names if world.model.declared(name).dtype == "real"]
+        names, model = quantities(world), world.model
+        spaced = [name for name in names if model.declared(name).a is not None]
+        real = [name for name in names if model.declared(name).dtype == "real"]
         for request in (
             world.task.sample_goal("A"),
             {name: Draw("A") for name in spaced[:: max(len(spaced) // 3, 1)]},
@@ -124,34 +124,33 @@ def story(world: Simulation) -> bytes:
         ):
             with contextlib.suppress(InterventionError):  # refused here, refused everywhere
                 world.do(request)
-            states = trajectory(world, actions(world, 4, seed=episode))
-            seen.append(states.tobytes())
+            seen.append(trajectory(world, actions(world, 4, seed=episode)).tobytes())
         values = world.values()
         seen += [name.encode() + np.asarray(values[name]).tobytes() for name in sorted(values)]
-    return b"".join(seen)
+    return " ".join(hashlib.sha256(part).hexdigest() for part in (seen[0], b"".join(seen[1:])))
 
 
-def _digests(world: Simulation, snapshot: Any) -> str:
-    """Hash the future of a snapshot, and the story of the world."""
-    world.restore(snapshot)
-    parts = (trajectory(world, actions(world, 20, 7)).tobytes(), story(world))
-    return " ".join(hashlib.sha256(part).hexdigest() for part in parts)
+# --- another process --------------------------------------------------------------------------
 
 
-def serve() -> None:
-    """Answer with digests, in another process, until there are no more questions."""
-    with contextlib.suppress(EOFError):
-        while True:
-            module, question = pickle.load(sys.stdin.buffer)  # noqa: S301 # from our parent
-            importlib.import_module(module)
-            world, snapshot = pickle.loads(question)  # noqa: S301 # likewise
-            print(f"\n{_LINE}{_digests(world, snapshot)}", flush=True)  # noqa: T201 # the answer
-            world.close()
+def elsewhere(function: Callable[..., str], *arguments: Any, module: str = __name__) -> str:
+    """Call a function in another process, which lives as long as this one.
+
+    Args:
+        function: What it returns has no line break.
+        arguments: They are pickled.
+        module: It is imported there before.
+    """
+    child: Any = _child()
+    pickle.dump((module, pickle.dumps((function, arguments))), child.stdin)
+    child.stdin.flush()
+    lines = iter(child.stdout.readline, b"")
+    found = next((line.decode() for line in lines if line.startswith(_LINE.encode())), _LINE)
+    return found.removeprefix(_LINE).strip()
 
 
 @cache
-def _elsewhere() -> subprocess.Popen[bytes]:
-    """Start the other process, which lives as long as this one."""
+def _child() -> subprocess.Popen[bytes]:
     child = subprocess.Popen(  # our own interpreter, our own code
         [sys.executable, "-c", "from scm_world.testing.model import serve; serve()"],
         stdin=subprocess.PIPE,
@@ -160,6 +159,16 @@ def _elsewhere() -> subprocess.Popen[bytes]:
     )
     atexit.register(child.communicate)
     return child
+
+
+def serve() -> None:
+    """Answer ``elsewhere``, until there are no more questions."""
+    with contextlib.suppress(EOFError):
+        while True:
+            module, question = pickle.load(sys.stdin.buffer)  # noqa: S301 # from our parent
+            importlib.import_module(module)
+            function, arguments = pickle.loads(question)  # noqa: S301 # likewise
+            print(f"\n{_LINE}{function(*arguments)}", flush=True)  # noqa: T201 # the answer
 
 
 # --- checks -----------------------------------------------------------------------------------
@@ -178,25 +187,31 @@ def check_variables(world: Simulation) -> int:
     return len(world.model)
 
 
+def _future(world: Simulation, steps: int) -> tuple[Any, Floats, Floats]:
+    """Step a new episode; return a snapshot, the next actions and the states that follow."""
+    world.reset(seed=0)
+    taken = actions(world, steps + 3)
+    trajectory(world, taken[:3])
+    start = world.snapshot()
+    expected = trajectory(world, taken[3:])
+    world.restore(start)
+    return start, taken[3:], expected
+
+
 def check_undo(world: Simulation, horizons: tuple[int, ...] = (1, 50)) -> tuple[int, float]:
     """Check that an intervention that is undone leaves exactly 0.0, for every quantity.
 
     Returns:
         How many quantities were set, and the largest difference at any horizon.
     """
-    world.reset(seed=0)
-    taken = actions(world, max(horizons) + 3)
-    trajectory(world, taken[:3])
-    start = world.snapshot()
-    expected = trajectory(world, taken[3:])
-    world.restore(start)
+    start, taken, expected = _future(world, max(horizons))
     found, worst = 0, 0.0
     for name in quantities(world):
         old = world[name]
         if moved(world, name) is not None:
             world.do({name: old})
             found += 1
-            here = trajectory(world, taken[3:])
+            here = trajectory(world, taken)
             worst = max(worst, *(float(np.abs(here[h] - expected[h]).max()) for h in horizons))
             assert worst == 0.0, f"{name}: {worst:g} is left after do and undo"
         world.restore(start)
@@ -205,12 +220,7 @@ def check_undo(world: Simulation, horizons: tuple[int, ...] = (1, 50)) -> tuple[
 
 def check_refusal(world: Simulation) -> int:
     """Check that a request of which one part is wrong leaves the world bit-identical."""
-    world.reset(seed=0)
-    taken = actions(world, 6)
-    trajectory(world, taken[:2])
-    start = world.snapshot()
-    expected = trajectory(world, taken[2:])
-    world.restore(start)
+    _, taken, expected = _future(world, 4)
     names = quantities(world)
     requests: list[dict[str, Any]] = [{names[0]: Draw("A"), "no_such_variable": 1.0}]
     for other, name in zip((names[-1], *names), names, strict=False):
@@ -223,7 +233,7 @@ def check_refusal(world: Simulation) -> int:
         except InterventionError:
             continue
         raise AssertionError(f"do({request!r}) was not refused")
-    assert np.array_equal(trajectory(world, taken[2:]), expected), "a refusal left a trace"
+    assert np.array_equal(trajectory(world, taken), expected), "a refusal left a trace"
     return len(requests)
 
 
@@ -241,23 +251,19 @@ def check_future(world: Simulation, module: str = __name__) -> None:
         world: The world.
         module: A module that the other process has to import first.
     """
-    world.reset(seed=2)
-    trajectory(world, actions(world, 5, 3))
-    snapshot = world.snapshot()
-    here = _digests(world, snapshot)
-    assert _digests(world, pickle.loads(pickle.dumps(snapshot))) == here  # noqa: S301 # our own
-    child: Any = _elsewhere()
-    pickle.dump((module, pickle.dumps((world, snapshot))), child.stdin)
-    child.stdin.flush()
-    lines = iter(child.stdout.readline, b"")
-    found = next((line.decode() for line in lines if line.startswith(_LINE.encode())), _LINE)
-    assert found.removeprefix(_LINE).strip() == here, "another process has another future"
+    snapshot, *_ = _future(world, 2)
+    here = digests(world, snapshot)
+    assert digests(world, pickle.loads(pickle.dumps(snapshot))) == here  # noqa: S301 # our own
+    there = elsewhere(digests, world, snapshot, module=module)
+    assert there == here, "another process has another future"
 
 
 def check_batch(
     make: Callable[[], Simulation], n: int = 16, steps: int = 10, threads: int = 2
 ) -> None:
     """Check that worlds stepped together equal single ones, each with a change of its own.
+
+    A change whose physics explodes is left out.
 
     Args:
         make: Makes a world.
@@ -274,28 +280,24 @@ def check_batch(
             moved(world, names[index % len(names)])
         return world
 
-    first = begun(0, changed=False)
-    taken = np.stack([actions(first, steps, seed) for seed in range(n)], axis=1)
-    first.close()
-    singles, stable = [], []
+    taken: list[Floats] = []
+    singles: list[Floats] = []
+    worlds: list[Simulation] = []
     for index in range(n):
-        world = begun(index, changed=True)
-        try:
-            singles.append(trajectory(world, taken[:, index])[-1])
-            stable.append(True)
-        except EngineFailure:  # the physics of this change explodes: then without it
-            world.close()
-            world = begun(index, changed=False)
-            singles.append(trajectory(world, taken[:, index])[-1])
-            stable.append(False)
-        world.close()
-    batch = Batch([begun(i, changed=stable[i]) for i in range(n)], threads=threads)
-    for step in range(steps):
-        batch.advance(taken[step])
-    for index in range(n):
-        together = batch.world(index).current()[1].vector
-        assert np.array_equal(together, singles[index]), f"world {index} of the batch differs"
-    batch.close()
+        for changed in (True, False):
+            world = begun(index, changed=changed)
+            mine = actions(world, steps, index)
+            with contextlib.suppress(EngineFailure), contextlib.closing(world):
+                singles.append(trajectory(world, mine)[-1])
+                taken.append(mine)
+                worlds.append(begun(index, changed=changed))
+                break
+    with contextlib.closing(Batch(worlds, threads=threads)) as batch:
+        for step in range(steps):
+            batch.advance(np.stack([mine[step] for mine in taken]))
+        for index in range(n):
+            together = batch.world(index).current()[1].vector
+            assert np.array_equal(together, singles[index]), f"world {index} of the batch differs"
 
 
 def check_endurance(world: Simulation, steps: int = 2000, every: int = 20) -> tuple[int, str]:
@@ -338,8 +340,7 @@ def check_model(
     def make() -> World:
         return World.from_mjcf(source, backend=backend, **options)
 
-    started = time.perf_counter()
-    world = make()
+    started, world = time.perf_counter(), make()
     found: dict[str, Any] = {"variables": check_variables(world), "edges": len(world.graph.edges)}
     found["set and undone"], found["left over"] = check_undo(world)
     found["refused"] = check_refusal(world)
@@ -348,5 +349,4 @@ def check_model(
     check_batch(make)
     found["steps"], found["ended by"] = check_endurance(world, steps)
     world.close()
-    found["seconds"] = round(time.perf_counter() - started, 1)
-    return found
+    return {**found, "seconds": round(time.perf_counter() - started, 1)}

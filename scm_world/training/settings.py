@@ -12,7 +12,7 @@ from scm_world.curricula import resample
 from scm_world.errors import ScmWorldError, UnknownOption
 from scm_world.evaluation.episodes import METRICS
 from scm_world.tasks import TASKS, Task, tasks
-from scm_world.tasks.model import FILES, is_model
+from scm_world.tasks.factories import FILES, is_model
 from scm_world.variables.spaces import Frozen
 
 

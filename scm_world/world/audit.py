@@ -88,7 +88,7 @@ def report(
     change: Difference,
     before: Present,
     now: Present,
-    inertia: Mapping[str, Value],
+    inertia: Parameters,
     reported: Parameters,
     backend: Backend,
 ) -> Audit:
@@ -100,7 +100,7 @@ def report(
         change: What the backend had to change.
         before: What the backend had before; its values are not overwritten.
         now: What it has now.
-        inertia: Principal moments before, of the bodies whose mass or size changed.
+        inertia: Principal moments of bodies whose mass or size changed, before.
         reported: Parameters that were read back already.
         backend: That took over the plan.
     """
@@ -128,17 +128,15 @@ def report(
             old, new = before.compiled.view(name, before.state), now.values[name]
             if not same(old, new):
                 followed[name] = (_typed(old, new), np.array(new))
-    engine = {f"{body}.inertia": (old, backend.inertia(body)) for body, old in inertia.items()}
-    there, were = (
-        {*one.compiled.composition.blocks, *one.compiled.composition.obstacles}
-        for one in (now, before)
-    )
+    moments = backend.parameters(inertia)
+    engine = {".".join(key): (old, moments[key]) for key, old in inertia.items()}
+    there, were = ({*one.compiled.composition.bodies} for one in (now, before))
     came, went = sorted(there - were), sorted(were - there)
     remarks: tuple[str, ...] = ()
     if change.structure is None and any(what.endswith("friction") for _, what in change.parameters):
         known_keys = before.compiled.parameter_keys.items()
         changed = {key: before.values[name] for name, key in known_keys if key in change.parameters}
-        remarks = backend.remarks(changed)
+        remarks = backend.capabilities.remarks(backend, changed)
     return Audit(targets, followed, engine, tuple(came), tuple(went), remarks)
 
 

@@ -195,7 +195,7 @@ class CompiledTask(ActionVector):
         self.bundles = {v.name: v.parts for v in self.model.variables if v.parts}
         self.parts = frozenset(part for parts in self.bundles.values() for part in parts)
         self.commanded = {**self.actions, **_in_a_row(self.bundles, self.actions)}
-        states = self.composition.slices()
+        states = self.composition.system.layout.slices
         self.slices = {**states, **_in_a_row(self.bundles, states)}
         self._places = [
             (name, where, self.model.declared(name).shape) for name, where in self.slices.items()
@@ -285,7 +285,7 @@ class CompiledTask(ActionVector):
 
     @cached_property
     def _start(self) -> State:
-        found: State = self.composition.empty_state()
+        found: State = self.composition.system.empty_state()
         return found
 
     def empty_state(self, vector: Floats | None = None) -> State:
@@ -308,7 +308,8 @@ class CompiledTask(ActionVector):
 
     def view(self, name: str, state: State) -> Value:
         """Give one state, as a view of a vector."""
-        return state.vector[self.slices[name]].reshape(self.model.declared(name).shape)
+        found: Value = state.vector[self.slices[name]].reshape(self.model.declared(name).shape)
+        return found
 
     def in_coordinates(self, name: str, *values: Value) -> Value:
         """Give a value of a quantity in other coordinates, or values of the parts of a bundle."""

@@ -245,7 +245,7 @@ def _immaterial(
 
     Goals count as bodies where there are obstacles, in which they must not be.
     """
-    buries = bool(compiled.composition.obstacles)
+    buries = compiled.composition.hides_goals
     found = set()
     for name, act in request.items():
         if isinstance(act, Draw) and name not in structures.head:
@@ -280,15 +280,14 @@ def _stay(
     for state in compiled.carried:
         if not moved.isdisjoint(compiled.set_parents[state.name]):
             moved.add(state.name)
-    anyhow = {*compiled.composition.blocks, *compiled.composition.obstacles}
-    anyhow -= {name.partition(".")[0] for name in moved}
+    anyhow = {*compiled.composition.bodies} - {name.partition(".")[0] for name in moved}
     return not draws or any(anyhow.issuperset(overlap.bodies) for overlap in problems)
 
 
 def _buried(plan: InterventionPlan, request: Mapping[str, Any]) -> list[Overlap]:
     """List goals that were drawn into an obstacle. Where they are put by hand, they may be."""
     compiled = plan.compiled
-    if not compiled.composition.obstacles:
+    if not compiled.composition.hides_goals:
         return []
     draws = [name for name, act in request.items() if isinstance(act, Draw)]
     targets = [target for name in draws for target in compiled.model.targets(name)]

@@ -167,7 +167,7 @@ def _accepted(
             for part, own in divided(model.declared(kept), act).items():
                 accepted[model.target(part)] = (part, own)
         except InterventionError as problem:
-            reason = compiled.task.refused.get(name)
+            reason = dict(compiled.composition.system.refused).get(name)
             if reason is not None and isinstance(problem, UnknownVariable):
                 problem = NotIntervenable(name, reason)
             problems.append(problem)

@@ -345,7 +345,7 @@ class Simulation(WorldAttributes):
         """Name the state with the largest number, as it was before a step."""
         vector = self._values.state.vector
         worst = int(np.abs(vector).argmax())
-        places = self.composition.slices().items()
+        places = self.composition.system.layout.slices.items()
         name = next((name for name, where in places if where.start <= worst < where.stop), "")
         return f"before that step, the largest number was {vector[worst]:.3g}, of {name}"
 
@@ -544,12 +544,12 @@ class Simulation(WorldAttributes):
             self._offset = offset
             raise
 
-    def _inertia(self, change: Difference) -> dict[str, Value]:
+    def _inertia(self, change: Difference) -> Parameters:
         if change.structure is not None or not self.composition.movers():
             return {}
         bodies = {body for body, what in change.parameters if what in ("mass", "size")}
-        bodies -= {*self.composition.obstacles}
-        return {body: self.backend.inertia(body) for body in sorted(bodies)}
+        bodies -= {*self.composition.bodies}.difference(self.composition.movers())
+        return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
     def _applied(self, change: Difference) -> Parameters:
         """Read back what was applied.
@@ -598,8 +598,7 @@ class Simulation(WorldAttributes):
         commands = compiled.composition.commands
         self.translates = commands is not None and commands.applies(static)
         self.structure = compiled.structure(static)
-        timestep = compiled.composition.timestep(static)
-        self._substeps = max(1, round(self.control_period / timestep))
+        self._substeps = max(1, round(self.control_period / self.structure.timestep))
         self.version += 1
         if state is None:
             self.backend.read(values.state)

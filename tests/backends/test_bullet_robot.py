@@ -15,7 +15,7 @@ import robot_scenes
 from robot_scenes import busy_scene
 
 from scm_world.backends.bullet import BulletBackend
-from scm_world.backends.mujoco.reading import body_names, compiled
+from scm_world.backends.mujoco.reading import compiled
 from scm_world.errors import EngineFailure, MissingEngine
 from scm_world.models import Difference
 from scm_world.tasks.trifinger import hardware
@@ -40,8 +40,8 @@ def backend() -> Iterator[BulletBackend]:
 
 def robot(backend: BulletBackend) -> tuple[Any, Any, tuple[str, ...]]:
     """Give the engine, the client that holds the last step, and the names of the bodies."""
-    client = backend._last()
-    return backend._engine, client, body_names(compiled(backend.structure))
+    client = backend.base()
+    return backend._engine, client, backend.structure.body_names
 
 
 def test_links_are_where_kinematics_has_them(backend: BulletBackend) -> None:
@@ -55,7 +55,7 @@ def test_links_are_where_kinematics_has_them(backend: BulletBackend) -> None:
         for link in (1, 2, 3):
             place = client._built.bodies[names.index(hardware.link_name(finger, link))]
             state = engine.getLinkState(
-                *place, computeForwardKinematics=1, physicsClientId=client.handle
+                *place, computeForwardKinematics=1, physicsClientId=client.engine.handle
             )
             # The engine keeps the frames of links in single precision.
             np.testing.assert_allclose(state[4], places[link], atol=1e-6)
@@ -68,7 +68,7 @@ def test_every_link_has_its_inertia(backend: BulletBackend) -> None:
     for finger in hardware.FINGERS:
         for link in (1, 2, 3):
             place = client._built.bodies[names.index(hardware.link_name(finger, link))]
-            info = engine.getDynamicsInfo(*place, physicsClientId=client.handle)
+            info = engine.getDynamicsInfo(*place, physicsClientId=client.engine.handle)
             inertial, mass = hardware.INERTIAL[link], hardware.LINK_MASS[link]
             np.testing.assert_allclose(info[3], inertial.center, atol=1e-12)
             np.testing.assert_allclose(info[4], inertial.orientation, atol=1e-12)
@@ -85,8 +85,8 @@ def test_frictions_reach_the_shapes(backend: BulletBackend) -> None:
     places = [client._built.geoms[g] for g, name in owners.items() if name[:2].isdigit()]
     assert len(places) == 12
     for place in places:  # compound shapes would make saved states inexact
-        shapes = engine.getCollisionShapeData(*place, physicsClientId=client.handle)
-        info = engine.getDynamicsInfo(*place, physicsClientId=client.handle)
+        shapes = engine.getCollisionShapeData(*place, physicsClientId=client.engine.handle)
+        info = engine.getDynamicsInfo(*place, physicsClientId=client.engine.handle)
         assert len(shapes) == 1
         assert info[1] == pytest.approx(0.37)
         assert info[5] == 0.0
@@ -102,7 +102,7 @@ def test_nothing_slows_a_flying_block(backend: BulletBackend) -> None:
     backend.build(scene)
     backend.apply(Difference(parameters={("world", "gravity"): np.zeros(3)}))
     backend.step(np.array(hardware.REST), 100)
-    after = backend.state()
+    after = backend.read()
     np.testing.assert_array_equal(after.linear_velocities, scene.state.linear_velocities)
     np.testing.assert_allclose(after.angular_velocities, scene.state.angular_velocities, atol=1e-14)
 
@@ -121,7 +121,7 @@ def test_a_driven_joint_reaches_its_final_speed(backend: BulletBackend) -> None:
     }
     backend.build(scene.with_(parameters={**scene.parameters, **values}))
     backend.step(np.full(9, torque), 125)
-    np.testing.assert_allclose(backend.state().joint_velocities, torque / damping, rtol=0.02)
+    np.testing.assert_allclose(backend.read().joint_velocities, torque / damping, rtol=0.02)
 
 
 # --- life -----------------------------------------------------------------------------------------
@@ -152,7 +152,7 @@ def test_clients_are_given_back() -> None:
     backend = BulletBackend()
     engine = backend._engine
     backend.build(busy_scene())
-    handle = backend._last().handle
+    handle = backend.base().engine.handle
     assert engine.isConnected(handle)
     del backend
     assert not engine.isConnected(handle)

@@ -199,7 +199,7 @@ def test_fingertips_are_where_kinematics_says(backend: MujocoBackend) -> None:
     generator = np.random.default_rng(0)
     for height in (0.3, 0.37):
         backend.apply(Difference(parameters={("robot", "height"): np.array(height)}))
-        state = backend.state()
+        state = backend.read()
         state.joint_positions[:] = generator.uniform(hardware.JOINT_LOW, hardware.JOINT_HIGH)
         backend.apply(Difference(state=state))
         data = backend.realization.data

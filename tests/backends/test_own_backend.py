@@ -127,7 +127,7 @@ def test_the_example_moves_more_slowly(registry: dict[str, type[Backend]]) -> No
     slow, fast = make_backend("slow_motors"), make_backend("mujoco")
     for backend in (slow, fast):
         backend.build(busy_scene())
-    before = slow.state().joint_positions.copy()
+    before = slow.read().joint_positions.copy()
     kept = slow.snapshot()
     moved = [np.abs(play(backend, 1)[-1][:9] - before).max() for backend in (slow, fast)]
     assert module.AHEAD < moved[0] < 2 * module.AHEAD < moved[1]

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from robot_scenes import link_frames
+from robot_scenes import box_hull, link_frames
 
 from scm_world._types import Floats
 from scm_world.backends.renderer import body_names, render
 from scm_world.geometry import from_rotation_vector, rotation_matrix
-from scm_world.geometry.hulls import Hull, box_hull, hull_of
+from scm_world.geometry.hulls import Hull, hull_of
 from scm_world.models import GoalRegion, Light, Scene
 from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger import hardware

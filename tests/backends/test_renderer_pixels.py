@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from robot_scenes import box_hull
 
 from scm_world.backends.renderer import (
     ORIGINAL,
@@ -23,7 +24,6 @@ from scm_world.backends.renderer import (
     render,
     resized,
 )
-from scm_world.geometry.hulls import box_hull
 from scm_world.models import GoalRegion, Light, Scene
 from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger.cameras import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from robot_scenes import box_hull
 
 from scm_world._types import Floats
 from scm_world.backends.renderer.kernels import Canvas
 from scm_world.backends.renderer.picture import following, framing
 from scm_world.backends.renderer.shapes import SKY, draw_parts, goal_shapes, parted
 from scm_world.geometry import rotation_matrix
-from scm_world.geometry.hulls import box_hull
 from scm_world.models.camera import Camera
 from scm_world.models.scene import GoalRegion, Light
 from scm_world.models.shapes import Kind, Mesh, Shape, Shapes, Tiles, mesh_of

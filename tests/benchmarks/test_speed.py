@@ -120,13 +120,13 @@ def test_engine_alone_lives_the_same_episode(engine: str) -> None:
     given = actions(20)
     for action in given:
         env.step(action)
-    whole = env.world.backend.state().vector.copy()
+    whole = env.world.backend.read().vector.copy()
     told, alone = commands(env, given), bare(env)
     env.reset(seed=0)
     for one in told:
         alone(one)
 
-    np.testing.assert_array_equal(env.world.backend.state().vector, whole)
+    np.testing.assert_array_equal(env.world.backend.read().vector, whole)
     env.close()
 
 

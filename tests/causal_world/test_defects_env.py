@@ -80,7 +80,7 @@ def test_d07_pictures_do_not_move_what_they_show(backend: str) -> None:
     env.do({"tool_block.cartesian_position": place, "goal_block.cartesian_position": place + 0.05})
     env.render()
     np.testing.assert_array_equal(place, [0.05, 0.02, 0.1])
-    np.testing.assert_allclose(env.world.backend.state().positions[0], place, atol=1e-12)
+    np.testing.assert_allclose(env.world.backend.read().positions[0], place, atol=1e-12)
     np.testing.assert_array_equal(env.world.scene().state.positions[0], place)
     env.close()
 

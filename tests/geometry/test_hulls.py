@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from robot_scenes import box_hull
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from scm_world._types import Floats
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
-from scm_world.geometry import overlap_volume, rotation_matrix
-from scm_world.geometry.hulls import Hull, box_hull, extents, hull_of, hull_overlap, load_hull
+from scm_world.geometry import rotation_matrix
+from scm_world.geometry.filling import overlap_kernel
+from scm_world.geometry.hulls import Hull, extents, hull_of, hull_overlap, load_hull
 
 HERE, UPRIGHT = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
 TETRAHEDRON = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]])
@@ -238,7 +240,7 @@ def test_overlap_of_boxes(seed: int) -> None:
     hulls = (box_hull(size_a), shift, turn_a, box_hull(size_b), HERE, turn_b)
 
     smaller = min(np.prod(size_a), np.prod(size_b))
-    assert hull_overlap(*hulls) == pytest.approx(overlap_volume(*boxes), abs=1e-12 * smaller)
+    assert hull_overlap(*hulls) == pytest.approx(overlap_kernel(*boxes), abs=1e-12 * smaller)
 
 
 @pytest.mark.parametrize("seed", range(10))

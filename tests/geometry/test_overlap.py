@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scm_world._types import Floats
-from scm_world.geometry import aabb_overlap_fraction, overlap_fraction, overlap_volume
+from scm_world._types import ArrayLike, Floats
+from scm_world.geometry import aabb_overlap_fraction, overlap_fraction
+from scm_world.geometry.filling import overlap_kernel
 from scm_world.geometry.rotations import (
     from_rotation_vector,
     quaternion_product,
@@ -22,6 +23,11 @@ HERE = (0.0, 0.0, 0.0)
 EIGHTH = from_rotation_vector([0.0, 0.0, np.pi / 4])
 
 Box = tuple[Floats, Floats, Floats]
+
+
+def overlap_volume(*boxes: ArrayLike) -> float:
+    """Compute the volume that two boxes share: sizes, positions and orientations."""
+    return overlap_kernel(*(np.array(numbers, dtype=float) for numbers in boxes))
 
 
 def _vectors(low: float, high: float) -> st.SearchStrategy[Floats]:

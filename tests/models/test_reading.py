@@ -15,7 +15,6 @@ import pytest
 from model_files import LONG, PENDULUM, QUICK, SUITE, URDFS, arrays, model_file, pile
 
 from scm_world.backends import read_model
-from scm_world.backends.mujoco.fields import slots
 from scm_world.backends.mujoco.reading import compiled, permutation
 from scm_world.backends.mujoco.sources import realized
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
@@ -61,7 +60,7 @@ def test_writing_and_undoing_leaves_no_trace(model: Model) -> None:
     """Every parameter is read back as written, and its default restores every array to the bit."""
     mj = copy.copy(compiled(model))
     data, scratch = mujoco.MjData(mj), mujoco.MjData(mj)
-    before, places = arrays(mj), slots(compiled(model), model.default_parameters(), mj, data)
+    before, places = arrays(mj), model.slots(mj, data)
     assert places.keys() == {row.key for row in model.parameters}
     for row in model.parameters:
         slot, default = places[row.key], value(row, row.default)
@@ -250,7 +249,7 @@ def test_servos_have_gains_instead_of_numbered_slots() -> None:
         ("motor.kv", 0.5, "N m s/rad"),
     ]
     mj = copy.copy(compiled(model))
-    places = slots(compiled(model), model.default_parameters(), mj, mujoco.MjData(mj))
+    places = model.slots(mj, mujoco.MjData(mj))
     places["motor", "kp"].write(np.array(7.0))
     assert (mj.actuator_gainprm[0, 0], mj.actuator_biasprm[0, 1]) == (7.0, -7.0)
 
@@ -264,7 +263,7 @@ def test_a_color_is_that_of_the_material_until_it_is_set() -> None:
     mj = copy.copy(compiled(model))
     before, slot = (
         arrays(mj),
-        slots(compiled(model), model.default_parameters(), mj, mujoco.MjData(mj))["rod", "color"],
+        model.slots(mj, mujoco.MjData(mj))["rod", "color"],
     )
     assert model.parameters[0].default == (0.9, 0.1, 0.2, 1.0)
     for color in ([0.3, 0.4, 0.5, 1.0], [0.5, 0.5, 0.5, 1.0]):
@@ -279,7 +278,7 @@ def test_sizes_act_as_in_a_model_that_is_compiled_with_them() -> None:
     wide = pile(5).replace('size="0.1 0.1 0.1"', 'size="0.13 0.11 0.12"')
     model, other = read_model(pile(5)), read_model(wide)
     mj = copy.copy(compiled(model))
-    places = slots(compiled(model), model.default_parameters(), mj, mujoco.MjData(mj))
+    places = model.slots(mj, mujoco.MjData(mj))
     for row in other.parameters:
         places[row.key].write(value(row, row.default))
     mujoco.mj_setConst(mj, mujoco.MjData(mj))
@@ -301,9 +300,7 @@ def test_mocap_bodies_have_a_pose_that_can_be_set() -> None:
     row = next(row for row in model.parameters if row.name == "hand.position")
     mj = copy.copy(compiled(model))
     data = mujoco.MjData(mj)
-    slots(compiled(model), model.default_parameters(), mj, data)[row.key].write(
-        np.array([0.0, 0.3, 1.0])
-    )
+    model.slots(mj, data)[row.key].write(np.array([0.0, 0.3, 1.0]))
     mujoco.mj_step(mj, data, 500)
     assert data.body("held").xpos[1] == pytest.approx(0.3, abs=0.05)
 

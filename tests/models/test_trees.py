@@ -11,7 +11,6 @@ import pytest
 from model_files import GYMNASIUM, SUITE, TRANSMISSIONS, URDFS, driven, model_file, pile
 
 from scm_world.backends import read_model
-from scm_world.backends.mujoco.fields import slots
 from scm_world.backends.mujoco.reading import compiled, permutation
 from scm_world.models import Model
 
@@ -112,7 +111,7 @@ class Physics:
     def __init__(self, model: Model) -> None:
         self.model, self.mj = model, copy.copy(compiled(model))
         self.data, self.scratch = mujoco.MjData(self.mj), mujoco.MjData(self.mj)
-        self.slots = slots(compiled(model), model.default_parameters(), self.mj, self.data)
+        self.slots = model.slots(self.mj, self.data)
         self.places = permutation(model)
         self.data.warning.number[:] = 1
         self.tree = np.empty(model.layout.size, dtype=int)

@@ -56,11 +56,11 @@ class Lab:
         """Hold the robot still for a while."""
         steps = round(seconds / self.preset.timestep)
         self.backend.step(self.rest, steps)
-        return self.backend.state()
+        return self.backend.read()
 
     def push(self, velocity: ArrayLike) -> None:
         """Give every block a velocity [m/s]."""
-        state = self.backend.state()
+        state = self.backend.read()
         state.linear_velocities[:] = velocity
         state.angular_velocities[:] = 0.0
         self.backend.apply(Difference(state=state))

@@ -104,7 +104,7 @@ def test_torques_and_weight_accelerate_the_fingers(lab, seed: int) -> None:
     lab.place([1.0, 0.0, 0.5], parameters, joints=joints, torques=True)
     torques = random.uniform(-0.2, 0.2, 9)
     lab.backend.step(torques, 1)
-    found = lab.backend.state().joint_velocities / lab.preset.timestep
+    found = lab.backend.read().joint_velocities / lab.preset.timestep
     expected = [
         acceleration(k, joints[3 * k : 3 * k + 3], masses[k], torques[3 * k : 3 * k + 3], gravity)
         for k in range(3)
@@ -121,7 +121,7 @@ def test_the_torques_of_the_weight_hold_the_fingers_at_rest(lab) -> None:
         assert found[2] == pytest.approx(9.81 * moment * np.sin(0.5 + 0.7))
     lab.place([1.0, 0.0, 0.5], {("world", "gravity"): gravity}, joints=joints, torques=True)
     lab.backend.step(np.ravel(torques), 50)
-    np.testing.assert_allclose(lab.backend.state().joint_positions, joints, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(lab.backend.read().joint_positions, joints, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("torques", [False, True])

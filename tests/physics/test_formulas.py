@@ -135,6 +135,6 @@ def test_a_tower_stands(lab) -> None:
     heights = ON_FLOOR + SIZE * np.arange(5)
     parameters = {key: value for i in range(5) for key, value in cube(i).items()}
     lab.place(np.column_stack([noise, heights]), parameters)
-    start = lab.backend.state().positions.copy()
+    start = lab.backend.read().positions.copy()
     drift = np.abs(lab.wait(10.0).positions - start).max()
     assert drift <= 3e-3

@@ -50,7 +50,7 @@ def test_lift(lab, size: float, mass: float, friction: float) -> None:
             assert solution.reached.all()
             joints = solution.joint_positions
             lab.backend.step(joints, round(PERIOD / lab.preset.timestep))
-            state = lab.backend.state()
+            state = lab.backend.read()
             tips = forward(state.joint_positions, HEIGHT).reshape(3, 3)
             offsets.append(state.positions[0] - tips.mean(axis=0))
     assert state.positions[0, 2] - size / 2 == pytest.approx(0.1, abs=0.01)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from robot_scenes import box_hull
 
 from scm_world.errors import NotIntervenable
 from scm_world.geometry import (
@@ -14,7 +15,7 @@ from scm_world.geometry import (
     quaternion_product,
     rotation_matrix,
 )
-from scm_world.geometry.hulls import Hull, box_hull, hull_of
+from scm_world.geometry.hulls import Hull, hull_of
 from scm_world.tasks import PickAndPlace, Picking, Pushing
 from scm_world.tasks.trifinger import hardware
 from scm_world.variables import Draw

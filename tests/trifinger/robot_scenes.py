@@ -13,7 +13,7 @@ import numpy as np
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends import Backend
 from scm_world.backends.mujoco.backend import realize
-from scm_world.geometry.hulls import Hull
+from scm_world.geometry.hulls import Hull, hull_of
 from scm_world.geometry.rotations import from_rotation_vector, quaternion_product
 from scm_world.models.scene import Difference, ParameterKey, Scene
 from scm_world.tasks.trifinger import hardware
@@ -23,6 +23,11 @@ from scm_world.tasks.trifinger.system import tip_name, trifinger
 
 SUBSTEPS = 10
 SEED = 20_26
+
+
+def box_hull(size: ArrayLike) -> Hull:
+    """Make a box of these edge lengths [m] as a hull."""
+    return hull_of(np.asarray(size) * (np.indices((2, 2, 2)).reshape(3, 8).T - 0.5))
 
 
 def octahedron(a: float, b: float, c: float) -> Hull:
@@ -122,7 +127,7 @@ def play(
     if structure.torques is not torques:
         backend.apply(Difference(structure.with_(torques=torques)))
     center = np.zeros(9) if torques else np.array(hardware.REST)
-    state = backend.state()
+    state = backend.read()
     states = np.empty((steps, state.vector.size))
     for row in states:
         command = center + generator.uniform(-0.3, 0.3, 9)

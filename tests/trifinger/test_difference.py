@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from robot_scenes import busy_scene, other_value
+from robot_scenes import box_hull, busy_scene, other_value
 
-from scm_world.geometry.hulls import box_hull
 from scm_world.models import Difference, Scene, diff
 from scm_world.models.scene import complete
 from scm_world.tasks.trifinger.hardware import PRECISE, ControllerSpec

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from robot_scenes import link_frames, octahedron
+from robot_scenes import box_hull, link_frames, octahedron
 
 from scm_world._types import ArrayLike
 from scm_world.geometry import from_rotation_vector
-from scm_world.geometry.hulls import Hull, box_hull
+from scm_world.geometry.hulls import Hull
 from scm_world.models import Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.feasibility import overlaps

@@ -43,7 +43,12 @@ class Faulty(FakeBackend):  # type: ignore[misc] # final for users; a double of 
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
         """Read back, perhaps wrongly."""
+        keys = tuple(keys)
         found: dict[ParameterKey, Floats] = dict(super().parameters(keys))
+        if any(what == "inertia" for _, what in keys):
+            if self.once("inertia"):
+                raise EngineFailure("inertia", self.name)
+            return found
         fault = self.once("parameters")
         if fault == "parameters raises":
             raise EngineFailure(fault, self.name)
@@ -52,12 +57,6 @@ class Faulty(FakeBackend):  # type: ignore[misc] # final for users; a double of 
         if fault == "parameters are nan":
             found = {key: value * np.nan for key, value in found.items()}
         return found
-
-    def inertia(self, body: str) -> Floats:
-        """Compute the inertia, perhaps not."""
-        if self.once("inertia"):
-            raise EngineFailure("inertia", self.name)
-        return super().inertia(body)
 
     def read(self, into: PhysicalState) -> None:
         """Read the state, perhaps wrongly."""

@@ -8,7 +8,7 @@ from worlds import BACKENDS, NEEDS_BULLET
 
 from scm_world import Draw, ModelTask, World
 from scm_world.errors import Infeasible
-from scm_world.tasks.model import ModelComposition
+from scm_world.tasks.composition import Composition
 from scm_world.variables import Box
 
 SCENE = """
@@ -114,7 +114,7 @@ def test_nothing_is_looked_at_where_nothing_moves(monkeypatch: pytest.MonkeyPatc
     def fail(*_: object, **__: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr(ModelComposition, "overlaps", fail)
+    monkeypatch.setattr(Composition, "overlaps", fail)
     world.do({"hinge.velocity": 1.0, "ball.mass": 2.0, "gravity": [0.0, 0.0, -1.0]})
     with pytest.raises(AssertionError):
         world.do({"hinge.position": 0.01})

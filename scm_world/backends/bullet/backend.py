@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import weakref
 from array import array
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, final
 
@@ -14,45 +12,14 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, Capabilities, ContactPoint, EngineSnapshot
-from scm_world.backends.bullet.client import (
-    Client,
-    Instant,
-    Values,
-    arrays,
-    known,
-    plain,
-)
-from scm_world.backends.bullet.engine import load, version
-from scm_world.backends.bullet.honoured import check, heavy, keys, settle, supports
-from scm_world.errors import EngineFailure, Infeasible, ModelError
+from scm_world.backends.bullet.client import Client, Instant, Saved, alike
+from scm_world.backends.bullet.engine import load
+from scm_world.backends.bullet.honoured import check, rebuilt, settle, supports
+from scm_world.errors import EngineFailure, Infeasible, ModelError, UnknownOption
 from scm_world.models.model import Model
-from scm_world.models.scene import (
-    Difference,
-    ParameterKey,
-    Parameters,
-    Scene,
-    State,
-    Structure,
-    complete,
-)
+from scm_world.models.scene import Difference, ParameterKey, Parameters, Scene, complete
 
 LONG = 200  # [physics steps] from here on, saving the engine's state is cheaper than a replay
-AHEAD = 1  # numbers of each step before its command: its substeps
-
-
-@final
-class SavedState:
-    """A claim on a state that a client keeps; the client forgets it when the claim is dropped."""
-
-    def __init__(self, client: Client) -> None:
-        self.client = client
-        self.generation = client.generation
-        self.ticket = client.save()
-        weakref.finalize(self, client.forget, self.ticket).atexit = False
-
-    def usable(self) -> bool:
-        """Tell whether the client still stands where the state is exact."""
-        return self.client.handle is not None and self.client.generation == self.generation
 
 
 @final
@@ -62,27 +29,27 @@ class History:
 
     Attributes:
         origin: The last canonical state.
-        rows: The steps: substeps and command of each.
+        rows: The steps: how many physics steps, then the command.
         edits: Changes of parameters: the length of ``rows`` at that moment, and the new values.
         substeps: How many physics steps a replay takes.
     """
 
     origin: Instant
     rows: array[float] = field(default_factory=lambda: array("d"))
-    edits: list[tuple[int, Values]] = field(default_factory=list)
+    edits: list[tuple[int, Parameters]] = field(default_factory=list)
     substeps: int = 0
 
-    def relive(self, client: Client) -> None:
-        """Go through it again, from the canonical state to the end."""
+    def replay(self, client: Client) -> None:
+        """Repeat it, from the canonical state to the end."""
         client.canonicalize(self.origin)
-        edits, row = list(reversed(self.edits)), AHEAD + self.origin.structure.n_commands
+        edits, row = list(reversed(self.edits)), 1 + self.origin.structure.n_commands
         for start in range(0, len(self.rows), row):
             while edits and edits[-1][0] == start:
                 client.edit(edits.pop()[1])
             substeps, *command = self.rows[start : start + row]
             client.step(command, int(substeps))
-        for _, values_ in reversed(edits):
-            client.edit(values_)
+        for _, parameters in reversed(edits):
+            client.edit(parameters)
 
 
 @final
@@ -91,29 +58,31 @@ class Record:
     """What a snapshot of Bullet holds. It can be pickled; the saved state then stays behind.
 
     Attributes:
-        origin: See ``History``.
-        rows: The same. They are shared, so that taking them costs little: it may go on.
-        length: How many of its numbers belong to this record.
-        edits: See ``History``.
-        reported: What cannot be set, after the last step.
-        present: The world now, if anything was changed since.
-        light: Whether the present differs from the last step in nothing but light parameters.
-        resting: The state after the last step.
+        history: Until the last step. It is shared, so that taking it costs little: it may go on.
+        length: How many numbers of its rows belong to this record.
+        n_edits: How many of its edits do.
+        last: The world after the last step.
+        now: The world with what was changed since.
+        light: Whether the two differ in nothing but parameters that live bodies can take on.
         saved: The engine's own state after the last step, if one was kept.
     """
 
-    origin: Instant
-    rows: array[float]
+    history: History
     length: int
-    edits: tuple[tuple[int, Values], ...]
-    reported: list[float]
-    present: Instant | None
+    n_edits: int
+    last: Instant
+    now: Instant
     light: bool
-    resting: list[float]
-    saved: SavedState | None = None
+    saved: Saved | None = None
+
+    def past(self) -> History:
+        """Copy the history as far as it belongs to this record."""
+        rows, origin = self.history.rows[: self.length], self.history.origin
+        substeps = int(sum(rows[:: 1 + origin.structure.n_commands]))
+        return History(origin, rows, self.history.edits[: self.n_edits], substeps)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "rows": self.rows[: self.length], "saved": None}
+        return {**self.__dict__, "history": self.past(), "saved": None}
 
 
 @final
@@ -133,74 +102,77 @@ class BulletBackend(Backend):
     """
 
     name: ClassVar[str] = "bullet"
-    capabilities: ClassVar[Capabilities] = Capabilities(snapshot="replay")
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        supports=supports, remarks=lambda backend, before: backend.client().remarks(before)
+    )
+
+    _history: History
+    _last: Instant  # the world after the last step
+    _now: Instant  # with what was changed since
+    _light: bool  # whether the first client can hold it, edited
 
     def __init__(self) -> None:
-        self._engine = load()
-        self._version = version()
+        self._engine, self.version = load()
         self._base: Client | None = None  # holds the world of the last step, once it is needed
-        self._lost = False  # whether the past must be replayed before the base is used
         self._spare: Client | None = None  # holds the canonical world, if there is one
-        self._history: History | None = None
-        self._before: Values = {}  # parameters of the last step
-        self._present: Instant | None = None  # what was made of the last step since
-        self._light = True  # whether the base itself holds the present, and not the spare
-        self._reported: list[float] = []  # what cannot be set, after the last step
-        self._resting: list[float] | None = None  # state of the base, once it was asked for
-        self._saved: SavedState | None = None  # of the base
+        self._saved: Saved | None = None  # stands for the state of the base
 
-    @property
-    def version(self) -> str:
-        """Version of pybullet."""
-        return self._version
-
-    @property
-    def structure(self) -> Structure:
-        """What was built."""
-        return (self._present or self._lived().origin).structure
+    def __getattr__(self, name: str) -> Any:
+        if name == "structure":
+            return self._now.structure
+        if name in ("_history", "_last", "_now"):
+            raise EngineFailure("there is no scene yet; call build() first", self.name)
+        raise AttributeError(name)
 
     # --- clients -------------------------------------------------------------------------------
 
-    def _lived(self) -> History:
-        if self._history is None:
-            raise EngineFailure("there is no scene yet; call build() first", self.name)
-        return self._history
-
-    def _last(self) -> Client:
-        """Give the client that holds the world of the last step."""
-        history = self._lived()
-        if self._base is None:
-            self._base, self._lost = Client(self._engine), True
-        if self._lost:
-            history.relive(self._base)
-            self._lost = False
+    def base(self) -> Client:
+        """Return the client that holds the last step, perhaps with what live bodies took on."""
+        history = self._history
+        self._base = self._base or Client(self._engine)
+        if self._base.holds is not history:
+            history.replay(self._base)
+            self._base.holds = history
+            if self._light:
+                self._base.edit(self._now.parameters)
         return self._base
 
-    def _other(self) -> Client:
-        """Give the client that does not hold the last step."""
-        if self._spare is None:
-            self._spare = Client(self._engine)
+    def _recall(self) -> None:
+        """Spare the base a replay, if one of the clients still has the saved state."""
+        base, spare = self._base, self._spare
+        if self._saved is None or (base and base.holds is self._history):
+            return
+        if base and base.load(self._saved):
+            base.holds = self._history
+        elif spare and spare.load(self._saved):
+            spare.holds = self._history
+            self._base, self._spare = spare, base
+
+    def client(self) -> Client:
+        """Return the client that holds the present."""
+        if self._light:
+            return self.base()
+        self._spare = self._spare or Client(self._engine)
+        if self._spare.holds is not self._now:
+            self._spare.canonicalize(self._now)
+            self._spare.holds = self._now
         return self._spare
 
-    def _now(self) -> Client:
-        """Give the client that holds the present."""
-        return self._last() if self._light else self._other()
+    def _drop(self, client: Client) -> None:
+        """Disconnect a client in which something went wrong."""
+        client.engine.close()
+        if client is self._base:
+            self._base = None
+        else:
+            self._spare = None
 
     # --- the interface -------------------------------------------------------------------------
 
     def build(self, scene: Scene) -> None:
         """Realise a scene from nothing; with the bodies that are there already, where possible."""
         structure = scene.structure
-        if not isinstance(structure, Model):
-            name = type(structure).__name__
-            raise ModelError([f"Bullet cannot realise a {name}; it takes models"])
-        parameters = plain(scene.parameters, known(scene.parameters, keys(structure)))
-        check(structure, parameters)
-        origin = Instant(structure, parameters, settle(structure, scene.state))
-        with self._all_or_nothing():
-            self._other().canonicalize(origin)
-        self._present, self._light = origin, False
-        self._reported = [0.0] * int((~structure.layout.can_be_set).sum())
+        parameters = self._checked(structure, {}, scene.parameters)
+        self._bring(Instant(structure, parameters, settle(structure, scene.state)))
         self._commit()
 
     def apply(self, difference: Difference) -> None:
@@ -212,88 +184,69 @@ class BulletBackend(Backend):
             NotIntervenable: The engine has no such parameter.
             EngineFailure: A value is not finite, or the engine refused. The world is as it was.
         """
-        present = self._described()
-        wish = self._wish(present, difference)
-        light = self._is_light(self._described_base(), wish)
-        with self._all_or_nothing():
-            if light:
-                changed = difference.parameters if self._light else wish.parameters
-                self._last().edit({key: wish.parameters[key] for key in changed})
-            elif not self._light and self._is_light(present, wish):
-                spare = self._other()
-                spare.edit({key: wish.parameters[key] for key in difference.parameters})
-            else:
-                self._other().canonicalize(wish)
-        self._present, self._light = wish, light
-
-    def _described_base(self) -> Instant:
-        """Describe the world of the last step."""
-        structure = self._lived().origin.structure
-        if self._resting is None:
-            self._resting = self._last().read([0.0] * len(self._reported))
-        return Instant(structure, self._before, self._resting)
-
-    def _described(self) -> Instant:
-        """Describe the present."""
-        return self._present or self._described_base()
-
-    def _wish(self, present: Instant, difference: Difference) -> Instant:
-        """Say which world the difference makes of the present."""
-        structure, parameters, state = present.structure, present.parameters, present.state
-        if difference.structure is not None:
-            now = Scene(
-                structure,
-                arrays(parameters),
-                structure.empty_state().with_vector(np.array(state)),
-            )
-            structure = difference.structure
-            difference = complete(now, structure, difference)
-            given = difference.parameters
-            parameters = plain(given, known(given, keys(structure)))
-        elif difference.parameters:
-            given = difference.parameters
-            parameters = {**parameters, **plain(given, known(parameters, given))}
-        if difference.structure is not None or difference.parameters:
-            check(structure, parameters)
+        now, last, structure = self._now, self._last, difference.structure
+        state, known = now.structure.empty_state().with_vector(now.state), now.parameters
+        if structure is not None:
+            difference = complete(Scene(now.structure, known, state), structure, difference)
+            known = {}
+        else:
+            structure = now.structure
+        parameters, vector = self._checked(structure, known, difference.parameters), now.state
         if difference.state is not None:
-            state = settle(structure, difference.state)
-        return Instant(structure, parameters, state)
-
-    def _is_light(self, here: Instant, there: Instant) -> bool:
-        """Tell whether one world becomes another without setting a state.
-
-        That is so if only parameters change that live bodies can take on.
-        """
-        return (
-            here.structure == there.structure
-            and here.state == there.state
-            and all(here.parameters[k] == there.parameters[k] for k in heavy(here.structure))
+            vector = settle(structure, difference.state, state)
+        settable = structure.layout.can_be_set
+        self._bring(
+            Instant(structure, parameters, vector),
+            light=structure == last.structure
+            and np.array_equal(vector[settable], last.state[settable])
+            and alike(parameters, last.parameters, rebuilt(structure)),
         )
 
-    @contextmanager
-    def _all_or_nothing(self) -> Iterator[None]:
-        """Bring the present back, should the engine fail half way."""
+    def _checked(self, structure: Any, known: Parameters, given: Parameters) -> Parameters:
+        """Return all parameters, some of them new; those that do not change are the same arrays."""
+        if not isinstance(structure, Model):
+            name = type(structure).__name__
+            raise ModelError([f"Bullet cannot realise a {name}; it takes models"])
+        found, before = dict[ParameterKey, Floats](), vars(self).get("_now")
+        for key in given if known else [row.key for row in structure.parameters]:
+            if key not in (known or given):
+                raise UnknownOption("parameter", ".".join(key), map(".".join, known or given))
+            value = np.array(given[key], dtype=np.float64)
+            old = value if before is None else before.parameters.get(key, value)
+            found[key] = old if old.tobytes() == value.tobytes() else value
+        check(structure, found)
+        return {**known, **found}
+
+    def _bring(self, wish: Instant, *, light: bool = False) -> None:
+        """Make a world the present, which stays as it was, should the engine fail half way."""
+        self._spare = self._spare or Client(self._engine)
+        client = self.base() if light else self._spare
         try:
-            yield
+            if light:
+                client.edit(wish.parameters)
+            else:
+                client.canonicalize(wish)
+                client.holds = wish
         except Infeasible:  # nothing was told to the engine
-            if self._history is not None:
-                self._return()
             raise
         except Exception as error:
-            if self._spare is not None:
-                self._spare.close()
-                self._spare = None
-            if self._history is not None:
-                self._return()
+            self._drop(client)
             raise EngineFailure(f"Bullet refused the change: {error}", self.name) from error
+        self._now, self._light = wish, light
 
-    def _return(self) -> None:
-        """Bring the clients back to the present."""
-        present = self._described()
+    def _commit(self) -> None:
+        """Make the present the world that everything after it starts from."""
+        now = self._now
         if self._light:
-            self._last().edit(present.parameters)
+            old = self._last.parameters
+            pending = {k: v for k, v in now.parameters.items() if not alike({k: v}, old, [k])}
+            if pending:
+                self._history.edits.append((len(self._history.rows), pending))
         else:
-            self._other().canonicalize(present)
+            client, self._history = self.client(), History(now)
+            client.holds = self._history
+            self._base, self._spare, self._saved = client, self._base, None
+        self._last, self._light = now, True
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
         """Read parameters back; see ``Client.parameters``.
@@ -301,92 +254,50 @@ class BulletBackend(Backend):
         Raises:
             UnknownOption: The scene has no such parameter.
         """
-        return self._now().parameters(known(self._described().parameters, keys))
+        return self.client().parameters(keys)
 
-    def inertia(self, body: str) -> Floats:
-        """Read the principal moments of inertia of a body, shape (3,) [kg m²].
-
-        Raises:
-            UnknownOption: There is no such body.
-        """
-        return self._now().inertia(body)
-
-    def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """Say which frictions were changed without an effect."""
-        return self._now().remarks(before)
-
-    def read(self, into: State) -> None:
-        """Write the present state into an existing vector."""
-        numbers = self._now().read(self._reported)
-        if not math.isfinite(sum(numbers)):
+    def read(self, into: Any = None) -> Any:
+        """Write the present state into an existing one, or a new one."""
+        now = self._now
+        if not math.isfinite(now.state.sum()):
             raise EngineFailure("Bullet produced a state that is not finite", self.name)
-        into.vector[:] = numbers
+        into = now.structure.empty_state() if into is None else into
+        into.vector[:] = now.state
+        return into
 
     def step(self, command: Floats, substeps: int) -> None:
-        """Hold a command for some physics steps.
-
-        Raises:
-            UnknownOption: Commands of this structure mean something else.
-        """
+        """Hold a command for some physics steps."""
         numbers, size = np.asarray(command, dtype=np.float64).tolist(), self.structure.n_commands
         if len(numbers) != size:
             raise ValueError(f"a command has {size} numbers, got {len(numbers)}")
         if substeps < 1:
             return
-        self._commit()
-        client, history = self._last(), self._lived()
+        if self._now is not self._last:
+            self._commit()
+        client, history, last = self.base(), self._history, self._last
         try:
-            reported = client.step(numbers, substeps)
+            client.step(numbers, substeps)
+            state = client.read()
         except Exception as error:
-            client.close()  # torques that were not stepped would count twice
-            self._base = None
+            self._drop(client)  # torques that were not stepped would count twice
             raise EngineFailure(f"Bullet could not step: {error}", self.name) from error
         history.rows.extend((substeps, *numbers))
         history.substeps += substeps
-        self._reported, self._resting, self._saved = reported, None, None
-
-    def _commit(self) -> None:
-        """Make the present the world that everything after it starts from."""
-        if self._present is None:
-            return
-        if self._light:
-            history, before = self._lived(), self._before
-            now = self._present.parameters
-            pending = {key: value for key, value in now.items() if value != before[key]}
-            if pending:
-                history.edits.append((len(history.rows), pending))
-        else:
-            self._history = History(self._present)
-            self._base, self._spare, self._lost = self._spare, self._base, False
-            self._resting = self._saved = None
-        self._before = self._present.parameters
-        self._present, self._light = None, True
+        self._last = self._now = Instant(last.structure, last.parameters, state)
+        self._saved = None
 
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step."""
-        return self._last().contacts()
-
-    def supports(self, structure: Structure, key: ParameterKey) -> bool:
-        """Tell whether a parameter of a structure can be set."""
-        return isinstance(structure, Model) and supports(structure, key)
+        return self.base().contacts()
 
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""
-        history, resting = self._lived(), self._described_base().state
-        if history.substeps >= LONG and self._saved is None and not self._lost:
-            self._saved = SavedState(self._last())
-        record = Record(
-            history.origin,
-            history.rows,
-            len(history.rows),
-            tuple(history.edits),
-            self._reported,
-            self._present,
-            self._light,
-            resting,
-            self._saved,
-        )
-        return self.sealed(record)
+        history, base = self._history, self._base
+        if history.substeps >= LONG and self._saved is None and base and base.holds is history:
+            self._saved = base.save()
+        counts = len(history.rows), len(history.edits)
+        record = Record(history, *counts, self._last, self._now, self._light, self._saved)
+        return EngineSnapshot.of(self, record)
 
     def restore(self, snapshot: EngineSnapshot) -> None:
         """Go back to a snapshot.
@@ -394,36 +305,27 @@ class BulletBackend(Backend):
         Raises:
             SnapshotMismatch: It was taken by another engine, or another version of it.
         """
-        record: Record = self.opened(snapshot)
-        rows, row = record.rows[: record.length], AHEAD + record.origin.structure.n_commands
-        self._history = History(record.origin, rows, list(record.edits), int(sum(rows[::row])))
-        self._before = dict(record.origin.parameters)
-        for _, edit in record.edits:
-            self._before.update(edit)
-        self._present, self._light = record.present, record.light
-        self._reported, self._resting = record.reported, record.resting
-        self._lost, self._saved = True, None
+        record: Record = snapshot.opened(self)
+        mine: History | None = vars(self).get("_history")
+        counts = (len(mine.rows), len(mine.edits)) if mine is record.history else None
+        if counts != (record.length, record.n_edits):
+            self._history = record.past()
+        self._last, self._now, self._light = record.last, record.now, record.light
+        self._saved = record.saved
         try:
-            self._recall(record.saved)
-            self._return()
+            self._recall()
+            if self._light:
+                self.base().edit(record.now.parameters)
+            self.client()
         except Exception as error:
             self.close()
             raise EngineFailure(f"Bullet could not go there: {error}", self.name) from error
-
-    def _recall(self, saved: SavedState | None) -> None:
-        """Spare the base a replay, if one of the clients still has the saved state."""
-        if saved is None or not saved.usable():
-            return
-        if saved.client is self._spare:
-            self._base, self._spare = self._spare, self._base
-        if saved.client is self._base:
-            saved.client.load(saved.ticket)
-            saved.client.edit(self._before)
-            self._lost, self._saved = False, saved
 
     def close(self) -> None:
         """Disconnect both clients. Closing twice is harmless."""
         for client in (self._base, self._spare):
             if client is not None:
-                client.close()
-        self._base = self._spare = self._history = self._present = self._saved = None
+                client.engine.close()
+        self._base = self._spare = self._saved = None
+        for name in ("_history", "_last", "_now"):
+            vars(self).pop(name, None)

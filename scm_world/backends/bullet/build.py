@@ -9,7 +9,7 @@ shapes of one body can differ in what they touch. A shape that cannot move is a 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, final
 
@@ -27,59 +27,90 @@ HULL_MARGIN = 1e-5  # [m] a mesh is inflated by so much, or by the margin of its
 GEAR_ERP = 0.2  # share of the error of a coupling that a step takes away
 STRONGEST = 1e9  # [N m] or [N] of a coupling
 
-FREE, BALL, SLIDE, HINGE = (
-    int(mujoco.mjtJoint.mjJNT_FREE),
-    int(mujoco.mjtJoint.mjJNT_BALL),
-    int(mujoco.mjtJoint.mjJNT_SLIDE),
-    int(mujoco.mjtJoint.mjJNT_HINGE),
-)
-PLANE, SPHERE, CAPSULE, CYLINDER, BOX, MESH = (
-    int(mujoco.mjtGeom.mjGEOM_PLANE),
-    int(mujoco.mjtGeom.mjGEOM_SPHERE),
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE),
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER),
-    int(mujoco.mjtGeom.mjGEOM_BOX),
-    int(mujoco.mjtGeom.mjGEOM_MESH),
-)
-SHAPES = (PLANE, SPHERE, CAPSULE, CYLINDER, BOX, MESH)
-"""The shapes that the engine has."""
+FREE, BALL, SLIDE, HINGE = range(4)
+"""Kinds of joints, as MuJoCo numbers them (``mjtJoint``)."""
+JOINTS = {HINGE: "JOINT_REVOLUTE", SLIDE: "JOINT_PRISMATIC", BALL: "JOINT_SPHERICAL"}
+"""Their names in the engine."""
 
-UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
+MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
+SHAPES = {
+    int(mujoco.mjtGeom.mjGEOM_PLANE): "GEOM_PLANE",
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): "GEOM_SPHERE",
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): "GEOM_CAPSULE",
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "GEOM_CYLINDER",
+    int(mujoco.mjtGeom.mjGEOM_BOX): "GEOM_BOX",
+    MESH: "GEOM_MESH",
+}
+"""The shapes that the engine has, by the kinds of MuJoCo's."""
+
+ORIGIN, UNTURNED = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+
+LINK = (
+    "linkMasses",
+    "linkCollisionShapeIndices",
+    "linkVisualShapeIndices",
+    "linkPositions",
+    "linkOrientations",
+    "linkInertialFramePositions",
+    "linkInertialFrameOrientations",
+    "linkParentIndices",
+    "linkJointTypes",
+    "linkJointAxis",
+)
+"""Arguments of ``createMultiBody`` for every link."""
 
 
 @final
 @dataclass
 class Unit:
-    """A multibody, or a body that cannot move.
+    """A multibody, or a body that cannot move. Equal ones need not be made again.
 
     Attributes:
-        made_of: Everything that cannot be changed while it is there.
+        bodies: The numbers of its bodies in the compiled model.
+        joints: The numbers of its joints.
+        geoms: The numbers of those of its shapes that can touch something.
         multibody: Its number in the engine.
-        bodies: The links that carry the masses of its bodies.
-        joints: The links of its joints; -1 for that of a free body.
-        geoms: The links that are its shapes.
+        links: The links of each body, of each joint and of each shape, in the order above; that of
+            a body carries its mass, and that of a free joint is -1.
+        base: Arguments of ``createMultiBody`` for the base.
+        rows: Those for each link, see ``LINK``. Masses are 1 or 0 until they are told.
+        shapes: Of each shape, the arguments of ``createCollisionShape`` and its margin [m].
+        gears: Of each coupling, two joints, an offset and a ratio.
+        rest: What else cannot be changed while it is there.
     """
 
-    made_of: tuple[Any, ...]
-    multibody: int
-    bodies: list[int]
-    joints: list[int]
-    geoms: list[int]
+    bodies: list[int] = field(compare=False)
+    joints: list[int] = field(compare=False)
+    geoms: list[int] = field(compare=False)
+    multibody: int = field(default=-1, compare=False)
+    links: tuple[list[int], list[int], list[int]] = ([], [], [])
+    base: dict[str, Any] = field(default_factory=dict)
+    rows: list[list[Any]] = field(default_factory=list)
+    shapes: list[tuple[dict[str, Any], float]] = field(default_factory=list)
+    gears: list[tuple[int, int, float, float]] = field(default_factory=list)
+    rest: tuple[bytes, ...] = ()
 
-
-@final
-@dataclass(frozen=True)
-class Plan:
-    """What becomes a unit, by the numbers in the compiled model."""
-
-    bodies: list[int]
-    joints: list[int]
-    geoms: list[int]
+    def add(
+        self,
+        parent: int,
+        position: Floats,
+        turn: Floats,
+        kind: str = "JOINT_FIXED",
+        axis: Sequence[float] = (0.0, 0.0, 1.0),
+    ) -> int:
+        """Add a link without mass whose frame is given in that of its parent."""
+        frame = [position.tolist(), plain(turn), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+        # The engine counts parents from the base.
+        self.rows.append([0.0, -1, -1, *frame, parent + 1, kind, list(axis)])
+        return len(self.rows) - 1
 
 
 @final
 class Built:
     """Everything that a compiled model has in the engine.
+
+    Args:
+        engine: The functions of a physics client.
 
     Attributes:
         bodies: The link that carries the mass of each body that can move, by its number.
@@ -87,15 +118,15 @@ class Built:
         geoms: The link of each shape that can touch something, by its number.
     """
 
-    def __init__(self, engine: Any, client: int) -> None:
-        self._engine, self._client = engine, client
+    def __init__(self, engine: Any) -> None:
+        self._engine = engine
         self._units: list[Unit] = []
         self.bodies: dict[int, Handle] = {}
         self.joints: dict[int, Handle] = {}
         self.geoms: dict[int, Handle] = {}
 
     def make(self, mj: mujoco.MjModel, touching: list[int]) -> set[int]:
-        """Make what there is not yet. Everything stays in one order: what comes later is new, too.
+        """Make what is missing. Everything stays in one order: what comes later is new, too.
 
         Args:
             mj: With the parameters in force.
@@ -104,142 +135,237 @@ class Built:
         Returns:
             The multibodies that are gone.
         """
-        data = mujoco.MjData(mj)
+        data, engine, kept = mujoco.MjData(mj), self._engine, 0
         mujoco.mj_kinematics(mj, data)
-        plans = list(_plans(mj, touching))
-        wanted = [_made_of(mj, data, plan) for plan in plans]
-        kept = 0
-        while kept < min(len(self._units), len(wanted)):
-            if self._units[kept].made_of != wanted[kept]:
+        units = list(_units(mj, touching))
+        for unit in units:
+            _describe(unit, mj, data)
+        for old, new in zip(self._units, units, strict=False):
+            if old != new:
                 break
-            kept += 1
+            new.multibody, kept = old.multibody, kept + 1
         gone = [unit.multibody for unit in self._units[kept:]]
         for multibody in reversed(gone):
-            self._engine.removeBody(multibody, physicsClientId=self._client)
-        del self._units[kept:]
-        for plan, made_of in zip(plans[kept:], wanted[kept:], strict=True):
-            self._units.append(_made(self._engine, self._client, mj, data, plan, made_of))
-        self.bodies, self.joints, self.geoms = {}, {}, {}
-        for plan, unit in zip(plans, self._units, strict=True):
-            for table, numbers, links in (
-                (self.bodies, plan.bodies, unit.bodies),
-                (self.joints, plan.joints, unit.joints),
-                (self.geoms, plan.geoms, unit.geoms),
-            ):
-                table |= {n: (unit.multibody, link) for n, link in zip(numbers, links, strict=True)}
+            engine.removeBody(multibody)
+        self._units = units[:kept]
+        for unit in units[kept:]:
+            self._create(unit, custom(mj, "bullet_damping", -1 in unit.links[1]))
+            self._units.append(unit)
+        numbers = [(unit, (unit.bodies, unit.joints, unit.geoms)) for unit in units]
+        self.bodies, self.joints, self.geoms = (
+            {
+                number: (unit.multibody, link)
+                for unit, own in numbers
+                for number, link in zip(own[kind], unit.links[kind], strict=True)
+            }
+            for kind in range(3)
+        )
         return set(gone)
 
+    def _create(self, unit: Unit, damping: float) -> None:
+        """Make a unit, without what the engine does by itself: motors, sleep, a highest speed."""
+        engine, base, rows = self._engine, dict(unit.base), [list(row) for row in unit.rows]
+        for (shape, _), link in zip(unit.shapes, unit.links[2], strict=True):
+            kind = getattr(engine, shape["shapeType"])
+            number = engine.createCollisionShape(**{**shape, "shapeType": kind})
+            if link < 0:
+                base["baseCollisionShapeIndex"] = number
+            else:
+                rows[link][1] = number
+        for row in rows:
+            row[8] = getattr(engine, row[8])
+        # What touches what is said by pairs alone, also within the multibody.
+        flags = engine.URDF_USE_SELF_COLLISION | engine.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
+        columns = dict(zip(LINK, map(list, zip(*rows, strict=True)), strict=bool(rows)))
+        made = engine.createMultiBody(flags=flags if unit.bodies else 0, **base, **columns)
+        unit.multibody = made
+        if unit.bodies:
+            # One property a call: beside damping or maxJointVelocity, others land on the base.
+            awake = engine.ACTIVATION_STATE_DISABLE_SLEEPING
+            engine.changeDynamics(made, -1, linearDamping=damping)
+            engine.changeDynamics(made, -1, angularDamping=damping)
+            engine.changeDynamics(made, -1, maxJointVelocity=FASTEST)
+            engine.changeDynamics(made, -1, activationState=awake)
+        for link in unit.links[1]:
+            if link < 0:
+                continue
+            if unit.rows[link][8] == "JOINT_SPHERICAL":
+                engine.setJointMotorControlMultiDof(
+                    made,
+                    link,
+                    engine.POSITION_CONTROL,
+                    targetPosition=[0.0, 0.0, 0.0, 1.0],
+                    positionGain=0.0,
+                    velocityGain=0.0,
+                    force=[0.0, 0.0, 0.0],
+                )
+            else:
+                engine.setJointMotorControl2(made, link, engine.VELOCITY_CONTROL, force=0.0)
+        zero = [0.0, 0.0, 0.0]
+        for first, other, offset, ratio in unit.gears:
+            ends, axis = (made, first, made, other), [1.0, 0.0, 0.0]
+            gear = engine.createConstraint(*ends, engine.JOINT_GEAR, axis, zero, zero)
+            engine.changeConstraint(
+                gear,
+                gearRatio=-ratio,
+                relativePositionTarget=offset,
+                erp=GEAR_ERP,
+                maxForce=STRONGEST,
+            )
+        for (shape, margin), link in zip(unit.shapes, unit.links[2], strict=True):
+            if shape["shapeType"] == "GEOM_MESH":
+                engine.changeDynamics(made, link, collisionMargin=max(HULL_MARGIN, margin))
 
-def _plans(mj: mujoco.MjModel, touching: list[int]) -> Iterator[Plan]:
+
+def _describe(unit: Unit, mj: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Fill in what a unit is made of."""
+    carrier: dict[int, int] = {}  # the link whose frame moves with a body
+    origin: dict[int, Floats | None] = {}  # of that frame, in the frame of the body
+    hinges: dict[int, int] = {}
+    shapes: dict[int, int] = {}
+    for body in unit.bodies:
+        joints, parent = joints_of(mj, body), int(mj.body_parentid[body])
+        mass, center = float(mj.body_mass[body] > 0.0), mj.body_ipos[body]
+        axes = plain(solid(mj, body)[1])
+        if joints and mj.jnt_type[joints[0]] == FREE:
+            unit.base["baseMass"] = mass
+            unit.base["baseInertialFramePosition"] = center.tolist()
+            unit.base["baseInertialFrameOrientation"] = axes
+            carrier[body], origin[body], hinges[joints[0]] = -1, ORIGIN, -1
+        else:
+            start, turn = mj.body_pos[body], mj.body_quat[body]
+            if parent in carrier:
+                link, start = carrier[parent], start - origin[parent]
+            else:  # the parent cannot move
+                link, start = -1, data.xpos[parent] + rotated(data.xquat[parent], start)
+                turn = composed(data.xquat[parent], turn)
+            at = ORIGIN
+            for joint in joints:
+                anchor, axis = mj.jnt_pos[joint], mj.jnt_axis[joint].tolist()
+                position = start + rotated(turn, anchor - at)
+                link = unit.add(link, position, turn, JOINTS[int(mj.jnt_type[joint])], axis)
+                hinges[joint], start, turn, at = link, ORIGIN, UNTURNED, anchor
+            if not joints:
+                link = unit.add(link, start, turn)
+            unit.rows[link][0], unit.rows[link][5:7] = mass, ((center - at).tolist(), axes)
+            carrier[body], origin[body] = link, at
+        own = [geom for geom in unit.geoms if mj.geom_bodyid[geom] == body]
+        for number, geom in enumerate(own):
+            link = unit.add(carrier[body], ORIGIN, UNTURNED) if number else carrier[body]
+            shapes[geom] = link
+    if not unit.bodies:
+        (geom,), place, turn = unit.geoms, data.geom_xpos[unit.geoms[0]], np.empty(4)
+        mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
+        body, shapes[geom] = int(mj.geom_bodyid[geom]), -1
+        origin[body] = None
+        if mj.geom_type[geom] == MESH:  # in the frame of the body, as it was drawn
+            place, turn, origin[body] = data.xpos[body], data.xquat[body], ORIGIN
+        unit.base = {"baseMass": 0.0, "useMaximalCoordinates": True}
+        unit.base |= {"basePosition": place.tolist(), "baseOrientation": plain(turn)}
+    unit.links = (
+        [carrier[body] for body in unit.bodies],
+        [hinges[joint] for joint in unit.joints],
+        [shapes[geom] for geom in unit.geoms],
+    )
+    for geom in unit.geoms:
+        shape = _shape(mj, geom, origin[int(mj.geom_bodyid[geom])])
+        unit.shapes.append((shape, float(mj.geom_margin[geom])))
+    for equality in couplings(mj, unit.joints):
+        ends = hinges[int(mj.eq_obj1id[equality])], hinges[int(mj.eq_obj2id[equality])]
+        unit.gears.append((*ends, *mj.eq_data[equality, :2].tolist()))
+    paired = np.isin(unit.geoms, [mj.pair_geom1, mj.pair_geom2])
+    rest = (mj.jnt_limited[unit.joints], paired, mj.numeric_data, np.array(mj.opt.disableflags))
+    unit.rest = tuple(part.tobytes() for part in rest)
+
+
+def _shape(mj: mujoco.MjModel, geom: int, origin: Floats | None) -> dict[str, Any]:
+    """Return the arguments that make a collision shape.
+
+    Args:
+        mj: The model.
+        geom: The shape.
+        origin: Of the frame that it is made in, which is turned like the body, in the frame of the
+            body [m]; in its own frame if None.
+    """
+    radius, half, _ = size = mj.geom_size[geom].tolist()
+    found: dict[str, Any] = {"shapeType": SHAPES[int(mj.geom_type[geom])]}
+    match found["shapeType"]:
+        case "GEOM_PLANE":
+            found["planeNormal"] = [0.0, 0.0, 1.0]
+        case "GEOM_SPHERE":
+            found["radius"] = radius
+        case "GEOM_CAPSULE" | "GEOM_CYLINDER":
+            found |= {"radius": radius, "height": 2.0 * half}
+        case "GEOM_BOX":
+            found["halfExtents"] = size
+        case _:
+            return found | {"vertices": _kept(_corners(mj, geom, origin))}
+    if origin is not None:
+        place, turn = mj.geom_pos[geom] - origin, mj.geom_quat[geom]
+        if place.any() or turn[0] != 1.0:  # a frame of its own, which has a price
+            found["collisionFramePosition"] = place.tolist()
+            found["collisionFrameOrientation"] = plain(turn)
+    return found
+
+
+def _units(mj: mujoco.MjModel, touching: list[int]) -> Iterator[Unit]:
     """List what becomes a unit: what hangs on the world; shapes that cannot move; free bodies.
 
     They meet in this order. Kinematic trees that hang on the world share a multibody, as far as
     there is room: the engine is asked and told of all of them at once, and solves each by itself.
     """
-    free, hanging, room = list[Plan](), Plan([], [], []), MOST_LINKS
+    free, hanging, room = list[Unit](), Unit([], [], []), MOST_LINKS
     for tree in range(mj.ntree):
-        plan = plan_of(mj, tree, touching)
-        if mj.jnt_type[plan.joints[0]] == FREE:
-            free.append(plan)
+        unit = unit_of(mj, tree, touching)
+        if mj.jnt_type[unit.joints[0]] == FREE:
+            free.append(unit)
             continue
-        if links(mj, plan) > room:
+        if links(mj, unit) > room:
             yield hanging
-            hanging, room = Plan([], [], []), MOST_LINKS
-        room -= links(mj, plan)
-        hanging.bodies.extend(plan.bodies)
-        hanging.joints.extend(plan.joints)
-        hanging.geoms.extend(plan.geoms)
+            hanging, room = Unit([], [], []), MOST_LINKS
+        room -= links(mj, unit)
+        hanging.bodies += unit.bodies
+        hanging.joints += unit.joints
+        hanging.geoms += unit.geoms
     yield from ([hanging] if hanging.bodies else [])
     still = mj.body_treeid[mj.geom_bodyid] < 0
-    yield from (Plan([], [], [geom]) for geom in touching if still[geom])
+    yield from (Unit([], [], [geom]) for geom in touching if still[geom])
     yield from free
 
 
-def plan_of(mj: mujoco.MjModel, tree: int, touching: list[int]) -> Plan:
+def unit_of(mj: mujoco.MjModel, tree: int, touching: list[int]) -> Unit:
     """List what a kinematic tree consists of."""
     bodies = np.flatnonzero(mj.body_treeid == tree).tolist()
     joints = [joint for body in bodies for joint in joints_of(mj, body)]
     own = mj.body_treeid[mj.geom_bodyid] == tree
-    return Plan(bodies, joints, [geom for geom in touching if own[geom]])
+    return Unit(bodies, joints, [geom for geom in touching if own[geom]])
 
 
-def links(mj: mujoco.MjModel, plan: Plan) -> int:
+def links(mj: mujoco.MjModel, unit: Unit) -> int:
     """Count the links that a tree needs."""
-    free = mj.jnt_type[plan.joints[0]] == FREE
-    jointless = sum(not joints_of(mj, body) for body in plan.bodies)
-    return len(plan.geoms) + len(plan.joints) + jointless - int(free)
-
-
-def _made_of(mj: mujoco.MjModel, data: mujoco.MjData, plan: Plan) -> tuple[Any, ...]:
-    """List everything in a unit that cannot be changed while it is there."""
-    bodies, joints, geoms = plan.bodies, plan.joints, plan.geoms
-    place = {body: index for index, body in enumerate(bodies)}
-    found: list[Any] = [
-        *(len(bodies), len(joints), mj.opt.disableflags, mj.jnt_limited[joints]),
-        *(mj.numeric_data, mj.geom_margin[geoms]),
-        np.isin(geoms, [mj.pair_geom1, mj.pair_geom2]),
-        *(mj.geom_type[geoms], mj.geom_size[geoms]),
-        *(_corners(mj, geom) for geom in geoms),
-    ]
-    if not bodies:
-        found += [data.geom_xpos[geoms], data.geom_xmat[geoms]]
-    else:
-        free = int(mj.jnt_type[joints[0]] == FREE)
-        parents = mj.body_parentid[bodies].tolist()
-        fixed = [parent for parent in parents if parent not in place]
-        found += [
-            tuple(place.get(parent, -1) for parent in parents),
-            tuple(place[body] for body in mj.geom_bodyid[geoms].tolist()),
-            *(mj.body_ipos[bodies], mj.body_jntnum[bodies]),
-            *(solid(mj, body)[1] for body in bodies),
-            *(mj.body_pos[bodies[free:]], mj.body_quat[bodies[free:]]),
-            *(data.xpos[fixed], data.xquat[fixed]),
-            *(mj.jnt_type[joints], mj.jnt_pos[joints], mj.jnt_axis[joints]),
-            *(mj.geom_pos[geoms], mj.geom_quat[geoms]),
-            *(mj.eq_data[equality, :2] for equality in couplings(mj, joints)),
-        ]
-    return tuple(part.tobytes() if isinstance(part, np.ndarray) else part for part in found)
-
-
-def _made(
-    engine: Any,
-    client: int,
-    mj: mujoco.MjModel,
-    data: mujoco.MjData,
-    plan: Plan,
-    made_of: tuple[Any, ...],
-) -> Unit:
-    """Make a unit, without motors, damping and sleep."""
-    if plan.bodies:
-        unit = _tree(engine, client, mj, data, plan, made_of)
-    else:
-        (geom,), body = plan.geoms, int(mj.geom_bodyid[plan.geoms[0]])
-        place, turn = data.geom_xpos[geom], np.empty(4)
-        mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
-        hull = bool(mj.geom_type[geom] == MESH)  # in the frame of the body, as it was drawn
-        if hull:
-            place, turn = data.xpos[body], data.xquat[body]
-        multibody = engine.createMultiBody(
-            0,
-            _shape(engine, client, mj, geom, np.zeros(3) if hull else None),
-            basePosition=place.tolist(),
-            baseOrientation=plain(turn),
-            useMaximalCoordinates=True,
-            physicsClientId=client,
-        )
-        unit = Unit(made_of, multibody, [], [], [-1])
-    for geom, link in zip(plan.geoms, unit.geoms, strict=True):
-        place = unit.multibody, link
-        if mj.geom_type[geom] == MESH:
-            margin = max(HULL_MARGIN, float(mj.geom_margin[geom]))
-            engine.changeDynamics(*place, collisionMargin=margin, physicsClientId=client)
-    return unit
+    free = mj.jnt_type[unit.joints[0]] == FREE
+    jointless = sum(not joints_of(mj, body) for body in unit.bodies)
+    return len(unit.geoms) + len(unit.joints) + jointless - int(free)
 
 
 def plain(turn: Floats) -> list[float]:
     """Turn a quaternion of MuJoCo (w, x, y, z) into one of the engine (x, y, z, w)."""
     w, x, y, z = turn.tolist()
     return [x, y, z, w]
+
+
+def rotated(turn: Floats, vector: Floats) -> Floats:
+    """Rotate a vector by a quaternion of MuJoCo."""
+    found = np.empty(3)
+    mujoco.mju_rotVecQuat(found, vector, turn)
+    return found
+
+
+def composed(first: Floats, then: Floats) -> Floats:
+    """Compose two quaternions of MuJoCo: the second turns within the frame of the first."""
+    found = np.empty(4)
+    mujoco.mju_mulQuat(found, first, then)
+    return found
 
 
 def joints_of(mj: mujoco.MjModel, body: int) -> range:
@@ -256,43 +382,8 @@ def couplings(mj: mujoco.MjModel, joints: Sequence[int]) -> Iterator[int]:
             yield equality
 
 
-def _shape(
-    engine: Any, client: int, mj: mujoco.MjModel, geom: int, origin: Floats | None = None
-) -> int:
-    """Make a collision shape.
-
-    Args:
-        engine: The module ``pybullet``.
-        client: Its client.
-        mj: The model.
-        geom: The shape.
-        origin: Of the frame that it is made in, which is turned like the body, in the frame of the
-            body [m]; in its own frame if None.
-    """
-    radius, half, _ = size = mj.geom_size[geom].tolist()
-    kind, options = {
-        PLANE: (engine.GEOM_PLANE, {"planeNormal": [0.0, 0.0, 1.0]}),
-        SPHERE: (engine.GEOM_SPHERE, {"radius": radius}),
-        CAPSULE: (engine.GEOM_CAPSULE, {"radius": radius, "height": 2.0 * half}),
-        CYLINDER: (engine.GEOM_CYLINDER, {"radius": radius, "height": 2.0 * half}),
-        BOX: (engine.GEOM_BOX, {"halfExtents": size}),
-        MESH: (engine.GEOM_MESH, {}),
-    }[int(mj.geom_type[geom])]
-    if kind == engine.GEOM_MESH:
-        options["vertices"] = _kept(_corners(mj, geom, origin))
-    elif origin is not None:
-        place, turn = mj.geom_pos[geom] - origin, mj.geom_quat[geom]
-        if place.any() or turn[0] != 1.0:  # a frame of its own, which has a price
-            options |= {"collisionFramePosition": place.tolist()}
-            options |= {"collisionFrameOrientation": plain(turn)}
-    shape: int = engine.createCollisionShape(kind, physicsClientId=client, **options)
-    return shape
-
-
-def _corners(mj: mujoco.MjModel, geom: int, origin: Floats | None = None) -> bytes:
-    """Return the corners of the convex hull of a mesh [m], see ``_shape``; else nothing."""
-    if mj.geom_type[geom] != MESH:
-        return b""
+def _corners(mj: mujoco.MjModel, geom: int, origin: Floats | None) -> bytes:
+    """Return the corners of the convex hull of a mesh [m], see ``_shape``."""
     mesh = int(mj.geom_dataid[geom])
     first, count = int(mj.mesh_vertadr[mesh]), int(mj.mesh_vertnum[mesh])
     vertices = mj.mesh_vert[first : first + count]
@@ -315,179 +406,6 @@ def _kept(vertices: bytes) -> list[list[float]]:
     return found
 
 
-COLUMNS = (
-    "linkMasses",
-    "linkCollisionShapeIndices",
-    "linkVisualShapeIndices",
-    "linkPositions",
-    "linkOrientations",
-    "linkInertialFramePositions",
-    "linkInertialFrameOrientations",
-    "linkParentIndices",
-    "linkJointTypes",
-    "linkJointAxis",
-)
-"""Arguments of ``createMultiBody`` for every link."""
-
-
-@final
-class _Links:
-    """The links of a multibody that is not made yet.
-
-    Args:
-        engine: The module ``pybullet``.
-
-    Attributes:
-        rows: Arguments for each: see ``COLUMNS``.
-    """
-
-    def __init__(self, engine: Any) -> None:
-        self._fixed = engine.JOINT_FIXED
-        self.rows: list[list[Any]] = []
-
-    def add(
-        self,
-        parent: int,
-        position: Floats,
-        turn: Floats,
-        *,
-        shape: int = -1,
-        kind: int | None = None,
-        axis: Sequence[float] = (0.0, 0.0, 1.0),
-    ) -> int:
-        """Add a link without mass whose frame is given in that of its parent."""
-        frame = [position.tolist(), plain(turn), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-        joint = [self._fixed if kind is None else kind, list(axis)]
-        # The engine counts parents from the base.
-        self.rows.append([0.0, shape, -1, *frame, parent + 1, *joint])
-        return len(self.rows) - 1
-
-    def load(self, link: int, mass: float, center: Floats, axes: Floats) -> None:
-        """Give a link a mass, whose center and principal axes are in the frame of the link."""
-        row = self.rows[link]
-        row[0], row[5], row[6] = mass, center.tolist(), plain(axes)
-
-
-def rotated(turn: Floats, vector: Floats) -> Floats:
-    """Rotate a vector by a quaternion of MuJoCo."""
-    found = np.empty(3)
-    mujoco.mju_rotVecQuat(found, vector, turn)
-    return found
-
-
-def composed(first: Floats, then: Floats) -> Floats:
-    """Compose two quaternions of MuJoCo: the second turns within the frame of the first."""
-    found = np.empty(4)
-    mujoco.mju_mulQuat(found, first, then)
-    return found
-
-
-def _tree(
-    engine: Any,
-    client: int,
-    mj: mujoco.MjModel,
-    data: mujoco.MjData,
-    plan: Plan,
-    made_of: tuple[Any, ...],
-) -> Unit:
-    """Make a multibody of a body that hangs on the world, and of all that hangs on it."""
-    links, base = _Links(engine), dict[str, Any](baseMass=0.0)
-    kinds = {
-        HINGE: engine.JOINT_REVOLUTE,
-        SLIDE: engine.JOINT_PRISMATIC,
-        BALL: engine.JOINT_SPHERICAL,
-    }
-    carrier: dict[int, int] = {}  # the link whose frame moves with a body
-    origin: dict[int, Floats] = {}  # of that frame, in the frame of the body
-    joint_links: dict[int, int] = {}
-    geom_links: dict[int, int] = {}
-    for body in plan.bodies:
-        joints, parent = joints_of(mj, body), int(mj.body_parentid[body])
-        mass, center = float(mj.body_mass[body]), mj.body_ipos[body]
-        _, axes = solid(mj, body)
-        if joints and mj.jnt_type[joints[0]] == FREE:
-            base = {
-                "baseMass": mass,
-                "baseInertialFramePosition": center.tolist(),
-                "baseInertialFrameOrientation": plain(axes),
-            }
-            carrier[body], origin[body], joint_links[joints[0]] = -1, np.zeros(3), -1
-        else:
-            start, turn = mj.body_pos[body], mj.body_quat[body]
-            if parent in carrier:
-                link, start = carrier[parent], start - origin[parent]
-            else:  # the parent cannot move
-                link, start = -1, data.xpos[parent] + rotated(data.xquat[parent], start)
-                turn = composed(data.xquat[parent], turn)
-            at = np.zeros(3)
-            for joint in joints:
-                kind, axis = kinds[int(mj.jnt_type[joint])], mj.jnt_axis[joint].tolist()
-                anchor = mj.jnt_pos[joint]
-                position = start + rotated(turn, anchor - at)
-                joint_links[joint] = link = links.add(link, position, turn, kind=kind, axis=axis)
-                start, turn, at = np.zeros(3), UNTURNED, anchor
-            if not joints:
-                link = links.add(link, start, turn)
-            links.load(link, mass, center - at, axes)
-            carrier[body], origin[body] = link, at
-        own = [geom for geom in plan.geoms if mj.geom_bodyid[geom] == body]
-        for geom in own[:1]:
-            shape, link = _shape(engine, client, mj, geom, origin[body]), carrier[body]
-            geom_links[geom] = link
-            if link < 0:
-                base["baseCollisionShapeIndex"] = shape
-            else:
-                links.rows[link][1] = shape
-        for geom in own[1:]:
-            shape = _shape(engine, client, mj, geom, origin[body])
-            geom_links[geom] = links.add(carrier[body], np.zeros(3), UNTURNED, shape=shape)
-    # What touches what is said by pairs alone, also within the multibody.
-    flags = engine.URDF_USE_SELF_COLLISION | engine.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
-    made = engine.createMultiBody(
-        flags=flags,
-        physicsClientId=client,
-        **base,
-        **dict(zip(COLUMNS, map(list, zip(*links.rows, strict=True)), strict=bool(links.rows))),
-    )
-    _settle(engine, client, mj, made, joint_links)
-    for equality in couplings(mj, plan.joints):
-        _couple(engine, client, mj, equality, made, joint_links)
-    carriers = [carrier[body] for body in plan.bodies]
-    hinges = [joint_links[joint] for joint in plan.joints]
-    shapes = [geom_links[geom] for geom in plan.geoms]
-    return Unit(made_of, made, carriers, hinges, shapes)
-
-
-def _settle(
-    engine: Any, client: int, mj: mujoco.MjModel, made: int, joints: dict[int, int]
-) -> None:
-    """Take away what the engine does by itself: damping, motors, sleep, a highest speed."""
-    # One property a call: beside damping or maxJointVelocity, all others would land on the base.
-    damping = custom(mj, "bullet_damping", int(-1 in joints.values()))
-    engine.changeDynamics(made, -1, linearDamping=damping, physicsClientId=client)
-    engine.changeDynamics(made, -1, angularDamping=damping, physicsClientId=client)
-    engine.changeDynamics(made, -1, maxJointVelocity=FASTEST, physicsClientId=client)
-    engine.changeDynamics(
-        made, -1, activationState=engine.ACTIVATION_STATE_DISABLE_SLEEPING, physicsClientId=client
-    )
-    for joint, link in joints.items():
-        if mj.jnt_type[joint] == BALL:
-            engine.setJointMotorControlMultiDof(
-                made,
-                link,
-                engine.POSITION_CONTROL,
-                targetPosition=[0.0, 0.0, 0.0, 1.0],
-                positionGain=0.0,
-                velocityGain=0.0,
-                force=[0.0, 0.0, 0.0],
-                physicsClientId=client,
-            )
-        elif link >= 0:
-            engine.setJointMotorControl2(
-                made, link, engine.VELOCITY_CONTROL, force=0.0, physicsClientId=client
-            )
-
-
 def custom(mj: mujoco.MjModel, name: str, index: int = 0) -> float:
     """Return a custom number that a model has for this engine; 0 if it has none.
 
@@ -500,49 +418,18 @@ def custom(mj: mujoco.MjModel, name: str, index: int = 0) -> float:
     return 0.0 if number < 0 else float(mj.numeric_data[mj.numeric_adr[number] + index])
 
 
-def _couple(
-    engine: Any,
-    client: int,
-    mj: mujoco.MjModel,
-    equality: int,
-    multibody: int,
-    links: dict[int, int],
-) -> None:
-    """Let a joint follow another one in proportion."""
-    offset, ratio = mj.eq_data[equality, :2].tolist()
-    gear = engine.createConstraint(
-        *(multibody, links[int(mj.eq_obj1id[equality])]),
-        *(multibody, links[int(mj.eq_obj2id[equality])]),
-        engine.JOINT_GEAR,
-        [1.0, 0.0, 0.0],
-        [0.0, 0.0, 0.0],
-        [0.0, 0.0, 0.0],
-        physicsClientId=client,
-    )
-    engine.changeConstraint(
-        gear,
-        gearRatio=-ratio,
-        relativePositionTarget=offset,
-        erp=GEAR_ERP,
-        maxForce=STRONGEST,
-        physicsClientId=client,
-    )
-
-
 def solid(mj: mujoco.MjModel, body: int) -> tuple[Floats, Floats]:
-    """Give the principal moments [kg m²] and axes of a body, with the armature of its hinge.
+    """Return the principal moments [kg m²] and axes of a body, with the armature of its hinge.
 
     The motor of the only hinge of a body that hangs on the world turns as fast as the body: it is
     as if the body had more inertia about the axis.
     """
     moments, axes = mj.body_inertia[body], mj.body_iquat[body]
-    if not takes_armature(mj, body):
-        return moments, axes
     joint = int(mj.body_jntadr[body])
-    armature, axis = mj.dof_armature[mj.jnt_dofadr[joint]], mj.jnt_axis[joint]
+    armature = mj.dof_armature[mj.jnt_dofadr[joint]] if takes_armature(mj, body) else 0.0
     if not armature:
         return moments, axes
-    turn = np.empty(9)
+    turn, axis = np.empty(9), mj.jnt_axis[joint]
     mujoco.mju_quat2Mat(turn, axes)
     frame = turn.reshape(3, 3)
     tensor = (frame * moments) @ frame.T + armature * np.outer(axis, axis)
@@ -554,7 +441,7 @@ def solid(mj: mujoco.MjModel, body: int) -> tuple[Floats, Floats]:
 
 
 def takes_armature(mj: mujoco.MjModel, body: int) -> bool:
-    """Tell whether the armature of the joint of a body is as if the body had more inertia."""
+    """Return whether the armature of the joint of a body is as if the body had more inertia."""
     joints = joints_of(mj, body)
     fixed = mj.body_treeid[mj.body_parentid[body]] < 0
     return bool(fixed and len(joints) == 1 and mj.jnt_type[joints[0]] == HINGE)

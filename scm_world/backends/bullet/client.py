@@ -5,33 +5,25 @@ from __future__ import annotations
 import math
 import statistics
 import weakref
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import ContactPoint
-from scm_world.backends.bullet.build import BALL, FREE, Built, Handle, custom, solid
-from scm_world.backends.bullet.honoured import heavy, realized, rotations
+from scm_world.backends.bullet.build import BALL, FREE, Built, custom, solid
+from scm_world.backends.bullet.engine import Connection
+from scm_world.backends.bullet.honoured import realized, rebuilt, rotations
 from scm_world.backends.bullet.joints import Part, parts
 from scm_world.backends.mujoco import reading
-from scm_world.backends.mujoco.backend import realize
+from scm_world.backends.mujoco.realization import Realization
 from scm_world.backends.mujoco.trees import Couplings, disabled
-from scm_world.errors import EngineFailure, UnknownOption
+from scm_world.errors import EngineFailure
 from scm_world.models.model import Model
 from scm_world.models.scene import ParameterKey, Parameters
-
-Values = dict[ParameterKey, Any]
-"""All parameters, or some: plain numbers, or lists of them.
-Neither they nor their values are ever changed in place."""
-
-WORLD: Handle = (-1, -1)
-"""Where what holds for all bodies is."""
 
 _OFF = mujoco.mjtDisableBit
 SMOOTH = int(_OFF.mjDSBL_CONSTRAINT) | int(_OFF.mjDSBL_AUTORESET)
@@ -40,54 +32,29 @@ SMOOTH = int(_OFF.mjDSBL_CONSTRAINT) | int(_OFF.mjDSBL_AUTORESET)
 SOLVER_ITERATIONS = 50  # with 20, towers spike at 40 mm/s
 TOLERANCE = 1e-6  # how far a state that was set may read back from what was asked
 
+Setting = tuple[str, tuple[int, ...], str]
+"""A function of the engine, the body and the link that it is called with, and what it sets."""
+
 
 @final
 @dataclass(frozen=True)
 class Instant:
-    """A canonical state: the engine's world is a function of these values.
+    """A moment, without the caches of the engine.
 
     Attributes:
         structure: The bodies.
-        parameters: All of them.
-        state: The numbers of a ``State``, with unit quaternions.
+        parameters: All of them. Neither the mapping nor an array in it is ever changed in place.
+        state: The vector of a ``State``, with unit quaternions; never changed in place.
     """
 
     structure: Model
-    parameters: Values
-    state: list[float]
+    parameters: Parameters
+    state: Floats
 
 
-def known(there: Mapping[ParameterKey, object], keys: Iterable[ParameterKey]) -> list[ParameterKey]:
-    """Pass keys on that the scene has.
-
-    Raises:
-        UnknownOption: It does not have one of them.
-    """
-    keys = list(keys)
-    for key in keys:
-        if key not in there:
-            raise UnknownOption("parameter", ".".join(key), map(".".join, there))
-    return keys
-
-
-def plain(parameters: Parameters, keys: Iterable[ParameterKey]) -> Values:
-    """Turn some of the parameters of a scene into plain numbers.
-
-    Raises:
-        EngineFailure: One is not finite.
-    """
-    found: Values = {}
-    for key in keys:
-        value = np.asarray(parameters[key], dtype=np.float64).tolist()
-        if not math.isfinite(value if isinstance(value, float) else sum(value)):
-            raise EngineFailure(f"{'.'.join(key)} must be finite, got {value}", "bullet")
-        found[key] = value
-    return found
-
-
-def arrays(parameters: Values) -> Parameters:
-    """Turn plain numbers into parameters of a scene."""
-    return {key: np.array(value) for key, value in parameters.items()}
+def alike(one: Parameters, other: Parameters, keys: Iterable[ParameterKey]) -> bool:
+    """Return whether some parameters have the same bits."""
+    return all(one[k] is other[k] or one[k].tobytes() == other[k].tobytes() for k in keys)
 
 
 def shares(mj: mujoco.MjModel, geoms: Iterable[int], usual: float) -> dict[int, float]:
@@ -127,42 +94,6 @@ def usual_friction(mj: mujoco.MjModel) -> float:
     return float(statistics.median_low(found.tolist() or [0.0]))
 
 
-MOST_GROUPS = 31
-"""As many bits the engine has."""
-
-
-def groups(touches: NDArray[np.bool_]) -> dict[int, tuple[int, int]]:
-    """Give each shape that touches something a group and a mask of those it touches.
-
-    Shapes that touch the same others, and each other or not, are one group.
-
-    Args:
-        touches: Which shapes may touch, shape (ngeom, ngeom).
-
-    Returns:
-        Nothing if there are more groups than the engine has.
-    """
-    members: list[list[int]] = []
-    for geom in np.flatnonzero(touches.any(axis=1)).tolist():
-        for group in members:
-            among = touches[np.ix_([*group, geom], [*group, geom])]
-            inside = among[~np.eye(len(among), dtype=np.bool_)]
-            apart = np.delete(touches[[group[0], geom]], [*group, geom], axis=1)
-            if (apart[0] == apart[1]).all() and (inside == inside[0]).all():
-                group.append(geom)
-                break
-        else:
-            members.append([geom])
-    if len(members) > MOST_GROUPS:
-        return {}
-    number = {geom: index for index, group in enumerate(members) for geom in group}
-    found = {}
-    for geom, index in number.items():
-        others = {number[other] for other in np.flatnonzero(touches[geom]).tolist()}
-        found[geom] = 1 << index, sum(1 << other for other in others)
-    return found
-
-
 def spinning_shares(mj: mujoco.MjModel) -> dict[int, float]:
     """Give each shape in a pair what it gets of the spinning friction of its pairs.
 
@@ -198,6 +129,11 @@ def _pulled(mj: mujoco.MjModel) -> Integers:
 
 
 @final
+class Saved:
+    """Stands for a state that a client keeps; the client forgets it when nobody holds this."""
+
+
+@final
 class Client:
     """A physics client with a model in it, and MuJoCo's own model beside it.
 
@@ -209,36 +145,22 @@ class Client:
         engine: The module ``pybullet``.
 
     Attributes:
-        handle: The number of the client; None once it is closed.
-        generation: Counts the canonical states; a saved state is exact within one of them.
+        engine: Its functions for this client.
+        holds: What was brought about here, for whoever did it.
     """
 
     def __init__(self, engine: Any) -> None:
-        self.engine = engine
-        self.handle = engine.connect(engine.DIRECT)
-        if self.handle < 0:
-            raise EngineFailure("Bullet has no physics client left; close some backends", "bullet")
-        self.generation = 0
+        self.engine = engine = Connection(engine)
+        self.holds: Any = None
         self._model: Model | None = None
-        self._told: dict[tuple[str, Handle], Any] = {}  # what the engine was told of live bodies
-        self._inside: Values | None = None  # parameters that were built into the bodies
+        self._told: dict[Setting, Any] = {}  # what the engine was told of live bodies
+        self._inside: Parameters | None = None  # parameters that were built into the bodies
         self._ruled: set[tuple[int, int, int, int]] = set()  # pairs of links with a rule
-        self._untouched: list[float] | None = None
-        self._saved: dict[int, tuple[int, Floats]] = {}  # engine's number and activations
-        self._tickets = 0
-        self._doomed: list[int] = []
-        self._close = weakref.finalize(self, _disconnect, engine, self.handle)
-        self._built = Built(engine, self.handle)
+        self._saved: list[tuple[weakref.ref[Saved], int, Floats]] = []  # number and activations
+        self._built = Built(engine)
         engine.setPhysicsEngineParameter(
-            numSolverIterations=SOLVER_ITERATIONS,
-            deterministicOverlappingPairs=1,
-            physicsClientId=self.handle,
+            numSolverIterations=SOLVER_ITERATIONS, deterministicOverlappingPairs=1
         )
-
-    def close(self) -> None:
-        """Disconnect. Closing twice is harmless."""
-        self._close()
-        self.handle = None
 
     # --- bodies ----------------------------------------------------------------------------------
 
@@ -248,120 +170,118 @@ class Client:
         Bodies stay where all their shapes stay; all else that depends on the past, the contact
         caches, is cleared by entering the collision objects again, always in one order.
         """
-        self.generation += 1
-        self._doomed.extend(self._saved)
-        self._bury()
+        self.holds = None
+        self._forget(everything=True)
         self._construct(instant.structure, instant.parameters)
         self._twin.reset()  # what the last step left there must not matter
-        self._twin.place(np.array(instant.state))
+        self._twin.place(instant.state)
         for part in self._parts:
             part.put(self._twin.data)
-        for place in self._built.geoms.values():
-            both = self._filters[place]
-            self.engine.setCollisionFilterGroupMask(*place, *both, physicsClientId=self.handle)
+        for place in self._built.geoms.values():  # what touches what is said by pairs
+            self.engine.setCollisionFilterGroupMask(*place, 0, 0)
         self._check(instant.state)
-        self._untouched = instant.state
 
-    def _construct(self, model: Model, parameters: Values) -> None:
+    def _construct(self, model: Model, parameters: Parameters) -> None:
         """Make what differs from what is there, and what live bodies cannot take on."""
         model = realized(model)
         if self._model != model:
             compiled = reading.compiled(model)
-            self._model, self._inside = model, None
-            self._twin = realize(model, arrays(parameters))
-            self._names, self._pulled = reading.body_names(compiled), _pulled(compiled)
+            self._model, self._inside = None, None
+            self._twin, self._given = Realization(model, parameters), dict(parameters)
+            self._pulled = _pulled(compiled)
             self._usual, self._spinning = usual_friction(compiled), spinning_shares(compiled)
             trees = Couplings(compiled)
             self._dynamic = np.flatnonzero(trees.dynamic.any(axis=1)).tolist()
             self._touching = np.argwhere(np.triu(trees.touches)).tolist()
-            self._groups = groups(trees.touches)
             self._shapes = np.flatnonzero(trees.touches.any(axis=1)).tolist()
             ends = zip(compiled.pair_geom1.tolist(), compiled.pair_geom2.tolist(), strict=True)
             self._paired = {geom: pair for pair, both in enumerate(ends) for geom in both}
-            self._rotations = rotations(model)
-            self._reported = np.flatnonzero(~model.layout.can_be_set)
-        self._twin.edit(arrays(parameters))
-        inside = {key: parameters[key] for key in heavy(model)}
-        if self._inside != inside:
-            gone = self._built.make(self._twin.model, self._shapes)
-            self._told = {what: v for what, v in self._told.items() if what[1][0] not in gone}
+            self._model = model
+        self._take(parameters)
+        if self._inside is None or not alike(self._inside, parameters, rebuilt(model)):
+            self._inside, mj = None, self._twin.model
+            gone = self._built.make(mj, self._shapes)
+            self._told = {what: v for what, v in self._told.items() if gone.isdisjoint(what[1][:1])}
             self._connect()
-            self._parts = self._joints(range(self._twin.model.ntree))
+            self._parts = parts(self.engine, mj, self._built.joints, range(mj.ntree))
             self._trees, self._driven = set[int](), list[Part]()
-            self._inside = inside
+            self._inside, self._twin.edited = parameters, True
         self._tell_all()
 
     def _connect(self) -> None:
-        """Say which shapes may touch: by groups, or pair by pair if these are too many."""
+        """Say which shapes may touch, pair by pair."""
         geoms = self._built.geoms
-        self._filters = {geoms[geom]: both for geom, both in self._groups.items()}
         wanted = {(*geoms[first], *geoms[second]) for first, second in self._touching}
-        if not self._groups:
-            self._ruled |= wanted  # this holds as long as the client
-            self._filters = dict.fromkeys(geoms.values(), (0, 0))
+        self._ruled |= wanted  # this holds as long as the client
         for body, link, other, its in sorted(self._ruled):
             enabled = int((body, link, other, its) in wanted)
-            self.engine.setCollisionFilterPair(
-                body, other, link, its, enabled, physicsClientId=self.handle
-            )
-        for place, both in self._filters.items():
-            self.engine.setCollisionFilterGroupMask(*place, *both, physicsClientId=self.handle)
+            self.engine.setCollisionFilterPair(body, other, link, its, enabled)
 
-    def _check(self, state: list[float]) -> None:
+    def _check(self, state: Floats) -> None:
         """Make sure that the engine took the state, up to rounding and the sign of a quaternion.
 
         Raises:
             EngineFailure: It did not.
         """
-        actual, wanted = np.array(self._ask()), np.array(state)
-        for start in self._rotations:
+        actual, model = self.read(), self._twin.structure
+        for start in rotations(model):
             where = slice(start, start + 4)
-            if actual[where] @ wanted[where] < 0.0:
+            if actual[where] @ state[where] < 0.0:
                 actual[where] *= -1.0
-        wanted[self._reported] = actual[self._reported]
-        if not (abs(actual - wanted) <= TOLERANCE * (1.0 + abs(wanted))).all():
+        near = abs(actual - state) <= TOLERANCE * (1.0 + abs(state))
+        if not near[model.layout.can_be_set].all():
             raise EngineFailure("Bullet did not take the state that was set", "bullet")
 
     # --- parameters ------------------------------------------------------------------------------
 
-    def edit(self, parameters: Values) -> None:
+    def edit(self, parameters: Parameters) -> None:
         """Change parameters that need no new bodies. What is in force already is left alone.
 
         Raises:
             Infeasible: Nothing can move with them. Nothing has changed.
         """
-        self._twin.edit(arrays(parameters))
+        self._take(parameters)
         self._tell_all()
+
+    def _take(self, parameters: Parameters) -> None:
+        """Give MuJoCo's model what it was not given before."""
+        fresh = {k: v for k, v in parameters.items() if self._given.get(k) is not v}
+        self._twin.edit(fresh)
+        self._given |= fresh
 
     def _tell_all(self) -> None:
         """Tell the engine what differs from what it was told before."""
+        if not self._twin.edited:
+            return
         for what, value in self._settings():
             if self._told.get(what) != value:
                 self._told.pop(what, None)  # unknown, should the engine fail
-                self._tell(*what, value)
+                getattr(self.engine, what[0])(*what[1], **value[0])
                 self._told[what] = value
         moved = self._moved()
         if self._trees != moved:
-            self._trees, self._driven = moved, self._joints(moved)
+            self._trees = moved
+            self._driven = parts(self.engine, self._twin.model, self._built.joints, moved)
+        self._twin.edited = False
 
-    def _joints(self, trees: Collection[int]) -> list[Part]:
-        """Prepare asking and telling of what moves in some trees."""
-        mj, places = self._twin.model, self._built.joints
-        tree_of = mj.body_treeid[mj.jnt_bodyid].tolist()
-        own = {joint: place for joint, place in places.items() if tree_of[joint] in trees}
-        return list(parts(self.engine, self.handle, mj, own))
-
-    def _settings(self) -> Iterator[tuple[tuple[str, Handle], Any]]:
-        """List what live bodies have, by what it is and where."""
+    def _settings(self) -> Iterator[tuple[Setting, tuple[dict[str, Any], Any]]]:
+        """List what live bodies have: arguments of functions, and what else their effect is of."""
         mj, built = self._twin.model, self._built
-        gravity = np.zeros(3) if disabled(mj, _OFF.mjDSBL_GRAVITY) else mj.opt.gravity
-        yield ("gravity", WORLD), gravity.tolist()
-        yield ("timestep", WORLD), mj.opt.timestep
+        off = disabled(mj, _OFF.mjDSBL_GRAVITY)
+        gravity = dict(zip(("gravX", "gravY", "gravZ"), mj.opt.gravity.tolist(), strict=True))
+        yield ("setGravity", (), ""), (dict.fromkeys(gravity, 0.0) if off else gravity, None)
         # An early end, decided for all bodies together, lets bodies act on each other without
         # touching: only a model that asks for it has one.
-        yield ("early_end", WORLD), custom(mj, "bullet_early_end")
+        early = custom(mj, "bullet_early_end")
+        for name, number in (
+            ("fixedTimeStep", mj.opt.timestep),
+            ("solverResidualThreshold", early),
+        ):
+            yield ("setPhysicsEngineParameter", (), name), ({name: number}, None)
         for body, place in built.bodies.items():
-            yield ("solid", place), (float(mj.body_mass[body]), *solid(mj, body)[0].tolist())
+            moments = solid(mj, body)[0].tolist()
+            inertia = {"mass": float(mj.body_mass[body]), "localInertiaDiagonal": moments}
+            yield ("changeDynamics", place, "inertia"), (inertia, None)
         rigid = not disabled(mj, _OFF.mjDSBL_CONSTRAINT)
         dry = rigid and not disabled(mj, _OFF.mjDSBL_FRICTIONLOSS)
         ends = rigid and not disabled(mj, _OFF.mjDSBL_LIMIT)
@@ -369,42 +289,27 @@ class Client:
             if mj.jnt_type[joint] in (FREE, BALL):
                 continue
             if ends and mj.jnt_limited[joint]:
-                zero = mj.qpos0[mj.jnt_qposadr[joint]]
-                yield ("limits", place), (mj.jnt_range[joint] - zero).tolist()
+                low, high = (mj.jnt_range[joint] - mj.qpos0[mj.jnt_qposadr[joint]]).tolist()
+                limits = {"jointLowerLimit": low, "jointUpperLimit": high}
+                yield ("changeDynamics", place, "limits"), (limits, None)
             loss = float(mj.dof_frictionloss[mj.jnt_dofadr[joint]]) if dry else 0.0
-            yield ("dry", place), (loss, loss and mj.opt.timestep)  # kept as an impulse of a step
-        for geom, share in shares(mj, self._dynamic, self._usual).items():
-            yield ("lateralFriction", built.geoms[geom]), share
+            brake = {"controlMode": self.engine.VELOCITY_CONTROL, "targetVelocity": 0.0}
+            held = loss and mj.opt.timestep  # the engine keeps it as an impulse of a step
+            yield ("setJointMotorControl2", place, ""), ({**brake, "force": loss}, held)
+        frictions = [
+            (geom, "lateralFriction", share)
+            for geom, share in shares(mj, self._dynamic, self._usual).items()
+        ]
         for geom, pair in self._paired.items():
             slides, spins, _ = mj.geom_friction[geom].tolist()
             bounce = math.sqrt(restitution(float(mj.pair_solref[pair, 1])))
-            yield ("lateralFriction", built.geoms[geom]), slides
-            yield ("spinningFriction", built.geoms[geom]), spins * self._spinning[geom]
-            yield ("restitution", built.geoms[geom]), bounce
-
-    def _tell(self, what: str, place: Handle, value: Any) -> None:
-        """Tell the engine one thing."""
-        engine, options = self.engine, {"physicsClientId": self.handle}
-        match what:
-            case "gravity":
-                engine.setGravity(*value, **options)
-            case "timestep":
-                engine.setPhysicsEngineParameter(fixedTimeStep=value, **options)
-            case "early_end":
-                engine.setPhysicsEngineParameter(solverResidualThreshold=value, **options)
-            case "solid":
-                mass, *moments = value
-                engine.changeDynamics(*place, mass=mass, localInertiaDiagonal=moments, **options)
-            case "limits":
-                low, high = value
-                engine.changeDynamics(*place, jointLowerLimit=low, jointUpperLimit=high, **options)
-            case "dry":
-                mode, force = engine.VELOCITY_CONTROL, value[0]
-                engine.setJointMotorControl2(
-                    *place, mode, targetVelocity=0.0, force=force, **options
-                )
-            case _:
-                engine.changeDynamics(*place, **{what: value}, **options)
+            frictions += [
+                (geom, "lateralFriction", slides),
+                (geom, "spinningFriction", spins * self._spinning[geom]),
+                (geom, "restitution", bounce),
+            ]
+        for geom, name, number in frictions:
+            yield ("changeDynamics", built.geoms[geom], name), ({name: number}, None)
 
     def _moved(self) -> set[int]:
         """List the trees on which smooth forces act, other than weight."""
@@ -423,20 +328,8 @@ class Client:
         """Read parameters from the arrays that the engine's numbers are made of."""
         return self._twin.parameters(keys)
 
-    def inertia(self, body: str) -> Floats:
-        """Ask the engine for principal moments of inertia, shape (3,) [kg m²].
-
-        Raises:
-            UnknownOption: There is no such body.
-        """
-        moments = self._twin.inertia(body)
-        place = self._built.bodies.get(self._names.index(body))
-        if place is None:  # it cannot move
-            return moments
-        return np.array(self.engine.getDynamicsInfo(*place, physicsClientId=self.handle)[2])
-
     def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """Say which frictions were changed without an effect; see ``shares``."""
+        """List which frictions were changed without an effect; see ``shares``."""
         twin, found = self._twin, list[str]()
         now = shares(twin.model, self._dynamic, self._usual)
         for key, old in before.items():
@@ -453,8 +346,8 @@ class Client:
 
     # --- steps -----------------------------------------------------------------------------------
 
-    def step(self, command: Sequence[float], substeps: int) -> list[float]:
-        """Hold a command for some physics steps, and return the numbers that cannot be set.
+    def step(self, command: Sequence[float], substeps: int) -> None:
+        """Hold a command for some physics steps.
 
         What brakes in proportion to speed acts with the speed at the end of the step: with that
         before the step, light links would turn back faster than they came. With mass matrix M,
@@ -462,7 +355,6 @@ class Client:
         ``a = (M + h D)^-1 (f - b)``, and ``Euler`` has the slopes of passive dampers alone; the
         forces ``M a + b`` let the engine's explicit step have it.
         """
-        self._untouched = None
         self._twin.forget()
         mj, data, options = self._twin.model, self._twin.data, self._twin.model.opt
         asked = options.disableflags, options.integrator
@@ -473,6 +365,7 @@ class Client:
             options.integrator = mujoco.mjtIntegrator.mjINT_EULER
         self._twin.command[:] = command
         forces, rates, step = np.empty(mj.nv), np.empty(mj.nv), options.timestep
+        advance = self.engine.stepSimulation
         for _ in range(substeps):
             if self._driven:
                 for part in self._driven:
@@ -485,32 +378,14 @@ class Client:
                 forces += data.qfrc_bias
                 for part in self._driven:
                     part.drive(data, forces)
-            self.engine.stepSimulation(physicsClientId=self.handle)
+            advance()
         options.disableflags, options.integrator = asked
-        reported: list[float] = self._vector()[self._reported].tolist()
-        return reported
 
-    def read(self, reported: list[float]) -> list[float]:
-        """Read the present state; the numbers that cannot be set are given.
-
-        A state that was set and not stepped yet reads as it was set; ``canonicalize`` has made
-        sure that the engine agrees up to rounding.
-        """
-        state = self._ask() if self._untouched is None else list(self._untouched)
-        for place, value in zip(self._reported, reported, strict=True):
-            state[place] = value
-        return state
-
-    def _ask(self) -> list[float]:
+    def read(self) -> Floats:
         """Ask the engine for the state."""
         for part in self._parts:
             part.take(self._twin.data)
-        state: list[float] = self._vector().tolist()
-        return state
-
-    def _vector(self) -> Floats:
-        """Give the state as MuJoCo has it now."""
-        vector: Floats = self._twin.structure.empty_state().vector
+        vector = np.empty(self._twin.structure.layout.size)
         self._twin.read(vector)
         return vector
 
@@ -528,37 +403,35 @@ class Client:
                 depth=-point[8],
                 force=point[9],
             )
-            for point in self.engine.getContactPoints(physicsClientId=self.handle)
+            for point in self.engine.getContactPoints()
             if point[8] <= 0.0 or point[9] > 0.0
         )
 
     # --- saved states ----------------------------------------------------------------------------
 
-    def save(self) -> int:
-        """Keep the engine's own state in this process and return a ticket for it."""
-        self._bury()
-        self._tickets += 1
-        number = self.engine.saveState(physicsClientId=self.handle)
-        self._saved[self._tickets] = number, self._twin.data.act.copy()
-        return self._tickets
+    def save(self) -> Saved:
+        """Keep the engine's own state in this process as long as what is returned is held."""
+        self._forget()
+        saved = Saved()
+        number, activations = self.engine.saveState(), self._twin.data.act.copy()
+        self._saved.append((weakref.ref(saved), number, activations))
+        return saved
 
-    def load(self, ticket: int) -> None:
-        """Go back to a state saved in this generation. Parameters are not part of it."""
-        number, self._twin.data.act[:] = self._saved[ticket]
-        self.engine.restoreState(stateId=number, physicsClientId=self.handle)
-        self._untouched = None
+    def load(self, saved: Saved) -> bool:
+        """Go back to a state if it is kept here. Parameters are not part of it."""
+        for reference, number, activations in self._saved:
+            if reference() is saved:
+                self._twin.data.act[:] = activations
+                self.engine.restoreState(stateId=number)
+                return True
+        return False
 
-    def forget(self, ticket: int) -> None:
-        """Free a saved state, at the next quiet moment: this may run amid an engine call."""
-        self._doomed.append(ticket)
-
-    def _bury(self) -> None:
-        while self._doomed:
-            number, _ = self._saved.pop(self._doomed.pop(), (None, None))
-            if number is not None:
-                self.engine.removeState(number, physicsClientId=self.handle)
-
-
-def _disconnect(engine: Any, handle: int) -> None:
-    with suppress(engine.error):
-        engine.disconnect(physicsClientId=handle)
+    def _forget(self, *, everything: bool = False) -> None:
+        """Free states that nobody holds, or all: beyond a canonical state they are not exact."""
+        kept = []
+        for entry in self._saved:
+            if everything or entry[0]() is None:
+                self.engine.removeState(entry[1])
+            else:
+                kept.append(entry)
+        self._saved = kept

@@ -5,45 +5,61 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 from importlib import metadata
-from typing import Any
+from typing import Any, final
 
-from scm_world.errors import MissingEngine
+from scm_world.errors import EngineFailure, MissingEngine
 
 INSTALL = 'pip install "pybullet==3.2.7"'
 REASON = "wheels exist for Linux and Python < 3.12 only"
 
 
-def load() -> Any:
-    """Import pybullet.
+def load() -> tuple[Any, str]:
+    """Import pybullet; return the module and its version.
 
-    Its import writes to the C library's streams, past ``sys.stdout``; nothing of it gets through.
+    The import writes to the C library's streams, past ``sys.stdout``; nothing of it gets through.
 
     Raises:
         MissingEngine: It is not installed.
     """
-    if sys.modules.get("pybullet") is not None:
-        return sys.modules["pybullet"]
     try:
-        with silence():
+        with nullcontext() if sys.modules.get("pybullet") else silence():
             import pybullet
-    except ImportError as error:
+        return pybullet, metadata.version("pybullet")
+    except (ImportError, metadata.PackageNotFoundError) as error:
         raise MissingEngine("bullet", INSTALL, f"{error}; {REASON}") from error
-    return pybullet
 
 
-def version() -> str:
-    """Give the version of pybullet.
+@final
+class Connection:
+    """The functions and constants of the engine, for a physics client of its own.
 
-    Raises:
-        MissingEngine: It is not installed.
+    Args:
+        engine: The module ``pybullet``.
+
+    Attributes:
+        handle: The number of the client.
+        close: Disconnects it, once; so does the end of this object.
     """
-    try:
-        return metadata.version("pybullet")
-    except metadata.PackageNotFoundError as error:
-        raise MissingEngine("bullet", INSTALL, REASON) from error
+
+    def __init__(self, engine: Any) -> None:
+        self._engine, self.handle = engine, engine.connect(engine.DIRECT)
+        if self.handle < 0:
+            raise EngineFailure("Bullet has no physics client left; close some backends", "bullet")
+        self.close = weakref.finalize(self, _disconnect, engine, self.handle)
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._engine, name)
+        return partial(found, physicsClientId=self.handle) if callable(found) else found
+
+
+def _disconnect(engine: Any, handle: int) -> None:
+    with suppress(engine.error):
+        engine.disconnect(physicsClientId=handle)
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,15 +20,14 @@ from scm_world.backends.bullet.build import (
     SHAPES,
     couplings,
     links,
-    plan_of,
     takes_armature,
+    unit_of,
 )
 from scm_world.backends.mujoco import fields, reading
-from scm_world.backends.mujoco.realization import slots_of
 from scm_world.backends.mujoco.trees import Couplings, works
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable
 from scm_world.models.model import Model, Parameter
-from scm_world.models.scene import ParameterKey, State
+from scm_world.models.scene import ParameterKey, Parameters, State
 
 UNIT = 1e-12  # a quaternion whose squared norm is this near to 1 is taken as it is
 
@@ -43,24 +42,68 @@ def realized(model: Model) -> Model:
 def unsupported(model: Model) -> tuple[str, ...]:
     """List everything in a model that the engine cannot honour."""
     mj = reading.compiled(realized(model))
-    names, trees = fields.element_names(mj), Couplings(mj)
-    parts = _of_joints(mj, names), _of_contacts(mj, names, trees), _of_bodies(mj, names, trees)
-    return tuple(sentence for part in parts for sentence in part)
-
-
-def _of_joints(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
-    """List what joints, and what joins them, ask for in vain."""
-    for joint, kind in enumerate(mj.jnt_type.tolist()):
-        name, dof = names["joint"][joint], int(mj.jnt_dofadr[joint])
-        if mj.dof_armature[dof] and not takes_armature(mj, int(mj.jnt_bodyid[joint])):
-            yield (
-                f"armature of the joint {name!r}, which is not a hinge that alone carries a body "
-                "on the world"
+    names, trees, tables = fields.element_names(mj), Couplings(mj), list[tuple[str, Any, str]]()
+    touching: NDArray[np.bool_] = np.asarray(trees.touches.any(axis=1))
+    dynamic: NDArray[np.bool_] = np.asarray(trees.dynamic.any(axis=1))
+    kinds, dofs = mj.jnt_type, mj.jnt_dofadr
+    loss, odd = mj.dof_frictionloss[dofs] != 0.0, ~np.isin(mj.geom_type, list(SHAPES))
+    working = np.array([works(mj, actuator) for actuator in range(mj.nactuator)], dtype=np.bool_)
+    adhesion = mj.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)
+    tables += [
+        (
+            "joint",
+            (mj.dof_armature[dofs] != 0.0) & ~_hinged(mj)[mj.jnt_bodyid],
+            "armature of the joint {!r}, which is not a hinge that alone carries a body on the "
+            "world",
+        ),
+        ("joint", (kinds == BALL) & (mj.jnt_limited != 0), "limits of the ball joint {!r}"),
+        ("joint", (kinds == FREE) & loss, "frictionloss of the free joint {!r}"),
+        ("joint", (kinds == BALL) & loss, "frictionloss of the ball joint {!r}"),
+        (
+            "tendon",
+            (mj.tendon_frictionloss != 0.0) | (mj.tendon_armature != 0.0) | mj.tendon_limited,
+            "frictionloss, armature or limits of the tendon {!r}",
+        ),
+        ("actuator", working & adhesion, "the actuator {!r}, which acts by contact"),
+        (
+            "actuator",
+            working & ~adhesion & (mj.actuator_armature != 0.0),
+            "the actuator {!r}, which adds armature of its own",
+        ),
+        ("flex", np.ones(mj.nflex), "the flex {!r}"),
+        ("geom", touching & odd, "the {kind} {!r}"),
+        (
+            "geom",
+            touching & ((mj.geom_adhesion != 0.0) | (mj.geom_surfacevel != 0.0).any(axis=1)),
+            "adhesion or moving surface of the geom {!r}",
+        ),
+        (
+            "pair",
+            dynamic[mj.pair_geom1] | dynamic[mj.pair_geom2] | ~_multiplied(mj),
+            "the pair {!r}, whose friction is not the product of those of its shapes",
+        ),
+        ("body", mj.body_mocapid >= 0, "the mocap body {!r}"),
+    ]
+    found = []
+    for element, which, sentence in tables:
+        for number in np.flatnonzero(which).tolist():
+            kind = mujoco.mjtGeom(mj.geom_type[number]).name if element == "geom" else ""
+            kind = kind.removeprefix("mjGEOM_").lower()
+            found.append(sentence.format(names[element][number], kind=kind))
+    found += _of_couplings(mj, names)
+    for tree in range(mj.ntree):
+        unit = unit_of(mj, tree, np.flatnonzero(touching).tolist())
+        count = links(mj, unit)
+        if count > MOST_LINKS:
+            found.append(
+                f"the {count} links that {names['body'][unit.bodies[0]]!r} and all that hangs on "
+                f"it need: there is room for {MOST_LINKS}"
             )
-        if kind == BALL and mj.jnt_limited[joint]:
-            yield f"limits of the ball joint {name!r}"
-        if kind in (FREE, BALL) and mj.dof_frictionloss[dof]:
-            yield f"frictionloss of the {('free', 'ball')[kind]} joint {name!r}"
+    return tuple(found)
+
+
+def _of_couplings(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
+    """List the equality constraints that are not joints which follow one another in proportion."""
     for equality in couplings(mj, range(mj.njnt)):
         kind = int(mj.eq_type[equality])
         ends = int(mj.eq_obj1id[equality]), int(mj.eq_obj2id[equality])
@@ -72,40 +115,10 @@ def _of_joints(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iter
         elif len({int(mj.body_treeid[mj.jnt_bodyid[end]]) for end in ends}) > 1:
             one, other = (names["joint"][end] for end in ends)
             yield f"{what}, which joins {one!r} and {other!r} of two trees"
-    for tendon, name in enumerate(names["tendon"]):
-        if any(
-            getattr(mj, f"tendon_{what}")[tendon]
-            for what in ("frictionloss", "armature", "limited")
-        ):
-            yield f"frictionloss, armature or limits of the tendon {name!r}"
-    for actuator, name in enumerate(names["actuator"]):
-        adhesion = mj.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_BODY)
-        if works(mj, actuator) and (adhesion or mj.actuator_armature[actuator]):
-            what = "acts by contact" if adhesion else "adds armature of its own"
-            yield f"the actuator {name!r}, which {what}"
-
-
-def _of_contacts(
-    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings
-) -> Iterator[str]:
-    """List what shapes ask for in vain."""
-    yield from (f"the flex {name!r}" for name in names["flex"])
-    for geom in np.flatnonzero(trees.touches.any(axis=1)).tolist():
-        name, kind = names["geom"][geom], int(mj.geom_type[geom])
-        if kind not in SHAPES:
-            yield f"the {mujoco.mjtGeom(kind).name.removeprefix('mjGEOM_').lower()} {name!r}"
-        if mj.geom_adhesion[geom] or np.any(mj.geom_surfacevel[geom]):
-            yield f"adhesion or moving surface of the geom {name!r}"
-    dynamic: NDArray[np.bool_] = np.asarray(trees.dynamic.any(axis=1))
-    for name, one, other, alike in zip(
-        names["pair"], mj.pair_geom1, mj.pair_geom2, _multiplied(mj), strict=True
-    ):
-        if dynamic[one] or dynamic[other] or not alike:
-            yield f"the pair {name!r}, whose friction is not the product of those of its shapes"
 
 
 def _multiplied(mj: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Tell which pairs have the product of the frictions of their shapes, shape (npair,)."""
+    """Return which pairs have the product of the frictions of their shapes, shape (npair,)."""
     factors = mj.geom_friction[:, 0]
     products = factors[mj.pair_geom1] * factors[mj.pair_geom2]
     same: Any = mj.pair_friction[:, :2] == products[:, None]
@@ -113,45 +126,39 @@ def _multiplied(mj: mujoco.MjModel) -> NDArray[np.bool_]:
     return found
 
 
-def _of_bodies(
-    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings
-) -> Iterator[str]:
-    """List what bodies ask for in vain."""
-    yield from (
-        f"the mocap body {names['body'][body]!r}" for body in np.flatnonzero(mj.body_mocapid >= 0)
-    )
-    touching = np.flatnonzero(trees.touches.any(axis=1)).tolist()
-    for tree in range(mj.ntree):
-        plan = plan_of(mj, tree, touching)
-        count = links(mj, plan)
-        if count > MOST_LINKS:
-            yield (
-                f"the {count} links that {names['body'][plan.bodies[0]]!r} and all that hangs on "
-                f"it need: there is room for {MOST_LINKS}"
-            )
+def _hinged(mj: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Return which bodies take the armature of their joint, shape (nbody,)."""
+    return np.array([takes_armature(mj, body) for body in range(mj.nbody)], dtype=np.bool_)
 
 
-def check(model: Model, parameters: Mapping[ParameterKey, Any]) -> None:
-    """Say what the engine cannot honour, before anything is made.
+def check(model: Model, parameters: Parameters) -> None:
+    """Refuse what the engine cannot honour, before anything is made.
+
+    Args:
+        model: What is to be built.
+        parameters: Those that are given.
 
     Raises:
         ModelError: All of it that is in the model.
         NotIntervenable: A parameter that the engine lacks is not as in the model.
-        EngineFailure: A rotation has no direction.
+        EngineFailure: A number is not finite, or a rotation has no direction.
     """
     problems = unsupported(model)
     if problems:
         advice = "take it out of the model, or use backend='mujoco'"
         raise ModelError([f"Bullet cannot honour {what}; {advice}" for what in problems])
-    known = changes(model)
-    for row in model.parameters:
-        if row.kind == "rotation" and not any(parameters[row.key]):
-            found = parameters[row.key]
+    known, rows = changes(model), {row.key: row for row in model.parameters}
+    for key, value in parameters.items():
+        row = rows[key]
+        if not np.isfinite(value).all():
+            name, found = ".".join(key), value.tolist()
+            raise EngineFailure(f"{name} must be finite, got {found}", "bullet")
+        if row.kind == "rotation" and not value.any():
+            found = value.tolist()
             raise EngineFailure(f"{row.name} must be a quaternion, got {found}", "bullet")
-        if row.visual or row.key in known:
+        if row.visual or key in known:
             continue
-        default, value = np.array(row.default), parameters[row.key]
-        if not np.array_equal(np.broadcast_to(default, row.shape), value):
+        if not np.array_equal(np.broadcast_to(np.array(row.default), row.shape), value):
             raise NotIntervenable(
                 row.name,
                 f"is no parameter on Bullet: there it keeps its default {row.default}; use "
@@ -159,43 +166,41 @@ def check(model: Model, parameters: Mapping[ParameterKey, Any]) -> None:
             )
 
 
-def rotations(model: Model) -> list[int]:
+@lru_cache(maxsize=64)
+def rotations(model: Model) -> tuple[int, ...]:
     """List where in the state the quaternions begin."""
     slices = model.layout.slices
-    return [slices[row.name].start for row in model.states if row.kind == "rotation"]
+    return tuple(slices[row.name].start for row in model.states if row.kind == "rotation")
 
 
-def settle(model: Model, given: State) -> list[float]:
-    """Turn a state into plain numbers: unit quaternions, and 0 for what cannot be set.
+def settle(model: Model, given: State, last: State | None = None) -> Floats:
+    """Return the vector of a state with unit quaternions; what cannot be set is as it was last.
 
     Raises:
         ValueError: It is a state of another structure.
         EngineFailure: A number is not finite.
     """
-    numbers: list[float] = given.vector.tolist()
-    if len(numbers) != model.layout.size:
-        raise ValueError(f"expected a state of {model.layout.size} numbers, got {given!r}")
+    layout, vector = model.layout, given.vector.copy()
+    if vector.size != layout.size:
+        raise ValueError(f"expected a state of {layout.size} numbers, got {given!r}")
+    for name in layout.reported:
+        there = last is not None and name in last.layout.slices
+        vector[layout.slices[name]] = last[name] if last is not None and there else 0.0
+    numbers: list[float] = vector.tolist()
     if not math.isfinite(sum(numbers)):
         raise EngineFailure(f"a state must be finite, got {given!r}", "bullet")
-    for name in model.layout.reported:
-        where = model.layout.slices[name]
-        numbers[where] = [0.0] * (where.stop - where.start)
-    slices = model.layout.slices
     for row in model.states:
         if row.kind == "rotation":
-            where = slices[row.name]
+            where = layout.slices[row.name]
             turn = numbers[where]
             square = sum(part * part for part in turn)
             scale = math.sqrt(square) if abs(square - 1.0) >= UNIT and square else 1.0
             scale = -scale if row.frame == "world" and turn[3] < 0.0 else scale
-            numbers[where] = [part / scale for part in turn]
-    return numbers
+            vector[where] = [part / scale for part in turn]
+    return vector
 
 
 # --- parameters -----------------------------------------------------------------------------------
-
-Kind = Literal["live", "rebuilt"]
-"""What a change takes: live bodies take it on, or only new ones do."""
 
 FORCES = (
     "actuator_gainprm", "actuator_biasprm", "actuator_gear", "actuator_ctrlrange",
@@ -205,26 +210,30 @@ FORCES = (
     "opt.viscosity",
 )  # fmt: skip
 """What acts by smooth forces alone: they come from MuJoCo."""
+LIVE = (*FORCES, "opt.gravity", "opt.timestep", "body_mass", "pair_solref")
+"""What bodies that are there take on."""
+REBUILT = (
+    "body_pos", "body_quat", "body_ipos", "jnt_pos", "jnt_axis", "qpos0", "geom_pos", "geom_quat",
+    "geom_size",
+)  # fmt: skip
+"""What only new bodies take on."""
 
 
-def _honoured(mj: mujoco.MjModel) -> Iterator[tuple[str, Kind, Any]]:
-    """List arrays, what a change of them takes, and which of their rows or numbers count."""
-    hinged = np.array([takes_armature(mj, body) for body in range(mj.nbody)])
-    scalar = ~np.isin(mj.jnt_type, (FREE, BALL))
+def _honoured(mj: mujoco.MjModel) -> list[tuple[str, bool, Any]]:
+    """List arrays, whether they need new bodies, and which of their rows or numbers count."""
+    hinged, scalar = _hinged(mj), ~np.isin(mj.jnt_type, (FREE, BALL))
     dynamic = Couplings(mj).dynamic.any(axis=1)
-    frictions = np.stack([dynamic | True, ~dynamic, ~dynamic], axis=1)
-    dofs = scalar[mj.dof_jntid]
-    yield from ((name, "live", True) for name in FORCES)
-    yield from ((name, "live", True) for name in ("opt.gravity", "opt.timestep"))
-    yield from (("body_mass", "live", True), ("body_inertia", "live", ~hinged[:, None]))
-    yield from (("jnt_range", "live", scalar[:, None]), ("dof_frictionloss", "live", dofs))
-    yield from (("geom_friction", "live", frictions), ("pair_solref", "live", True))
-    yield "pair_friction", "live", np.arange(5) < 3
-    yield from (("body_inertia", "rebuilt", hinged[:, None]), ("body_pos", "rebuilt", True))
-    yield from (("body_quat", "rebuilt", True), ("body_ipos", "rebuilt", True))
-    yield from ((name, "rebuilt", True) for name in ("jnt_pos", "jnt_axis", "qpos0"))
-    yield "dof_armature", "rebuilt", hinged[mj.dof_bodyid]
-    yield from ((name, "rebuilt", True) for name in ("geom_pos", "geom_quat", "geom_size"))
+    return [
+        *((name, False, True) for name in LIVE),
+        *((name, True, True) for name in REBUILT),
+        ("body_inertia", False, ~hinged[:, None]),
+        ("body_inertia", True, hinged[:, None]),
+        ("dof_armature", True, hinged[mj.dof_bodyid]),
+        ("jnt_range", False, scalar[:, None]),
+        ("dof_frictionloss", False, scalar[mj.dof_jntid]),
+        ("geom_friction", False, np.stack([dynamic | True, ~dynamic, ~dynamic], axis=1)),
+        ("pair_friction", False, np.arange(5) < 3),
+    ]
 
 
 def _read(mj: mujoco.MjModel, name: str) -> Floats:
@@ -250,7 +259,7 @@ def _saved(mj: mujoco.MjModel) -> NDArray[np.uint8]:
 
 
 def _other(row: Parameter) -> Floats:
-    """Give another value of a parameter."""
+    """Return another value of a parameter."""
     value = np.array(np.broadcast_to(row.default, row.shape), dtype=np.float64)
     if row.kind == "switch":
         return 1.0 - value
@@ -259,48 +268,46 @@ def _other(row: Parameter) -> Floats:
 
 
 @lru_cache(maxsize=64)
-def changes(model: Model) -> Mapping[ParameterKey, Kind]:
-    """Map the parameters that the engine has to what a change of them takes.
+def changes(model: Model) -> Mapping[ParameterKey, bool]:
+    """Map the parameters that the engine has to whether a change of them needs new bodies.
 
     Each is tried on a copy of the compiled model: the engine has a parameter if nothing is written
     but what it honours.
     """
     model = realized(model)
     mj = copy.copy(reading.compiled(model))
-    slots = slots_of(model, mj, mujoco.MjData(mj))
-    untouched, found = _saved(mj), dict[ParameterKey, Kind]()
-    rows = [(name, kind, which, _read(mj, name)) for name, kind, which in _honoured(mj)]
+    slots = model.slots(mj, mujoco.MjData(mj))
+    untouched, found = _saved(mj), dict[ParameterKey, bool]()
+    rows = [(name, new, which, _read(mj, name)) for name, new, which in _honoured(mj)]
     for row in model.parameters:
         slot = slots[row.key]
         before = slot.read()
         slot.write(_other(row))
         if slot.follow_up:
             slot.follow_up(mj)
-        takes, multiplied = set[Kind](), _multiplied(mj).all()
-        for name, kind, which, was in rows:
+        takes, multiplied = set[bool](), _multiplied(mj).all()
+        for name, new, which, was in rows:
             now = _read(mj, name)
             changed = (now != was) & which
             if changed.any():
-                takes.add(kind)
+                takes.add(new)
                 _write(mj, name, np.where(changed, was, now))
         if takes and multiplied and np.array_equal(_saved(mj), untouched):
-            found[row.key] = "rebuilt" if "rebuilt" in takes else "live"
+            found[row.key] = any(takes)
         for name, _, _, was in rows:
             _write(mj, name, was)
         slot.write(before)
     return found
 
 
-def keys(model: Model) -> list[ParameterKey]:
-    """List every parameter of a model, also those that the engine lacks."""
-    return [row.key for row in model.parameters]
-
-
-def heavy(model: Model) -> list[ParameterKey]:
+@lru_cache(maxsize=64)
+def rebuilt(model: Model) -> tuple[ParameterKey, ...]:
     """List the parameters that need new bodies."""
-    return [key for key, takes in changes(model).items() if takes == "rebuilt"]
+    return tuple(key for key, new in changes(model).items() if new)
 
 
-def supports(model: Model, key: ParameterKey) -> bool:
-    """Tell whether a parameter of a model can be set: the engine has it, or only pictures do."""
+def supports(model: Any, key: ParameterKey) -> bool:
+    """Return whether a parameter of a model can be set: the engine has it, or only pictures do."""
+    if not isinstance(model, Model):
+        return False
     return key in changes(model) or any(row.key == key and row.visual for row in model.parameters)

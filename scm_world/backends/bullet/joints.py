@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, final
 
 import mujoco
@@ -13,12 +13,19 @@ from numba import njit
 from scm_world._types import Floats, Integers
 from scm_world.backends.bullet.build import BALL, FREE, UNTURNED, Handle, composed, plain, rotated
 
-_SIGNS = np.array([1.0, -1.0, -1.0, -1.0])
-"""What turns a quaternion (w, x, y, z) into its inverse."""
-
 
 class Part(ABC):
-    """Joints that the engine is asked and told of together."""
+    """Joints that the engine is asked and told of together.
+
+    Args:
+        engine: The functions of a physics client.
+        mj: The model.
+        places: The link of each joint, by the number of the joint.
+    """
+
+    def __init__(self, engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle]) -> None:
+        self._engine, joints = engine, list(places)
+        self._starts = np.stack([mj.jnt_qposadr[joints], mj.jnt_dofadr[joints]], axis=1)
 
     @abstractmethod
     def put(self, data: mujoco.MjData) -> None:
@@ -35,26 +42,18 @@ class Part(ABC):
 
 @final
 class Scalars(Part):
-    """Hinges and slides.
+    """Hinges and slides."""
 
-    Args:
-        engine: The module ``pybullet``.
-        handle: The number of the client.
-        mj: The model.
-        places: The link of each joint, by the number of the joint.
-    """
-
-    def __init__(
-        self, engine: Any, handle: int, mj: mujoco.MjModel, places: Mapping[int, Handle]
-    ) -> None:
-        self._engine, self._handle = engine, handle
-        links: dict[int, dict[int, int]] = {}
-        for joint, (multibody, link) in places.items():
-            links.setdefault(multibody, {})[joint] = link
-        joints = [joint for own in links.values() for joint in own]
-        self._links = [(multibody, list(own.values())) for multibody, own in links.items()]
-        self._positions = _run(mj.jnt_qposadr[joints])
-        self._velocities = _run(mj.jnt_dofadr[joints])
+    def __init__(self, engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle]) -> None:
+        order = dict.fromkeys(multibody for multibody, _ in places.values())
+        rank = {multibody: index for index, multibody in enumerate(order)}
+        places = dict(sorted(places.items(), key=lambda item: rank[item[1][0]]))
+        super().__init__(engine, mj, places)
+        self._ask, self._tell = engine.getJointStates, engine.setJointMotorControlArray
+        self._mode = engine.TORQUE_CONTROL
+        self._places = list(places.values())
+        self._links = [(m, [link for body, link in self._places if body == m]) for m in order]
+        self._positions, self._velocities = (_run(starts) for starts in self._starts.T)
         self._references = mj.qpos0[self._positions]
         self._shifted = bool(self._references.any())
 
@@ -62,16 +61,13 @@ class Scalars(Part):
         """Give the engine the state that MuJoCo has."""
         values = (data.qpos[self._positions] - self._references).tolist()
         speeds = data.qvel[self._velocities].tolist()
-        places = [(multibody, link) for multibody, links in self._links for link in links]
-        for place, value, speed in zip(places, values, speeds, strict=True):
-            self._engine.resetJointState(*place, value, speed, physicsClientId=self._handle)
+        tell = self._engine.resetJointState
+        for place, value, speed in zip(self._places, values, speeds, strict=True):
+            tell(*place, value, speed)
 
     def take(self, data: mujoco.MjData) -> None:
         """Give MuJoCo the state that the engine has."""
-        ask, handle = self._engine.getJointStates, self._handle
-        rows = [
-            row for body, links in self._links for row in ask(body, links, physicsClientId=handle)
-        ]
+        rows = [row for body, links in self._links for row in self._ask(body, links)]
         data.qpos[self._positions] = [row[0] for row in rows]
         if self._shifted:
             data.qpos[self._positions] += self._references
@@ -79,18 +75,14 @@ class Scalars(Part):
 
     def drive(self, data: mujoco.MjData, forces: Floats) -> None:
         """Apply forces along the joints."""
-        tell, torque, given = (
-            self._engine.setJointMotorControlArray,
-            self._engine.TORQUE_CONTROL,
-            forces[self._velocities].tolist(),
-        )
+        given = forces[self._velocities].tolist()
         for multibody, links in self._links:
             own, given = given[: len(links)], given[len(links) :]
-            tell(multibody, links, torque, forces=own, physicsClientId=self._handle)
+            self._tell(multibody, links, self._mode, forces=own)
 
 
 def _run(numbers: Integers) -> Any:
-    """Give a slice for numbers that follow one another, which is faster; else the numbers."""
+    """Return a slice for numbers that follow one another, which is faster; else the numbers."""
     first, count = int(numbers[0]), len(numbers)
     run = bool((numbers == np.arange(first, first + count)).all())
     return slice(first, first + count) if run else numbers
@@ -98,108 +90,97 @@ def _run(numbers: Integers) -> Any:
 
 @final
 class Ball(Part):
-    """A ball joint. The engine has it about the principal axes of the body.
+    """A ball joint. The engine has it about the principal axes of the body."""
 
-    Args:
-        engine: The module ``pybullet``.
-        handle: The number of the client.
-        mj: The model.
-        joint: Its number.
-        place: Its link.
-    """
-
-    def __init__(
-        self, engine: Any, handle: int, mj: mujoco.MjModel, joint: int, place: Handle
-    ) -> None:
-        self._engine, self._handle = engine, handle
-        self._multibody, self._link = place
-        self._q, self._v = int(mj.jnt_qposadr[joint]), int(mj.jnt_dofadr[joint])
+    def __init__(self, engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle]) -> None:
+        super().__init__(engine, mj, places)
+        ((joint, self._place),) = places.items()
+        q, v = self._starts[0].tolist()
+        self._turn, self._spin = slice(q, q + 4), slice(v, v + 3)
         body = int(mj.jnt_bodyid[joint])
         last = mj.body_jntadr[body] + mj.body_jntnum[body] - 1 == joint  # others have no mass
         self._axes = mj.body_iquat[body].copy() if last else UNTURNED
+        self._back = np.array([1.0, -1.0, -1.0, -1.0]) * self._axes
 
     def put(self, data: mujoco.MjData) -> None:
         """Give the engine the state that MuJoCo has."""
-        back = _SIGNS * self._axes
-        turn = composed(composed(back, data.qpos[self._q : self._q + 4]), self._axes)
-        spin = rotated(back, data.qvel[self._v : self._v + 3]).tolist()
-        self._engine.resetJointStateMultiDof(
-            self._multibody, self._link, plain(turn), spin, physicsClientId=self._handle
-        )
+        turn = composed(composed(self._back, data.qpos[self._turn]), self._axes)
+        spin = rotated(self._back, data.qvel[self._spin]).tolist()
+        self._engine.resetJointStateMultiDof(*self._place, plain(turn), spin)
 
     def take(self, data: mujoco.MjData) -> None:
         """Give MuJoCo the state that the engine has."""
-        (x, y, z, w), spin, *_ = self._engine.getJointStateMultiDof(
-            self._multibody, self._link, physicsClientId=self._handle
-        )
-        turn = composed(composed(self._axes, np.array([w, x, y, z])), _SIGNS * self._axes)
-        data.qpos[self._q : self._q + 4] = turn
-        data.qvel[self._v : self._v + 3] = rotated(self._axes, np.array(spin))
+        (x, y, z, w), spin, *_ = self._engine.getJointStateMultiDof(*self._place)
+        turn = composed(composed(self._axes, np.array([w, x, y, z])), self._back)
+        data.qpos[self._turn] = turn
+        data.qvel[self._spin] = rotated(self._axes, np.array(spin))
 
     def drive(self, data: mujoco.MjData, forces: Floats) -> None:
         """Apply a torque, which is given in the frame of the body."""
-        torque = rotated(_SIGNS * self._axes, forces[self._v : self._v + 3])
-        self._engine.setJointMotorControlMultiDof(
-            self._multibody,
-            self._link,
-            self._engine.TORQUE_CONTROL,
-            force=torque.tolist(),
-            physicsClientId=self._handle,
-        )
+        torque, mode = rotated(self._back, forces[self._spin]), self._engine.TORQUE_CONTROL
+        self._engine.setJointMotorControlMultiDof(*self._place, mode, force=torque.tolist())
 
 
 @final
 class Free(Part):
     """Free bodies. The engine has the motion of their centers, and turns of their principal axes.
 
-    Args:
-        engine: The module ``pybullet``.
-        handle: The number of the client.
-        mj: The model.
-        places: The base of each body, by the number of its joint.
+    Their coordinates in MuJoCo are positions of their frames.
     """
 
-    def __init__(
-        self, engine: Any, handle: int, mj: mujoco.MjModel, places: Mapping[int, Handle]
-    ) -> None:
-        self._engine, self._handle = engine, handle
+    def __init__(self, engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle]) -> None:
+        super().__init__(engine, mj, places)
         self._multibodies = [multibody for multibody, _ in places.values()]
-        joints = list(places)
-        self._bodies = mj.jnt_bodyid[joints].tolist()
-        self._starts = np.stack([mj.jnt_qposadr[joints], mj.jnt_dofadr[joints]], axis=1)
+        self._bodies = mj.jnt_bodyid[list(places)].tolist()
         self._centers, self._axes = mj.body_ipos[self._bodies], mj.body_iquat[self._bodies]
+        self._pose, self._velocity = engine.getBasePositionAndOrientation, engine.getBaseVelocity
 
     def put(self, data: mujoco.MjData) -> None:
         """Give the engine the state that MuJoCo has."""
-        engine, handle = self._engine, self._handle
         rows = np.empty((len(self._multibodies), 13))
         _to_centers(data.qpos, data.qvel, self._starts, self._centers, self._axes, rows)
         for body, row in zip(self._multibodies, rows.tolist(), strict=True):
-            engine.resetBasePositionAndOrientation(body, row[:3], row[3:7], physicsClientId=handle)
-            engine.resetBaseVelocity(body, row[7:10], row[10:], physicsClientId=handle)
+            self._engine.resetBasePositionAndOrientation(body, row[:3], row[3:7])
+            self._engine.resetBaseVelocity(body, row[7:10], row[10:])
 
     def take(self, data: mujoco.MjData) -> None:
         """Give MuJoCo the state that the engine has, with quaternions whose w >= 0.
 
         The engine keeps a matrix: which of two quaternions it makes of it has no meaning.
         """
-        engine, handle, rows = self._engine, self._handle, list[tuple[float, ...]]()
+        rows = []
         for body in self._multibodies:
-            position, turn = engine.getBasePositionAndOrientation(body, physicsClientId=handle)
-            speed, spin = engine.getBaseVelocity(body, physicsClientId=handle)
+            (position, turn), (speed, spin) = self._pose(body), self._velocity(body)
             rows.append(position + turn + speed + spin)
         _from_centers(np.array(rows), self._starts, self._centers, self._axes, data.qpos, data.qvel)
 
     def drive(self, data: mujoco.MjData, forces: Floats) -> None:
         """Apply forces at the origins of the bodies, and torques that are given in their frames."""
-        engine, world, handle = self._engine, self._engine.WORLD_FRAME, self._handle
-        for multibody, body, (_, v) in zip(
-            self._multibodies, self._bodies, self._starts.tolist(), strict=True
+        engine, world = self._engine, self._engine.WORLD_FRAME
+        for multibody, body, v in zip(
+            self._multibodies, self._bodies, self._starts[:, 1].tolist(), strict=True
         ):
             place, push = data.xpos[body].tolist(), forces[v : v + 3].tolist()
             torque = rotated(data.xquat[body], forces[v + 3 : v + 6]).tolist()
-            engine.applyExternalForce(multibody, -1, push, place, world, physicsClientId=handle)
-            engine.applyExternalTorque(multibody, -1, torque, world, physicsClientId=handle)
+            engine.applyExternalForce(multibody, -1, push, place, world)
+            engine.applyExternalTorque(multibody, -1, torque, world)
+
+
+def parts(
+    engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle], trees: Collection[int]
+) -> list[Part]:
+    """List what can move in some kinematic trees, as few parts as there can be."""
+    tree_of, found = mj.body_treeid[mj.jnt_bodyid].tolist(), list[Part]()
+    together: dict[type[Part], dict[int, Handle]] = {}
+    for joint, place in sorted(places.items()):
+        kind = int(mj.jnt_type[joint])
+        if tree_of[joint] not in trees:
+            continue
+        if kind == BALL:
+            found.append(Ball(engine, mj, {joint: place}))
+        else:
+            together.setdefault(Free if kind == FREE else Scalars, {})[joint] = place
+    return found + [kind(engine, mj, own) for kind, own in together.items()]
 
 
 @njit(cache=True)
@@ -280,24 +261,3 @@ def _from_centers(
         positions[q + 3 : q + 7] = np.roll(turn, 1)
         velocities[v : v + 3] = rows[i, 7:10] - np.cross(spin, arm)
         velocities[v + 3 : v + 6] = _turned(turn, spin, -1.0)
-
-
-def parts(
-    engine: Any, handle: int, mj: mujoco.MjModel, places: Mapping[int, Handle]
-) -> Iterator[Part]:
-    """List what can move, as few parts as there can be.
-
-    Args:
-        engine: The module ``pybullet``.
-        handle: The number of the client.
-        mj: The model.
-        places: The link of each joint, by the number of the joint.
-    """
-    together: dict[type[Scalars | Free], dict[int, Handle]] = {}
-    for joint, place in sorted(places.items()):
-        kind = mj.jnt_type[joint]
-        if kind == BALL:
-            yield Ball(engine, handle, mj, joint, place)
-        else:
-            together.setdefault(Free if kind == FREE else Scalars, {})[joint] = place
-    yield from (kind(engine, handle, mj, own) for kind, own in together.items())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, final
 
@@ -16,17 +16,15 @@ from scm_world.backends.base import (
     EngineBatch,
     EngineSnapshot,
 )
-from scm_world.backends.mujoco.batch import BatchSlot, MujocoBatch
+from scm_world.backends.mujoco.batch import MujocoBatch, Slot
 from scm_world.backends.mujoco.contacts import Touches
 from scm_world.backends.mujoco.realization import Realization, refuse_callbacks
-from scm_world.errors import EngineFailure, ModelError
-from scm_world.models.model import Model
+from scm_world.errors import EngineFailure
 from scm_world.models.scene import (
     Difference,
     ParameterKey,
     Parameters,
     Scene,
-    State,
     Structure,
     complete,
 )
@@ -54,45 +52,27 @@ class Payload:
     replay: tuple[Floats, int] | None = None
 
 
-def realize(structure: Any, parameters: Parameters) -> Realization:
-    """Compile a structure, and write all parameters.
-
-    Raises:
-        ModelError: It is nothing that MuJoCo can realise.
-    """
-    if not isinstance(structure, Model):
-        raise ModelError([f"MuJoCo cannot realise a {type(structure).__name__}; it takes models"])
-    fresh = Realization(structure)
-    fresh.edit(parameters)
-    return fresh
-
-
 @final
 class MujocoBackend(Backend):
     """MuJoCo, with one compiled model per structure and everything else edited in place."""
 
     name: ClassVar[str] = "mujoco"
-    capabilities: ClassVar[Capabilities] = Capabilities(batch=True)
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        remarks=lambda backend, before: backend.realization.remarks(before)
+    )
+    batch: ClassVar[type[EngineBatch]] = MujocoBatch
+    version = str(mujoco.__version__)
 
     _now: Realization
     _touches: Touches | None
-    slot: BatchSlot | None = None
+    slot: Slot | None = None
 
     def __getattr__(self, name: str) -> Any:
         if name == "_now":
             raise EngineFailure("there is no scene; call build() first", self.name)
+        if name == "structure":
+            return self._now.structure
         raise AttributeError(name)
-
-    @property
-    def version(self) -> str:
-        """Version of the engine."""
-        return str(mujoco.__version__)
-
-    @property
-    def structure(self) -> Structure:
-        """What was compiled."""
-        found: Structure = self._now.structure
-        return found
 
     def build(self, scene: Scene) -> None:
         """Realise a scene from nothing; where the structure is the same, that costs little."""
@@ -116,7 +96,7 @@ class MujocoBackend(Backend):
             now.edit(difference.parameters)
         else:
             record = self._last_touches()
-            scene = Scene(now.structure, now.kept, self.state())
+            scene = Scene(now.structure, now.kept, self.read())
             difference = complete(scene, structure, difference)
             self._now = self._realized(structure, difference.parameters)
             if self._now is not now:
@@ -133,23 +113,13 @@ class MujocoBackend(Backend):
         """
         return self._now.parameters(keys)
 
-    def inertia(self, body: str) -> Floats:
-        """Read the principal moments of inertia of a body, shape (3,) [kg m²].
-
-        Raises:
-            UnknownOption: There is no such body.
-        """
-        return self._now.inertia(body)
-
-    def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """Say with which shapes a friction that was changed has no effect."""
-        return self._now.remarks(before)
-
-    def read(self, into: State) -> None:
-        """Write the present state into an existing vector."""
+    def read(self, into: Any = None) -> Any:
+        """Write the present state into an existing one, or a new one."""
         if self.slot is not None:
             self._return()
+        into = self._now.structure.empty_state() if into is None else into
         self._now.read(into.vector)
+        return into
 
     def step(self, command: Floats, substeps: int) -> None:
         """Hold a command for some physics steps.
@@ -189,7 +159,8 @@ class MujocoBackend(Backend):
         touches = self._touches if now.replay is not None else self._last_touches()
         replay = now.replay if touches is None else None
         state = now.numbers(), now.memory()
-        return self.sealed(Payload(now.structure, dict(now.kept), *state, touches, replay))
+        payload = Payload(now.structure, dict(now.kept), *state, touches, replay)
+        return EngineSnapshot.of(self, payload)
 
     def restore(self, snapshot: EngineSnapshot) -> None:
         """Go back to a snapshot.
@@ -197,7 +168,7 @@ class MujocoBackend(Backend):
         Raises:
             SnapshotMismatch: It was taken by another engine, or another version of this one.
         """
-        payload: Payload = self.opened(snapshot)
+        payload: Payload = snapshot.opened(self)
         now: Realization | None = vars(self).get("_now")
         if now is None or now.applied is not payload.parameters:
             now = self._realized(payload.structure, payload.parameters)
@@ -206,24 +177,18 @@ class MujocoBackend(Backend):
         now.replay = payload.replay
         self._now, self.slot, self._touches = now, None, payload.touches
 
-    @classmethod
-    def batch(cls, backends: Sequence[Backend], threads: int) -> EngineBatch:
-        """Give what steps several scenes in one call, with C threads."""
-        members = [backend for backend in backends if isinstance(backend, MujocoBackend)]
-        return MujocoBatch(members, threads)
-
     @property
     def realization(self) -> Realization:
         """The compiled model, with parameters and state of the scene when it is not in a slot."""
         return self._now
 
-    def move_to(self, slot: BatchSlot) -> bool:
+    def move_to(self, slot: Slot) -> bool:
         """Copy the state to a slot; tell whether the model has changed since the last time."""
         now = self._now
         edited = now.edited
-        if self.slot is not slot:
+        if self.slot != slot:
             self._return()
-            slot.take(now)
+            slot[0].take(slot[1], now)
             self.slot, edited = slot, True
         now.forget()
         self._touches = None
@@ -233,7 +198,8 @@ class MujocoBackend(Backend):
     def _return(self) -> None:
         """Take the state back from where it is stepped."""
         if self.slot is not None:
-            self.slot.give_back(self._now)
+            group, index = self.slot
+            group.give_back(index, self._now)
             self.slot = None
 
     def close(self) -> None:
@@ -242,10 +208,10 @@ class MujocoBackend(Backend):
             delattr(self, name)
 
     def _realized(self, structure: Any, parameters: Parameters) -> Realization:
-        """Give a structure with these parameters: the present one edited, or a new one."""
+        """Return the present realization, edited, or a new one."""
         now: Realization | None = vars(self).get("_now")
         if now is None or structure != now.structure:
-            return realize(structure, parameters)
+            return Realization(structure, parameters)
         now.edit(parameters)
         return now
 

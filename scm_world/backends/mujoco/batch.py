@@ -19,44 +19,18 @@ from scm_world.errors import EngineFailure
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.backend import MujocoBackend
 
+Slot = tuple["Simulations", int]
+"""The place of a scene in a batch: the simulations that it belongs to, and its number there."""
+
 KEPT = 4
 """Structures whose simulations are kept although no scene is in them at the moment."""
 
-_LEFT_BEHIND: list[_Simulations] = []
+_LEFT_BEHIND: list[Simulations] = []
 """Simulations whose threads were left behind by a fork."""
 
 
 @final
-class BatchSlot:
-    """The place of one scene in a batch.
-
-    Attributes:
-        group: The simulations that it belongs to.
-        index: Of the simulation.
-    """
-
-    __slots__ = ("group", "index")
-
-    def __init__(self, group: _Simulations, index: int) -> None:
-        self.group, self.index = group, index
-
-    def take(self, scene: Realization) -> None:
-        """Take over the state of a scene."""
-        mujoco.mj_getState(scene.model, scene.data, self.group.batch.state[self.index], STATE)
-        self.group.taken[self.index] = 0
-
-    def give_back(self, scene: Realization) -> None:
-        """Copy everything that the last step left, or what it takes to compute it again."""
-        group, index = self.group, self.index
-        if scene.lean and group.taken[index]:
-            mujoco.mj_setState(scene.model, scene.data, group.batch.state[index], STATE)
-            scene.replay = group.before[index].copy(), int(group.taken[index])
-        elif not scene.lean:
-            group.batch.get_data(index, scene.data)
-
-
-@final
-class _Simulations:
+class Simulations:
     """The simulations of all scenes of one structure.
 
     Args:
@@ -73,7 +47,6 @@ class _Simulations:
         self.before: Floats = np.zeros(self.batch.state.shape if scene.lean else (n, 0))
         self.taken = np.zeros(n, dtype=np.int64)  # physics steps of the last step
         self.batch.warning[..., 1] = 1  # MuJoCo prints the first of each kind of warning
-        self.slots = [BatchSlot(self, index) for index in range(n)]
         # Scenes that are as the first one was share a copy of its model: it stays in the cache.
         self.usual = scene.fingerprint(), copy.copy(scene.model)
         self.models: list[mujoco.MjModel] = [self.usual[1]] * n
@@ -81,9 +54,22 @@ class _Simulations:
         self._width = len(scene.command)
         self._commands = self.batch.bind("ctrl")
 
+    def take(self, index: int, scene: Realization) -> None:
+        """Take over the state of a scene."""
+        mujoco.mj_getState(scene.model, scene.data, self.batch.state[index], STATE)
+        self.taken[index] = 0
+
+    def give_back(self, index: int, scene: Realization) -> None:
+        """Copy everything that the last step left, or what it takes to compute it again."""
+        if scene.lean and self.taken[index]:
+            mujoco.mj_setState(scene.model, scene.data, self.batch.state[index], STATE)
+            scene.replay = self.before[index].copy(), int(self.taken[index])
+        elif not scene.lean:
+            self.batch.get_data(index, scene.data)
+
     def step(self, which: Integers, commands: Floats, substeps: int) -> None:
         """Hold commands, shape (n, at least n_commands), in some of the simulations."""
-        width, everyone = self._width, len(which) == len(self.slots)
+        width, everyone = self._width, len(which) == len(self.models)
         rows = slice(None) if everyone else which
         self._commands[rows, :width] = commands[rows, :width]
         if self.before.size:
@@ -103,13 +89,13 @@ class MujocoBatch(EngineBatch):
         threads: That step them; the results do not depend on how many.
     """
 
-    def __init__(self, backends: Sequence[MujocoBackend], threads: int) -> None:
-        self._backends = tuple(backends)
+    def __init__(self, backends: Sequence[MujocoBackend], threads: int = 1) -> None:
+        super().__init__(backends, threads)
         self._threads = max(1, min(threads, len(self._backends)))
-        self._groups: dict[Any, _Simulations] = {}
-        self._slots: list[BatchSlot | None] = [None] * len(self._backends)
+        self._groups: dict[Any, Simulations] = {}
+        self._slots: list[Slot | None] = [None] * len(self._backends)
         self._process = os.getpid()
-        self._last: _Simulations | None = None  # if all were stepped in one group
+        self._last: Simulations | None = None  # if all were stepped in one group
 
     def step(self, which: Integers, commands: Floats, substeps: int, into: Floats) -> None:
         """Hold commands for some physics steps.
@@ -123,7 +109,7 @@ class MujocoBatch(EngineBatch):
             # be freed here: that would wait for the threads for ever.
             self._process, self._last = os.getpid(), None
             _LEFT_BEHIND.extend(self._groups.values())
-            _LEFT_BEHIND.extend(slot.group for slot in self._slots if slot is not None)
+            _LEFT_BEHIND.extend(slot[0] for slot in self._slots if slot is not None)
             self._groups.clear()
             self._slots = [None] * len(self._backends)
         refuse_callbacks()
@@ -134,16 +120,16 @@ class MujocoBatch(EngineBatch):
             if problem:
                 raise EngineFailure(problem, "mujoco")
             return
-        groups: dict[int, tuple[_Simulations, list[int]]] = {}
+        groups: dict[int, tuple[Simulations, list[int]]] = {}
         changed: set[int] = set()
         for index in which.tolist():
-            slot = self._slot(index)
-            key = id(slot.group)
-            groups.setdefault(key, (slot.group, []))[1].append(index)
+            slot = group, _ = self._slot(index)
+            key = id(group)
+            groups.setdefault(key, (group, []))[1].append(index)
             if self._backends[index].move_to(slot):
-                scene, (fingerprint, model) = self._backends[index].realization, slot.group.usual
+                scene, (fingerprint, model) = self._backends[index].realization, group.usual
                 alike = scene.fingerprint() == fingerprint
-                slot.group.models[index] = model if alike else scene.model
+                group.models[index] = model if alike else scene.model
                 changed.add(key)
         problems = []
         everyone = len(groups) == 1 and len(which) == len(self._backends)
@@ -156,24 +142,24 @@ class MujocoBatch(EngineBatch):
         if problems:
             raise EngineFailure("; ".join(problems), "mujoco")
 
-    def _slot(self, index: int) -> BatchSlot:
+    def _slot(self, index: int) -> Slot:
         """Return the slot of a scene in the group of its structure."""
         scene, slot = self._backends[index].realization, self._slots[index]
-        if slot is not None and slot.group.structure == scene.structure:
+        if slot is not None and slot[0].structure == scene.structure:
             return slot
         self._slots[index], group = None, self._groups.get(scene.structure)
         if group is None:
-            used = {id(slot.group) for slot in self._slots if slot is not None}
+            used = {id(slot[0]) for slot in self._slots if slot is not None}
             unused = [key for key, other in self._groups.items() if id(other) not in used]
             for key in unused[: max(0, len(self._groups) + 1 - KEPT)]:
                 del self._groups[key]
-            group = _Simulations(scene, len(self._backends), self._threads)
+            group = Simulations(scene, len(self._backends), self._threads)
             self._groups[scene.structure] = group
-        slot = self._slots[index] = group.slots[index]
+        slot = self._slots[index] = group, index
         return slot
 
 
-def _step(group: _Simulations, which: Any, commands: Floats, substeps: int, into: Floats) -> str:
+def _step(group: Simulations, which: Any, commands: Floats, substeps: int, into: Floats) -> str:
     """Step and read; say what went wrong, or nothing."""
     said = ""
     try:

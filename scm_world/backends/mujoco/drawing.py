@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import OrderedDict
 from collections.abc import Iterator
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, final
 
 import mujoco
@@ -18,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.backends.mujoco.backend import realize
-from scm_world.backends.mujoco.reading import body_names
+from scm_world.backends.mujoco.realization import Realization
 from scm_world.models.camera import Camera
-from scm_world.models.scene import Parameters, Scene
+from scm_world.models.scene import Scene
 from scm_world.models.shapes import (
     BOX,
     CAPSULE,
@@ -39,7 +37,7 @@ from scm_world.models.shapes import (
 )
 
 MOST_SHAPES = 10_000  # of the abstract scene
-MOST_STAGES = 4  # models that are kept compiled, in each thread
+MOST_STAGES = 16  # models that are kept compiled
 SHOWN_GROUPS = 3  # Source: MuJoCo, mjv_defaultOption
 UNCOLORED = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
 """The color of what has none of its own, so that its material decides. Source: MuJoCo, XML."""
@@ -69,19 +67,18 @@ class VisibleModel:
     both shown, only how it looks is.
 
     Args:
-        structure: What MuJoCo can realise.
-        parameters: All of them.
+        structure: A model that MuJoCo can realise.
 
     Attributes:
         names: Of the bodies, by number.
     """
 
-    def __init__(self, structure: Any, parameters: Parameters) -> None:
-        self._now = now = realize(structure, parameters)
+    def __init__(self, structure: Any) -> None:
+        self._now = now = Realization(structure, {})
         self._given: tuple[Any, bytes] = ((), b"")  # the parameters that were written last
         self.model, self.data = now.model, now.data
         model = now.model
-        self.names = body_names(model)
+        self.names: tuple[str, ...] = structure.body_names
         mocap = model.body_mocapid[model.body_rootid] >= 0
         self._moves: NDArray[np.bool_] = (model.body_weldid != 0) | mocap
         self._rows = rows = np.flatnonzero(np.isin(model.geom_type, list(_KINDS)) & _looks(model))
@@ -236,8 +233,10 @@ class VisibleModel:
         return mesh_of(vertices, faces, normals[faces])
 
 
-_local = threading.local()
-"""What each thread has drawn last."""
+@lru_cache(maxsize=MOST_STAGES)
+def _stage(structure: Any, thread: int) -> VisibleModel:
+    """Compile a structure once in each thread."""
+    return VisibleModel(structure)
 
 
 def visible(scene: Scene) -> VisibleModel:
@@ -247,23 +246,18 @@ def visible(scene: Scene) -> VisibleModel:
         scene: Of any backend.
 
     Returns:
-        What is seen, until the next call in this thread.
+        The scene, until the next call in this thread.
 
     Raises:
         ModelError: MuJoCo cannot realise the structure, so that there are no pictures of it.
     """
-    stages: OrderedDict[Any, VisibleModel]
-    stages = _local.__dict__.setdefault("stages", OrderedDict())
-    shown = stages.pop(scene.structure, None) or VisibleModel(scene.structure, scene.parameters)
-    stages[scene.structure] = shown
-    if len(stages) > MOST_STAGES:
-        stages.popitem(last=False)
+    shown = _stage(scene.structure, threading.get_ident())
     shown.place(scene)
     return shown
 
 
 def _looks(model: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Tell which geoms are shown, shape (ngeom,)."""
+    """Return which geoms are shown, shape (ngeom,)."""
     shown: NDArray[np.bool_] = model.geom_group < SHOWN_GROUPS
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     for body in range(1, model.nbody):
@@ -315,7 +309,7 @@ def _height_field(model: mujoco.MjModel, field: int) -> Mesh:
 
 
 def _texture(model: mujoco.MjModel, material: int) -> Floats | None:
-    """Give the two colors of the checkerboard closest to a texture, shape (2, 3); None without."""
+    """Return the two colors of the checkerboard closest to a texture, shape (2, 3), if any."""
     roles = model.mat_texid[material]
     texture = max(int(roles[_ROLE.mjTEXROLE_RGB]), int(roles[_ROLE.mjTEXROLE_RGBA]))
     if texture < 0:

@@ -1,4 +1,4 @@
-"""The parameters of a compiled model: a table of rows, and what makes fields of them.
+"""The parameters of a compiled model: a table of rows, and what makes parameters of them.
 
 What may be changed, and what has to follow, is MuJoCo's own table (*Programming, Simulation,
 mjModel changes*); every class was tried on foreign models by writing, undoing and comparing all
@@ -10,21 +10,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any, Literal, NamedTuple, final
+from typing import Any, Literal, final
 
 import mujoco
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.mujoco.slots import Slot, color, direction, first, gain, option, place, turn
+from scm_world.backends.mujoco.slots import Finder, at, color, direction, gain, option, place, turn
 from scm_world.backends.mujoco.trees import NOTHING, Couplings, Effect, disabled
-from scm_world.models.model import Numbers
-from scm_world.models.scene import ParameterKey
+from scm_world.models.model import Numbers, Parameter
 
-_OBJ, _TRN, _WRAP, _OFF = mujoco.mjtObj, mujoco.mjtTrn, mujoco.mjtWrap, mujoco.mjtDisableBit
+_TRN, _WRAP, _OFF = mujoco.mjtTrn, mujoco.mjtWrap, mujoco.mjtDisableBit
 _GAIN, _BIAS, _DYN, _GEOM = mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtDyn, mujoco.mjtGeom
 FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in (
     "FREE", "BALL", "SLIDE", "HINGE",
@@ -40,60 +39,12 @@ SMALLEST = 1e-9
 FORCES, INERTIAS = {"m": "N", "rad": "N m"}, {"m": "kg", "rad": "kg m^2"}
 """Units of a force and of an inertia along a coordinate, by its unit."""
 
-Slots = Callable[[mujoco.MjModel, mujoco.MjData], Slot]
-"""Finds a place in a model and its data."""
-
-
-@final
-@dataclass(frozen=True)
-class Field:
-    """A parameter of one element of a compiled model.
-
-    Attributes:
-        kind: Of the element: ``"body"``, ``"joint"``, ..., or ``"option"``.
-        element: Its name, ``""`` for an option.
-        attribute: What it is.
-        unit: SI unit.
-        doc: One sentence.
-        slot: Finds its place in a model and its data.
-        effect: The trees it acts on.
-        low: Lower bound.
-        high: Upper bound.
-        nature: The kind of its values.
-        usual: Whether it is exposed unless something else is asked for.
-        visual: Whether it acts on pictures only.
-        refusal: Why it cannot be set, to be read after its name; empty if it can.
-        name: Unique in the model.
-    """
-
-    kind: str
-    element: str
-    attribute: str
-    unit: str
-    doc: str
-    slot: Slots | None
-    effect: Callable[[], Effect] = lambda: NOTHING
-    low: Numbers = -math.inf
-    high: Numbers = math.inf
-    nature: Literal["real", "rotation", "inertia", "switch"] = "real"
-    usual: bool = True
-    visual: bool = False
-    refusal: str = ""
-    name: str = ""
-
-    @property
-    def plain_name(self) -> str:
-        """The name, if no other element has the same."""
-        return f"{self.element}.{self.attribute}" if self.element else self.attribute
-
-    @property
-    def key(self) -> ParameterKey:
-        """How engines know it."""
-        element, _, attribute = self.name.rpartition(".")
-        return element, attribute
-
-
 # --- elements ----------------------------------------------------------------------------------
+
+
+def prefix(kind: str) -> str:
+    """Return how MuJoCo calls the arrays of a kind of elements."""
+    return {"joint": "jnt", "equality": "eq", "option": "opt"}.get(kind, kind)
 
 
 @final
@@ -105,7 +56,7 @@ class Element:
         mj: The model, which is only read.
         trees: Its trees.
         fluid: Whether a medium acts, or may be made to act.
-        kind: See ``KINDS``.
+        kind: See ``ROWS``.
         i: Its number among those of its kind.
         name: Its name.
     """
@@ -118,7 +69,7 @@ class Element:
     name: str
 
     def __getitem__(self, array: str) -> Any:
-        return getattr(self.mj, f"{KINDS[self.kind].prefix}_{array}")[self.i]
+        return getattr(self.mj, f"{prefix(self.kind)}_{array}")[self.i]
 
     def is_(self, array: str, *members: Any) -> bool:
         """Return whether an entry is one of some constants of MuJoCo."""
@@ -273,12 +224,13 @@ class Row:
     """A parameter that every element of a kind has. What depends on the element is a function.
 
     Attributes:
-        attribute: What it is.
+        attribute: Its name.
         unit: SI unit; L is that of the coordinate, F of a force and I of an inertia along it.
         doc: One sentence.
-        array: The array of the model; a function that finds the slot; or ``""`` if nothing can be
-            written.
-        at: Place in the array; the number of the element by default.
+        array: Arrays with its value, or a function that returns a finder; ``""`` if nothing can be
+            written. See ``slots.at``.
+        at: Place in the arrays; the number of the element by default.
+        form: How the value stands there.
         constant: Whether constants of the model follow it (``mj_setConst``).
         low: Lower bound, or a function of the present value.
         high: Upper bound, likewise.
@@ -286,17 +238,18 @@ class Row:
         usual: Whether it is exposed by default; a function of the element and the present value.
         visual: Whether it acts on pictures only.
         exists: Which elements have it.
-        flags: Flags of the model that disable it, with what they disable.
+        flags: Flags of the model that disable it.
         acts: Whether it can be set, if no flag disables it.
         reason: Why not, to be read after its name.
-        effect: The trees it acts on; those of the kind by default.
+        effect: The trees it acts on; those of the element by default.
     """
 
     attribute: str
     unit: str | Callable[[Element], str]
     doc: str | Callable[[Element], str]
-    array: str | Callable[[Element], Slots] = ""
+    array: str | Callable[[Element], Finder] = ""
     at: Callable[[Element], Any] = lambda e: e.i
+    form: Callable[..., Any] = place
     constant: bool = False
     low: Numbers | Callable[[Floats], Numbers] = -math.inf
     high: Numbers | Callable[[Floats], Numbers] = math.inf
@@ -304,45 +257,56 @@ class Row:
     usual: bool | Callable[[Element, Floats], bool] = True
     visual: bool | Callable[[Element], bool] = False
     exists: Callable[[Element], bool] = lambda e: True
-    flags: tuple[tuple[mujoco.mjtDisableBit, str], ...] = ()
+    flags: tuple[mujoco.mjtDisableBit, ...] = ()
     acts: Callable[[Element], bool] = lambda e: True
     reason: str = ""
     effect: Callable[[Element], Effect] | None = None
 
 
-def _field(row: Row, e: Element) -> Field:
-    """Return the field of an element."""
-    value = np.empty(0)
-    slot: Slots | None = None
+def _parameter(row: Row, e: Element, data: mujoco.MjData) -> Parameter:
+    """Return the parameter of an element with its value in the model, and in the data."""
+
+    def of(value: Any, *arguments: Any) -> Any:
+        return value(*arguments) if callable(value) else value
+
     if callable(row.array):
-        slot = row.array(e)
-    elif row.array:
-        index = row.at(e)
+        slot: Finder | None = row.array(e)
+    else:
+        index = row.at(e) if row.array else ()
         index = index if isinstance(index, tuple) else (index,)
-        repeated = first if isinstance(index[0], slice) else None
-        value = getattr(e.mj, row.array)[index]
-        slot = partial(_at, row.array, (*index, ...), row.constant, repeated)
-    refusal = next(
-        (f"acts on nothing: the model disables {what}" for flag, what in row.flags
-         if disabled(e.mj, flag)),
-        "" if slot is not None and row.acts(e) else row.reason.format(e.name),
-    )  # fmt: skip
-    effect = row.effect or KINDS[e.kind].effect
-    return Field(
-        e.kind,
-        e.name,
-        row.attribute,
-        row.unit(e) if callable(row.unit) else _unit(row.unit, e),
-        row.doc(e) if callable(row.doc) else row.doc,
-        slot,
-        lambda: effect(e),
-        row.low(value) if callable(row.low) else row.low,
-        row.high(value) if callable(row.high) else row.high,
-        row.nature,
-        row.usual(e, value) if callable(row.usual) else row.usual,
-        row.visual(e) if callable(row.visual) else row.visual,
-        refusal,
+        slot = partial(at, row.form, row.array, index, row.constant) if row.array else None
+    default = np.zeros(()) if slot is None else slot(e.mj, data).read()
+    off = [flag for flag in row.flags if disabled(e.mj, flag)]
+    refusal = "" if slot is not None and row.acts(e) else row.reason.format(e.name)
+    if off:
+        word = off[0].name.removeprefix("mjDSBL_").lower()
+        refusal = f"acts on nothing: the model disables {word}"
+    always, contact = NOTHING
+    if not refusal:
+        always, contact = row.effect(e) if row.effect else getattr(e.trees, e.kind)(e.i)
+    return Parameter(
+        name=f"{e.name}.{row.attribute}" if e.name else row.attribute,
+        unit=_unit(of(row.unit, e), e),
+        shape=default.shape,
+        default=numbers(default),
+        low=of(row.low, default),
+        high=of(row.high, default),
+        doc=of(row.doc, e),
+        always=always,
+        contact=contact,
+        slot=slot,
+        kind=row.nature,
+        visual=of(row.visual, e),
+        body=e.body if e.kind in ("body", "geom") else -1,
+        usual=bool(of(row.usual, e, default)),
+        refusal=refusal,
     )
+
+
+def numbers(values: Any) -> Numbers:
+    """Return a default or a bound: one number, or one for each component."""
+    found = np.asarray(values, dtype=np.float64)
+    return tuple(found.ravel().tolist()) if found.ndim else float(found)
 
 
 def _unit(written: str, e: Element) -> str:
@@ -353,17 +317,6 @@ def _unit(written: str, e: Element) -> str:
     if length == "1":
         return "1"
     return written.format(L=length, F=FORCES[length], I=INERTIAS[length])
-
-
-def _at(
-    array: str,
-    index: tuple[Any, ...],
-    constant: bool,
-    back: Callable[[Any], Any] | None,
-    mj: mujoco.MjModel,
-    _: mujoco.MjData,
-) -> Slot:
-    return place(getattr(mj, array)[index], constant=constant, back=back)
 
 
 def _positive(value: Floats) -> float:
@@ -380,22 +333,15 @@ def _nonzero(_: Element, value: Floats) -> bool:
     return bool(np.any(value))
 
 
-def _quaternion(array: str) -> Callable[[Element], Slots]:
-    return lambda e: lambda mj, _: turn(getattr(mj, array)[e.i])
+_TURN: dict[str, Any] = {
+    "form": turn, "constant": True, "low": -1.0, "high": 1.0, "nature": "rotation",
+}  # fmt: skip
+"""How a quaternion stands in arrays."""
 
 
-def _gains(*places: tuple[str, int, int]) -> Callable[[Element], Slots]:
-    """Find a gain in arrays of the model: each with a column, and a sign."""
-
-    def found(e: Element, mj: mujoco.MjModel, _: mujoco.MjData) -> Slot:
-        plus, minus = (
-            [getattr(mj, f"actuator_{array}")[e.i, column, ...] for array, column, of in places
-             if of == sign]
-            for sign in (1, -1)
-        )  # fmt: skip
-        return gain(plus, minus)
-
-    return lambda e: partial(found, e)
+def _gains(*places: tuple[str, int, int]) -> Callable[[Element], Finder]:
+    """Return what finds a gain in arrays of the model: each with a column, and a sign."""
+    return lambda e: partial(gain, e.i, places)
 
 
 def _pose(kind: str, what: str) -> tuple[Row, Row]:
@@ -403,8 +349,7 @@ def _pose(kind: str, what: str) -> tuple[Row, Row]:
     where = f"of the {what} in the frame of its body."
     return (
         Row("position", "m", f"Place {where}", f"{kind}_pos", constant=True, usual=False),
-        Row("orientation", "1", f"Orientation {where}", _quaternion(f"{kind}_quat"), low=-1.0,
-            high=1.0, nature="rotation", usual=False),
+        Row("orientation", "1", f"Orientation {where}", f"{kind}_quat", usual=False, **_TURN),
     )  # fmt: skip
 
 
@@ -430,14 +375,14 @@ def _solver(prefix: str, suffix: str = "", **rest: Any) -> tuple[Row, Row]:
     )  # fmt: skip
 
 
-_GRAVITY = ((_OFF.mjDSBL_GRAVITY, "gravity"),)
-_DAMPER = ((_OFF.mjDSBL_DAMPER, "damping"),)
-_SPRING = ((_OFF.mjDSBL_SPRING, "springs"),)
-_LIMIT = ((_OFF.mjDSBL_LIMIT, "limits"),)
-_CONTACT = ((_OFF.mjDSBL_CONTACT, "contact"),)
-_FRICTION = ((_OFF.mjDSBL_FRICTIONLOSS, "friction loss"),)
-_CONSTRAINT = ((_OFF.mjDSBL_CONSTRAINT, "constraints"),)
-_EQUALITY = ((_OFF.mjDSBL_EQUALITY, "equality constraints"),)
+_GRAVITY = (_OFF.mjDSBL_GRAVITY,)
+_DAMPER = (_OFF.mjDSBL_DAMPER,)
+_SPRING = (_OFF.mjDSBL_SPRING,)
+_LIMIT = (_OFF.mjDSBL_LIMIT,)
+_CONTACT = (_OFF.mjDSBL_CONTACT,)
+_FRICTION = (_OFF.mjDSBL_FRICTIONLOSS,)
+_CONSTRAINT = (_OFF.mjDSBL_CONSTRAINT,)
+_EQUALITY = (_OFF.mjDSBL_EQUALITY,)
 _UNLIMITED = "is not in force: it has no limits"
 _SIMPLE = "is fixed by the compiler; write simple='false' at the body"
 _WEIGHTLESS = "acts on nothing: the body cannot move, or has no mass"
@@ -483,21 +428,19 @@ _BODY = (
         constant=True, usual=lambda e, v: e.moves and v != 0.0, acts=lambda e: e.heavy,
         flags=_GRAVITY, reason=_WEIGHTLESS),
     Row("position", "m", "Place of a body that is moved from outside.",
-        lambda e: lambda mj, data: place(data.mocap_pos[e["mocapid"]]),
+        "data.mocap_pos", lambda e: e["mocapid"],
         exists=lambda e: e["mocapid"] >= 0, effect=lambda e: e.trees.frame(e.i)),
     Row("orientation", "1", "Orientation of a body that is moved from outside.",
-        lambda e: lambda mj, data: turn(data.mocap_quat[e["mocapid"]], constant=False),
-        low=-1.0, high=1.0, nature="rotation", exists=lambda e: e["mocapid"] >= 0,
-        effect=lambda e: e.trees.frame(e.i)),
+        "data.mocap_quat", lambda e: e["mocapid"], exists=lambda e: e["mocapid"] >= 0,
+        effect=lambda e: e.trees.frame(e.i), **{**_TURN, "constant": False}),
     Row("position", "m", "", exists=lambda e: e["mocapid"] < 0 and e.is_free, usual=False,
         reason="is a state: set {}.cartesian_position"),
     Row("position", "m", "Place of the frame of the body in its parent.", "body_pos",
         constant=True, usual=False, exists=lambda e: e["mocapid"] < 0 and not e.is_free,
         effect=lambda e: e.trees.frame(e.i)),
-    Row("orientation", "1", "Orientation of the body in its parent.", _quaternion("body_quat"),
-        low=-1.0, high=1.0, nature="rotation", usual=False,
-        exists=lambda e: e["mocapid"] < 0 and not e.is_free,
-        effect=lambda e: e.trees.frame(e.i)),
+    Row("orientation", "1", "Orientation of the body in its parent.", "body_quat",
+        usual=False, exists=lambda e: e["mocapid"] < 0 and not e.is_free,
+        effect=lambda e: e.trees.frame(e.i), **_TURN),
 )  # fmt: skip
 
 
@@ -550,7 +493,7 @@ _JOINT = (
         "jnt_actfrcrange", exists=_scalar, usual=False, acts=lambda e: e["actfrclimited"],
         reason=_UNLIMITED),
     Row("axis", "1", "Unit vector of the axis in the frame of the body.",
-        lambda e: lambda mj, _: direction(mj.jnt_axis[e.i]), low=-1.0, high=1.0, exists=_scalar,
+        "jnt_axis", form=direction, low=-1.0, high=1.0, exists=_scalar,
         usual=False, acts=lambda e: not e.is_simple, reason=_SIMPLE),
     Row("anchor", "m", "Point of the body through which the axis goes.", "jnt_pos",
         constant=True, exists=_scalar, usual=False,
@@ -595,13 +538,12 @@ _SHAPE = (
     Row("size", "m", lambda e: f"{_SIZES[int(e['type'])][1]} of the {_word(e)}; "
         "mass and inertia stay as they are.", "geom_size",
         lambda e: (e.i, _columns(_SIZES[int(e["type"])][0])), constant=True, low=_positive,
-        exists=_sized, usual=lambda e, v: any(e.trees.shape(e.i)),
-        visual=lambda e: not any(e.trees.shape(e.i))),
+        exists=_sized, usual=lambda e, v: any(e.trees.geom(e.i)),
+        visual=lambda e: not any(e.trees.geom(e.i))),
     Row("size", "m", "", exists=lambda e: not _sized(e),
         reason="belongs to a shape that only another file can change"),
     Row("color", "1", "Red, green, blue and opacity of the shape.",
-        lambda e: lambda mj, _: color(
-            mj.geom_rgba[e.i], mj.mat_rgba[e["matid"]] if e["matid"] >= 0 else None),
+        lambda e: partial(color, e.i, int(e["matid"])),
         low=0.0, high=1.0, usual=lambda e, v: e["group"] < _SHOWN, visual=True,
         effect=lambda e: NOTHING),
     *_pose("geom", "shape"),
@@ -640,7 +582,7 @@ _TENDON = (
 )  # fmt: skip
 _CONSTRAINED = (
     Row("active", "1", "Whether the constraint is in force: 1, or 0.",
-        lambda e: lambda mj, data: place(mj.eq_active0[e.i, ...], data.eq_active[e.i, ...]),
+        "eq_active0 data.eq_active",
         low=0.0, high=1.0, nature="switch", flags=_EQUALITY + _CONSTRAINT),
     *_solver("eq"),
     Row("polycoef", "1", "Coefficients of the polynomial that gives one from the other.",
@@ -697,16 +639,16 @@ _ACTUATOR = (
 )  # fmt: skip
 
 
-def _number(name: str) -> Callable[[Element], Slots]:
-    return lambda e: lambda mj, _: option(mj.opt, name)
+def _number(name: str) -> Callable[[Element], Finder]:
+    return lambda e: partial(option, name)
 
 
 _OPTION = (
     Row("gravity", "m/s^2", "Acceleration that acts on every mass.",
-        lambda e: lambda mj, _: place(mj.opt.gravity), flags=_GRAVITY),
+        "opt.gravity", lambda e: (), flags=_GRAVITY),
     Row("timestep", "s", "Physics step; a control step has a fixed number of them.",
         _number("timestep"), low=SMALLEST),
-    Row("wind", "m/s", "Velocity of the medium.", lambda e: lambda mj, _: place(mj.opt.wind),
+    Row("wind", "m/s", "Velocity of the medium.", "opt.wind", lambda e: (),
         acts=lambda e: e.fluid, reason="acts on nothing: density and viscosity are zero"),
     Row("density", "kg/m^3", "The density of the medium.", _number("density"), low=0.0,
         usual=lambda e, v: e.fluid),
@@ -718,70 +660,48 @@ _OPTION = (
 )  # fmt: skip
 
 
-class Kind(NamedTuple):
-    """Elements: their type in MuJoCo, number, arrays, parameters and the trees these act on."""
-
-    obj: Any
-    size: str
-    prefix: str
-    rows: tuple[Row, ...] = ()
-    effect: Callable[[Element], Effect] = lambda e: NOTHING
+ROWS: dict[str, tuple[Row, ...]] = {
+    "body": _BODY, "joint": _JOINT, "geom": _SHAPE, "pair": _PAIR, "site": _pose("site", "site"),
+    "tendon": _TENDON, "equality": _CONSTRAINED, "actuator": _ACTUATOR, "option": _OPTION,
+}  # fmt: skip
+"""The parameters of each kind of elements, in the order in which they are listed."""
 
 
-KINDS = {
-    "body": Kind(_OBJ.mjOBJ_BODY, "nbody", "body", _BODY, lambda e: e.trees.body(e.i)),
-    "joint": Kind(_OBJ.mjOBJ_JOINT, "njnt", "jnt", _JOINT, lambda e: e.trees.body(e.body)),
-    "geom": Kind(_OBJ.mjOBJ_GEOM, "ngeom", "geom", _SHAPE, lambda e: e.trees.shape(e.i)),
-    "pair": Kind(_OBJ.mjOBJ_PAIR, "npair", "pair", _PAIR, lambda e: e.trees.pair(e.i)),
-    "site": Kind(
-        _OBJ.mjOBJ_SITE, "nsite", "site", _pose("site", "site"), lambda e: e.trees.site(e.i)
-    ),
-    "tendon": Kind(_OBJ.mjOBJ_TENDON, "ntendon", "tendon", _TENDON, lambda e: e.trees.tendon(e.i)),
-    "equality": Kind(
-        _OBJ.mjOBJ_EQUALITY, "neq", "eq", _CONSTRAINED, lambda e: e.trees.equality(e.i)
-    ),
-    "actuator": Kind(
-        _OBJ.mjOBJ_ACTUATOR, "nactuator", "actuator", _ACTUATOR, lambda e: e.trees.actuator(e.i)
-    ),
-    "option": Kind(None, "", "opt", _OPTION, lambda e: e.trees.always(e.trees.every)),
-    "sensor": Kind(_OBJ.mjOBJ_SENSOR, "nsensor", "sensor"),
-    "flex": Kind(_OBJ.mjOBJ_FLEX, "nflex", "flex"),
-}
-"""In the order in which parameters are listed."""
-
-
-@lru_cache(maxsize=32)
-def table(mj: mujoco.MjModel, *, fluid: bool = False) -> tuple[Field, ...]:
-    """List the parameters of a compiled model, each with its own name.
+def table(
+    mj: mujoco.MjModel, data: mujoco.MjData, trees: Couplings, *, fluid: bool = False
+) -> list[Parameter]:
+    """List the parameters of a compiled model, each with its own name, also those that are refused.
 
     Where two elements have the same name and attribute, the usual one keeps the plain name; if
     none or both are usual, both are distinguished by their kind: ``"geom:torso.color"``. So is what
     has the name of a state.
 
     Args:
-        mj: The model, which must not be changed afterwards.
+        mj: The model.
+        data: The state in which episodes begin.
+        trees: Of the model.
         fluid: Whether a medium may be made to act although it does not now.
     """
     fluid = fluid or mj.opt.density > 0.0 or mj.opt.viscosity > 0.0
-    names, trees, found = element_names(mj), Couplings(mj, fluid), list[Field]()
-    for kind, about in KINDS.items():
+    names, trees = element_names(mj), Couplings(mj, fluid) if fluid else trees
+    found: dict[str, list[tuple[str, Parameter]]] = {}
+    order = []
+    for kind, rows in ROWS.items():
         for i, name in enumerate(names.get(kind, ("",))):
             element = Element(mj, trees, fluid, kind, i, name)
-            rows = about.rows if (kind, i) != ("body", 0) else ()  # the world has none
-            found += [_field(row, element) for row in rows if row.exists(element)]
-    claims: dict[str, list[Field]] = {}
-    for field in found:
-        claims.setdefault(field.plain_name, []).append(field)
+            for row in rows if (kind, i) != ("body", 0) else ():  # the world has none
+                if row.exists(element):
+                    order.append((kind, _parameter(row, element, data)))
+                    found.setdefault(order[-1][1].name, []).append(order[-1])
     states = _state_names(mj, names)
     named = []
-    for field in found:
-        usual = [rival for rival in claims[field.plain_name] if rival.usual and not rival.refusal]
-        alone = len(claims[field.plain_name]) == 1 or (len(usual) == 1 and usual[0] is field)
-        plain = alone and field.plain_name not in states
-        named.append(
-            replace(field, name=field.plain_name if plain else f"{field.kind}:{field.plain_name}")
-        )
-    return tuple(named)
+    for kind, one in order:
+        rivals = found[one.name]
+        usual = [rival for _, rival in rivals if rival.usual and not rival.refusal]
+        alone = len(rivals) == 1 or (len(usual) == 1 and usual[0] is one)
+        plain = alone and one.name not in states
+        named.append(one if plain else replace(one, name=f"{kind}:{one.name}"))
+    return named
 
 
 def _state_names(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> set[str]:
@@ -794,30 +714,6 @@ def _state_names(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> se
         else:
             found.add(f"{body if kind == FREE else name}.orientation")
     return found
-
-
-def slots(
-    compiled: mujoco.MjModel,
-    keys: Iterable[ParameterKey],
-    mj: mujoco.MjModel,
-    data: mujoco.MjData,
-) -> dict[ParameterKey, Slot]:
-    """Find the places of some parameters in a model.
-
-    What is written there with ``constant`` slots takes effect with ``mj_setConst``.
-
-    Args:
-        compiled: What was compiled; it is not written.
-        keys: Of the parameters.
-        mj: A copy of it.
-        data: Where the copy is stepped.
-    """
-    wanted = frozenset(keys)
-    return {
-        field.key: field.slot(mj, data)
-        for field in table(compiled)
-        if field.key in wanted and field.slot is not None
-    }
 
 
 # --- names -------------------------------------------------------------------------------------
@@ -835,11 +731,11 @@ def clean(name: str) -> str:
 
 @lru_cache(maxsize=32)
 def element_names(mj: mujoco.MjModel) -> Mapping[str, tuple[str, ...]]:
-    """Name the elements of each kind: their own names, cleaned, or names made from their body."""
+    """Return the names of elements by kind: their own, cleaned, or names made from their body."""
     found: dict[str, tuple[str, ...]] = {}
     for kind in _NAMED:
-        about = KINDS[kind]
-        given = [mujoco.mj_id2name(mj, about.obj, i) or "" for i in range(getattr(mj, about.size))]
+        obj, size = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), f"n{prefix(kind)}"
+        given = [mujoco.mj_id2name(mj, obj, i) or "" for i in range(getattr(mj, size))]
         taken: set[str] = set()
         names = [_free(clean(name), taken) if name else "" for name in given]
         for i, name in enumerate(names):
@@ -855,7 +751,7 @@ _NAMED = (
 
 
 def _free(name: str, taken: set[str]) -> str:
-    """Give a name that is not taken, with a number if need be, and take it."""
+    """Return a name that is not taken, with a number if need be, and take it."""
     free, n = name, 1
     while free in taken:
         n += 1
@@ -874,7 +770,7 @@ def _made(
             before = int(np.count_nonzero(mj.body_parentid[1:i] == parent))
             return f"{names[parent]}_body_{before}"
         case "joint" | "geom" | "site":
-            bodies = getattr(mj, f"{KINDS[kind].prefix}_bodyid")
+            bodies = getattr(mj, f"{prefix(kind)}_bodyid")
             body = found["body"][int(bodies[i])]
             if kind == "joint" and mj.body_jntnum[bodies[i]] == 1:
                 return body

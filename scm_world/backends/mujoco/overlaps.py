@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from scm_world._types import Floats, Integers
-from scm_world.backends.mujoco.backend import realize
+from scm_world.backends.mujoco.realization import Realization
 from scm_world.models.scene import SURFACES, Overlap, ParameterKey, Scene
 
 Shapes = tuple[int, int]
@@ -31,7 +31,7 @@ class _Scratch:
         self._written: dict[ParameterKey, Floats] = {
             key: value for key, value in default.items() if key[1] in SURFACES
         }
-        self._now = realize(structure, self._written)
+        self._now = Realization(structure, self._written)
         model, self.owners = self._now.model, self._now.owners
         kinds = np.ones(model.ngeom + model.nflex, dtype=np.int64)
         roots = model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)]

@@ -13,15 +13,14 @@ from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
 import mujoco
-import numba
 import numpy as np
 
-from scm_world._types import Floats, Integers
+from scm_world._types import Integers
 from scm_world.backends.mujoco.fields import (
     MEDIUM,
-    Field,
     control_unit,
     element_names,
+    numbers,
     servo,
     table,
 )
@@ -32,20 +31,15 @@ from scm_world.errors import ModelError, UnknownOption, nearest
 from scm_world.models.model import (
     REPORTED,
     BodyRow,
-    Input,
     Model,
     Numbers,
     Parameter,
+    Row,
     StateRow,
 )
 from scm_world.models.scene import REVERSED, reversed_ranges
 
-_DSBL, _JNT, _TRN, _INT = (
-    mujoco.mjtDisableBit,
-    mujoco.mjtJoint,
-    mujoco.mjtTrn,
-    mujoco.mjtIntegrator,
-)
+_JNT = mujoco.mjtJoint
 _CONTROLS = {
     "position": "Position that the servo goes to.",
     "velocity": "Velocity that the servo keeps to.",
@@ -63,7 +57,7 @@ _control, _passive, _act_dyn, _act_gain, _act_bias, _filter = CALLBACKS.values()
 
 
 def callbacks() -> list[str]:
-    """Say of each callback that is in use why no model can have it; none of them is usual."""
+    """List why no model can have the callbacks that are in use; usually there are none."""
     if not (_control() or _passive() or _act_dyn() or _act_gain() or _act_bias() or _filter()):
         return []
     return [
@@ -74,42 +68,22 @@ def callbacks() -> list[str]:
     ]
 
 
-@numba.njit("b1(f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])", cache=True)
-def sensible(
-    masses: Floats, moments: Floats, inertia: Floats, dof_weights: Floats, body_weights: Floats
-) -> bool:
-    """Tell whether masses and what MuJoCo derives from them are those of something that can move.
+def sensible(mj: mujoco.MjModel) -> bool:
+    """Return whether masses, and what MuJoCo derives from them, are those of something that moves.
 
-    Args:
-        masses: Of the bodies, shape (nbody,).
-        moments: Their principal moments of inertia, shape (nbody, 3).
-        inertia: Diagonal of the inertia matrix, shape (nv,).
-        dof_weights: Inverse weights, shape (nv,).
-        body_weights: Inverse weights, shape (nbody, 2).
+    They are finite and not negative, and moments of inertia obey the triangle inequality.
     """
-    for body in range(masses.shape[0]):
-        a, b, c = moments[body]
-        least, most = min(a, b, c), max(a, b, c)
-        if not (0.0 <= masses[body] < math.inf and least >= 0.0 and most < math.inf):
-            return False
-        if not a + b + c - 2.0 * most >= -1e-6 * most:  # the triangle inequality
-            return False
-        for weight in body_weights[body]:
-            if not 0.0 <= weight < math.inf:
-                return False
-    for dof in range(inertia.shape[0]):
-        if not (0.0 < inertia[dof] < math.inf and 0.0 <= dof_weights[dof] < math.inf):
-            return False
-    return True
+    most = mj.body_inertia.max(axis=1)
+    parts = mj.body_mass, mj.body_inertia, mj.dof_M0, mj.dof_invweight0, mj.body_invweight0
+    return (
+        all(part.min() >= 0.0 and part.max() < math.inf for part in parts)
+        and mj.dof_M0.min() > 0.0
+        and bool((mj.body_inertia.sum(axis=1) - 2.0 * most >= -1e-6 * most).all())
+    )
 
 
-def inertia_of(mj: mujoco.MjModel) -> tuple[Floats, ...]:
-    """Return views of what ``sensible`` looks at."""
-    return mj.body_mass, mj.body_inertia, mj.dof_M0, mj.dof_invweight0, mj.body_invweight0
-
-
-Bindings = Callable[[mujoco.MjModel, Couplings], Iterable[Field]]
-"""Makes the parameters of a compiled model with these kinematic trees."""
+Bindings = Callable[[mujoco.MjModel, mujoco.MjData, Couplings], Iterable[Parameter]]
+"""Makes the parameters of a compiled model, in a state, with these kinematic trees."""
 
 
 def read_model(
@@ -179,7 +153,7 @@ def read_model(
     trees = Couplings(mj)
     names = element_names(mj)
     elements = {row.name: row for row in _states(mj, names, trees, start, frame)}
-    rows = _grouped(elements, states, [reported] if isinstance(reported, str) else [*reported])
+    moving = _grouped(elements, states, [reported] if isinstance(reported, str) else [*reported])
     inputs = tuple(_inputs(mj, names, trees, start))
     if controls is not None:
         inputs = inputs[: len(controls)]
@@ -188,15 +162,18 @@ def read_model(
             raise ModelError([f"controls={[*controls]}: the first actuators are {first}"])
     patterns = None if expose is None else [expose] if isinstance(expose, str) else list(expose)
     fluid = patterns is not None and any(fnmatch.filter(MEDIUM, p) for p in patterns if p != "*")
-    bound = bindings is not None
-    fields = tuple(bindings(mj, trees)) if bindings is not None else table(mj, fluid=fluid)
-    chosen = {field.name for field in fields} if bound else _exposed(fields, patterns)
-    parameters = tuple(
-        _parameter(mj, start, field, bound=bound) for field in fields if field.name in chosen
-    )
+    if bindings is not None:
+        rows = tuple(bindings(mj, start, trees))
+        chosen = {row.name for row in rows}
+    else:
+        rows = tuple(table(mj, start, trees, fluid=fluid))
+        chosen = _exposed(rows, patterns)
+    parameters = tuple(row for row in rows if row.name in chosen)
     wrong = reversed_ranges({row.key: row.default for row in parameters})
     if wrong:
         raise ModelError([f"{where}: {'.'.join(key)}: {REVERSED}" for key in wrong])
+    touch = mj.nflex > 0 or bool(trees.touches.any())
+    staged = touch and int(mj.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
     drift = tuple(_drift(mj, sealed, start))
     for note in drift:
         warnings.warn(note, stacklevel=3)
@@ -205,25 +182,26 @@ def read_model(
     keys += "" if states is None else f"\0{[*states.items()]}"
     keys += "" if part_of is None else f"\0{[*part_of.items()]}"
     keys += "" if (frame, len(inputs)) == ("body", mj.nu) else f"\0{frame} {len(inputs)}"
+    owners = [names["body"][int(body)] for body in mj.geom_bodyid]
     return Model(
         name=name or own_name or "model",
         digest=hashlib.sha256(f"{sealed.digest}\0{keys}".encode()).hexdigest(),
         source=sealed,
         timestep=float(mj.opt.timestep),
         parameters=parameters,
-        states=rows,
+        states=moving,
         inputs=inputs,
-        readouts=tuple(find_readouts(mj, sealed, rows, parameters, tuple(readouts))),
+        readouts=tuple(find_readouts(mj, sealed, moving, parameters, tuple(readouts))),
         trees=tuple(names["body"][root] for root in trees.roots),
         refused=tuple(
-            (field.name, field.refusal or "is not exposed; name it in expose=[…]")
-            for field in fields
-            if field.name not in chosen
+            (row.name, row.refusal or "is not exposed; name it in expose=[…]")
+            for row in rows
+            if row.name not in chosen
         ),
-        notes=(*replaced, *changed, *drift, *_notes(mj, keyframe)),
-        staged=_is_staged(mj),
+        notes=(*replaced, *changed, *drift, *_notes(mj, keyframe, staged)),
+        staged=staged,
         bodies=tuple(_bodies(mj, names, trees)),
-        owners=contact_bodies(mj, part_of or {}),
+        owners=(*((part_of or {}).get(name, name) for name in owners), *names["flex"]),
     )
 
 
@@ -246,11 +224,7 @@ def _bodies(
 
 
 def _check(mj: mujoco.MjModel, where: str) -> None:
-    """Refuse what has effects that no graph could declare.
-
-    Raises:
-        ModelError: All that is wrong.
-    """
+    """Refuse what has effects that no graph could declare."""
     problems = []
     if mj.nv == 0:
         hint = "add a joint, or a freejoint; for a URDF, fixed_base=False lets its root link move"
@@ -281,11 +255,11 @@ def _check(mj: mujoco.MjModel, where: str) -> None:
 
 
 def _check_inertia(mj: mujoco.MjModel, where: str) -> Iterator[str]:
-    """Say which bodies have no inertia that there can be, or which joints have none to move."""
+    """List bodies with impossible inertia, or joints that have none to move."""
     model, data = copy.copy(mj), mujoco.MjData(mj)
     data.warning.number[:] = 1  # MuJoCo prints the first warning of a kind
     mujoco.mj_setConst(model, data)
-    if data.warning.number[0] == 1 and sensible(*inertia_of(model)):
+    if data.warning.number[0] == 1 and sensible(model):
         return
     moments, names = mj.body_inertia, element_names(mj)
     possible = (mj.body_mass >= 0.0) & (moments.min(axis=1) >= 0.0)
@@ -307,11 +281,7 @@ def _check_inertia(mj: mujoco.MjModel, where: str) -> Iterator[str]:
 
 
 def _start(mj: mujoco.MjModel, keyframe: str | int | None) -> mujoco.MjData:
-    """Return the state in which episodes begin.
-
-    Raises:
-        UnknownOption: There is no such keyframe.
-    """
+    """Return the state in which episodes begin."""
     data = mujoco.MjData(mj)
     if keyframe is not None:
         names = [mj.key(i).name or str(i) for i in range(mj.nkey)]
@@ -329,7 +299,7 @@ DRIFT = 1e-4
 
 
 def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator[str]:
-    """Say how far plain MuJoCo, with its warm start, goes elsewhere where iterations are few."""
+    """Measure how far plain MuJoCo, with its warm start, differs where iterations are few."""
     if mj.opt.iterations >= FEW:
         return
     ends = []
@@ -361,11 +331,11 @@ def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator
         )
 
 
-def _notes(mj: mujoco.MjModel, keyframe: str | int | None) -> Iterator[str]:
-    """Say what acts without having a variable, and what is not used."""
+def _notes(mj: mujoco.MjModel, keyframe: str | int | None, staged: bool) -> Iterator[str]:
+    """List what acts without having a variable, and what is not used."""
     if mj.nflex:
         yield f"{mj.nflex} flex(es) act through their vertices; their material has no variables."
-    if _is_staged(mj):
+    if staged:
         yield (
             "RK4 looks for contacts in four stages of a physics step; those of the last one are "
             "listed, and an edge by contact may act in an earlier one."
@@ -379,84 +349,36 @@ def _notes(mj: mujoco.MjModel, keyframe: str | int | None) -> Iterator[str]:
         )
 
 
-def _is_staged(mj: mujoco.MjModel) -> bool:
-    """Return whether bodies may touch in several stages of a physics step."""
-    touch = mj.nflex > 0 or bool(Couplings(mj).touches.any())
-    return touch and int(mj.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
-
-
 # --- parameters --------------------------------------------------------------------------------
 
 
-def _exposed(fields: Sequence[Field], patterns: Sequence[str] | None) -> set[str]:
-    """Choose the parameters that can be set.
-
-    Raises:
-        ModelError: A pattern names nothing, or only what cannot be set.
-    """
-    can = [field for field in fields if not field.refusal]
+def _exposed(rows: Sequence[Parameter], patterns: Sequence[str] | None) -> set[str]:
+    """Choose the parameters that can be set."""
+    can = [row for row in rows if not row.refusal]
     if patterns is None:
-        return {field.name for field in can if field.usual}
+        return {row.name for row in can if row.usual}
     found: set[str] = set()
     problems = []
     for pattern in patterns:
         open_end = pattern.rpartition(".")[2] == "*"
         named = {
-            field.name
-            for field in can
-            if fnmatch.fnmatchcase(field.name, pattern) and (field.usual or not open_end)
+            row.name
+            for row in can
+            if fnmatch.fnmatchcase(row.name, pattern) and (row.usual or not open_end)
         }
         found |= named
         if named:
             continue
-        refused = [f for f in fields if f.refusal and fnmatch.fnmatchcase(f.name, pattern)]
+        refused = [row for row in rows if row.refusal and fnmatch.fnmatchcase(row.name, pattern)]
         if refused:
             problems.append(f"expose={pattern!r}: {refused[0].name!r} {refused[0].refusal}")
         else:
-            near = nearest(pattern, (field.name for field in can))
+            near = nearest(pattern, (row.name for row in can))
             hint = f"; did you mean {near!r}?" if near else ""
             problems.append(f"expose={pattern!r} names no parameter{hint}")
     if problems:
         raise ModelError(problems)
     return found
-
-
-def _parameter(mj: mujoco.MjModel, data: mujoco.MjData, field: Field, *, bound: bool) -> Parameter:
-    """Describe a field, or a binding, with its value in the model as it was given."""
-    if field.slot is None:
-        raise TypeError(f"{field.name} has no place")
-    slot = field.slot(mj, data)
-    default = slot.read()
-    always, contact = field.effect()
-    return Parameter(
-        name=field.name,
-        unit=field.unit,
-        shape=default.shape,
-        default=_numbers(default),
-        low=field.low,
-        high=field.high,
-        doc=field.doc,
-        always=always,
-        contact=contact,
-        key=field.key,
-        slot=field.slot if bound else None,
-        kind=field.nature,
-        visual=field.visual,
-        body=_body_of(mj, field),
-    )
-
-
-def _body_of(mj: mujoco.MjModel, field: Field) -> int:
-    """Return the number of the body that a field of a body or shape belongs to; -1 for others."""
-    if field.kind not in ("body", "geom"):
-        return -1
-    number = element_names(mj)[field.kind].index(field.element)
-    return number if field.kind == "body" else int(mj.geom_bodyid[number])
-
-
-def _numbers(values: Any) -> Numbers:
-    found = np.asarray(values, dtype=np.float64)
-    return tuple(found.ravel().tolist()) if found.ndim else float(found)
 
 
 # --- states and inputs -------------------------------------------------------------------------
@@ -488,83 +410,46 @@ def permutation(model: Model) -> Permutation:
     return Permutation(*(np.array(one, dtype=np.int64) for one in ordered))
 
 
-class _Moving(NamedTuple):
-    """A state: which of MuJoCo's numbers it is, and what it means."""
-
-    array: str
-    numbers: list[int]
-    kind: str
-    number: int
-    element: str
-    attribute: str
-    unit: str
-    doc: str
-    low: float = -math.inf
-    high: float = math.inf
-
-
-def _moving(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterator[_Moving]:
-    """List what moves, in the order of the state vector."""
-    for joint in range(mj.njnt):
-        name, body = names["joint"][joint], names["body"][int(mj.jnt_bodyid[joint])]
-        q, v = int(mj.jnt_qposadr[joint]), int(mj.jnt_dofadr[joint])
-        match mujoco.mjtJoint(int(mj.jnt_type[joint])):
-            case _JNT.mjJNT_FREE:
-                for array, numbers, attribute, unit, doc in (
-                    ("qpos", [q, q + 1, q + 2], "cartesian_position", "m",
-                     "Place of the frame of the body in the world."),
-                    ("qpos", [q + 4, q + 5, q + 6, q + 3], "orientation", "1",
-                     "Orientation of the body in the world (x, y, z, w)."),
-                    ("qvel", [v, v + 1, v + 2], "linear_velocity", "m/s",
-                     "Velocity of the origin of the body's frame, in the world."),
-                    ("qvel", [v + 3, v + 4, v + 5], "angular_velocity", "rad/s",
-                     "Angular velocity of the body, in its own frame."),
-                ):  # fmt: skip
-                    yield _Moving(array, numbers, "joint", joint, body, attribute, unit, doc)
-            case _JNT.mjJNT_BALL:
-                doc = "Orientation of the body in its parent (x, y, z, w)."
-                numbers = [q + 1, q + 2, q + 3, q]
-                yield _Moving("qpos", numbers, "joint", joint, name, "orientation", "1", doc)
-                doc, numbers = "Angular velocity in the frame of the body.", [v, v + 1, v + 2]
-                yield _Moving(
-                    "qvel", numbers, "joint", joint, name, "angular_velocity", "rad/s", doc
-                )
-            case kind:
-                turns = kind == _JNT.mjJNT_HINGE
-                unit, what = ("rad", "Angle") if turns else ("m", "Displacement")
-                low, high = mj.jnt_range[joint] if mj.jnt_limited[joint] else (-math.inf, math.inf)
-                yield _Moving(
-                    "qpos", [q], "joint", joint, name, "position", unit, f"{what} of the joint.",
-                    float(low), float(high),
-                )  # fmt: skip
-                doc = "Angular velocity of the joint." if turns else "Velocity of the joint."
-                yield _Moving("qvel", [v], "joint", joint, name, "velocity", f"{unit}/s", doc)
-    for actuator in range(mj.nactuator):
-        first, count = int(mj.actuator_actadr[actuator]), int(mj.actuator_actnum[actuator])
-        if first < 0 or not count:
-            continue
-        limited = mj.actuator_actlimited[actuator]
-        low, high = mj.actuator_actrange[actuator] if limited else (-math.inf, math.inf)
-        yield _Moving(
-            "act", list(range(first, first + count)), "actuator", actuator,
-            names["actuator"][actuator], "activation", "1", "Inner state of the actuator.",
-            float(low), float(high),
-        )  # fmt: skip
+_COORDINATES = {
+    _JNT.mjJNT_FREE: (
+        ("qpos", (0, 1, 2), "cartesian_position", "m",
+         "Place of the frame of the body in the world."),
+        ("qpos", (4, 5, 6, 3), "orientation", "1",
+         "Orientation of the body in the world (x, y, z, w)."),
+        ("qvel", (0, 1, 2), "linear_velocity", "m/s",
+         "Velocity of the origin of the body's frame, in the world."),
+        ("qvel", (3, 4, 5), "angular_velocity", "rad/s",
+         "Angular velocity of the body, in its own frame."),
+    ),
+    _JNT.mjJNT_BALL: (
+        ("qpos", (1, 2, 3, 0), "orientation", "1",
+         "Orientation of the body in its parent (x, y, z, w)."),
+        ("qvel", (0, 1, 2), "angular_velocity", "rad/s",
+         "Angular velocity in the frame of the body."),
+    ),
+    _JNT.mjJNT_HINGE: (
+        ("qpos", (0,), "position", "rad", "Angle of the joint."),
+        ("qvel", (0,), "velocity", "rad/s", "Angular velocity of the joint."),
+        (REPORTED, (0,), "actuator_torque", "N m",
+         "Sum of the torques of its actuators, in the last step."),
+    ),
+    _JNT.mjJNT_SLIDE: (
+        ("qpos", (0,), "position", "m", "Displacement of the joint."),
+        ("qvel", (0,), "velocity", "m/s", "Velocity of the joint."),
+        (REPORTED, (0,), "actuator_force", "N",
+         "Sum of the forces of its actuators, in the last step."),
+    ),
+}  # fmt: skip
+"""States of each kind of joint: array, places after the first of the joint, name, unit, doc."""
+_IN_WORLD = {
+    "orientation": "Orientation of the body in the world (x, y, z, w) with w >= 0.",
+    "angular_velocity": "Angular velocity of the body, in the world.",
+}
 
 
-def _reported(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterator[_Moving]:
-    """List what the engine reports: torques and forces of actuators, for joints with one axis."""
-    for joint, kind in enumerate(mj.jnt_type.tolist()):
-        if kind in (int(_JNT.mjJNT_HINGE), int(_JNT.mjJNT_SLIDE)):
-            turns = kind == int(_JNT.mjJNT_HINGE)
-            what, unit = ("torque", "N m") if turns else ("force", "N")
-            limited = mj.jnt_actfrclimited[joint]
-            low, high = mj.jnt_actfrcrange[joint] if limited else (-math.inf, math.inf)
-            yield _Moving(
-                REPORTED, [int(mj.jnt_dofadr[joint])], "joint", joint, names["joint"][joint],
-                f"actuator_{what}", unit, f"Sum of the {what}s of its actuators, in the last step.",
-                float(low), float(high),
-            )  # fmt: skip
+def _ends(limited: Any, ends: Any) -> tuple[float, float]:
+    """Return the ends of a range; infinite ones where it is not in force."""
+    return (float(ends[0]), float(ends[1])) if limited else (-math.inf, math.inf)
 
 
 def _states(
@@ -573,44 +458,63 @@ def _states(
     trees: Couplings,
     data: mujoco.MjData,
     frame: Literal["body", "world"],
-) -> Iterator[StateRow]:
+) -> list[StateRow]:
     """Describe what moves, in MuJoCo's order, then what is reported; the data are the start."""
-    states = [*_moving(mj, names), *_reported(mj, names)]
-    named = Counter(f"{state.element}.{state.attribute}" for state in states)
-    for state in states:
-        plain = f"{state.element}.{state.attribute}"
-        default = getattr(data, state.array)[state.numbers]
-        if state.kind == "joint":
-            tree = trees.tree(int(mj.jnt_bodyid[state.number]))
-            always, contact = trees.always([tree])
-        else:
-            tree, always, contact = _of_actuator(trees, state.number, stateful=True)
-        scalar = len(state.numbers) == 1
-        rotation = state.attribute == "orientation"
-        free = state.kind == "joint" and mj.jnt_type[state.number] == int(_JNT.mjJNT_FREE)
-        turns = free and state.attribute in ("orientation", "angular_velocity")
-        yield StateRow(
-            name=f"{state.kind}:{plain}" if named[plain] > 1 else plain,
-            unit=state.unit,
-            shape=() if scalar else (len(state.numbers),),
-            default=_numbers(default[0] if scalar else default),
-            low=-1.0 if rotation else min(state.low, float(default.min())),
-            high=1.0 if rotation else max(state.high, float(default.max())),
-            doc=_IN_WORLD[state.attribute] if turns and frame == "world" else state.doc,
-            always=always,
-            contact=contact,
-            trees=frozenset([tree]),
+    found: list[tuple[str, StateRow]] = []
+
+    def add(
+        kind: str, name: str, array: str, places: list[int], ends: tuple[float, float], **rest: Any
+    ) -> None:
+        rotation = name.endswith(".orientation")
+        default = getattr(data, array)[places if len(places) > 1 else places[0]]
+        low, high = min(ends[0], float(np.min(default))), max(ends[1], float(np.max(default)))
+        row = StateRow(
+            name=name,
+            shape=np.shape(default),
+            default=numbers(default),
+            low=-1.0 if rotation else low,
+            high=1.0 if rotation else high,
             kind="rotation" if rotation else "real",
-            array=state.array,
-            numbers=tuple(state.numbers),
-            frame=frame if turns else "body",
+            array=array,
+            numbers=tuple(places),
+            **rest,
         )
+        found.append((kind, row))
 
-
-_IN_WORLD = {
-    "orientation": "Orientation of the body in the world (x, y, z, w) with w >= 0.",
-    "angular_velocity": "Angular velocity of the body, in the world.",
-}
+    for joint, kind in enumerate(mj.jnt_type.tolist()):
+        body = int(mj.jnt_bodyid[joint])
+        free, tree = kind == int(_JNT.mjJNT_FREE), trees.tree(body)
+        element = names["body"][body] if free else names["joint"][joint]
+        always, contact = trees.always([tree])
+        for array, places, attribute, unit, doc in _COORDINATES[mujoco.mjtJoint(kind)]:
+            first = int((mj.jnt_qposadr if array == "qpos" else mj.jnt_dofadr)[joint])
+            limited = attribute == "position" and mj.jnt_limited[joint]
+            ends = _ends(limited, mj.jnt_range[joint])
+            if array == REPORTED:
+                ends = _ends(mj.jnt_actfrclimited[joint], mj.jnt_actfrcrange[joint])
+            turned = free and frame == "world" and attribute in _IN_WORLD
+            add(
+                "joint", f"{element}.{attribute}", array, [first + i for i in places], ends,
+                unit=unit, doc=_IN_WORLD[attribute] if turned else doc, always=always,
+                contact=contact, trees=frozenset([tree]), frame="world" if turned else "body",
+            )  # fmt: skip
+    for actuator, count in enumerate(mj.actuator_actnum.tolist()):
+        first = int(mj.actuator_actadr[actuator])
+        if first < 0 or not count:
+            continue
+        tree, always, contact = _of_actuator(trees, actuator, stateful=True)
+        ends = _ends(mj.actuator_actlimited[actuator], mj.actuator_actrange[actuator])
+        add(
+            "actuator", f"{names['actuator'][actuator]}.activation", "act",
+            [*range(first, first + count)], ends, unit="1", doc="Inner state of the actuator.",
+            always=always, contact=contact, trees=frozenset([tree]),
+        )  # fmt: skip
+    found.sort(key=lambda pair: pair[1].reported)
+    named = Counter(row.name for _, row in found)
+    return [
+        replace(row, name=f"{kind}:{row.name}") if named[row.name] > 1 else row
+        for kind, row in found
+    ]
 
 
 def _grouped(
@@ -618,11 +522,7 @@ def _grouped(
     states: Mapping[str, Sequence[str]] | None,
     reported: Sequence[str],
 ) -> tuple[StateRow, ...]:
-    """Put elementary states together, in the order of the state vector.
-
-    Raises:
-        ModelError: A name or a pattern names nothing, or a state is left out or taken twice.
-    """
+    """Group elementary states, in the order of the state vector."""
     known = [name for name, row in elements.items() if row.reported]
     asked = {name for pattern in reported for name in fnmatch.filter(known, pattern)}
     problems = [
@@ -654,9 +554,9 @@ def _grouped(
                 first,
                 name=name,
                 shape=(sum(len(row.numbers) for row in together),),
-                default=_joined(together, "default"),
-                low=_joined(together, "low"),
-                high=_joined(together, "high"),
+                default=_row_of(together, "default"),
+                low=_row_of(together, "low"),
+                high=_row_of(together, "high"),
                 always=always,
                 contact=frozenset().union(*(row.contact for row in together)) - always,
                 trees=frozenset().union(*(row.trees for row in together)),
@@ -667,16 +567,16 @@ def _grouped(
     return tuple(found)
 
 
-def _joined(rows: Iterable[StateRow], what: str) -> tuple[float, ...]:
+def _row_of(rows: Iterable[StateRow], what: str) -> Numbers:
     """Return default or bounds of states in a row."""
     parts = (np.broadcast_to(getattr(row, what), row.shape).ravel() for row in rows)
-    return tuple(np.concatenate([*parts]).tolist())
+    return numbers(np.concatenate([*parts]))
 
 
 def _of_actuator(
     trees: Couplings, actuator: int, *, stateful: bool
 ) -> tuple[int, frozenset[int], frozenset[int]]:
-    """Give the tree that an actuator is counted to, and what it acts on.
+    """Return the tree that an actuator is counted to, and the trees that it acts on.
 
     The inner state of an actuator belongs to the tree it moves.
     """
@@ -689,7 +589,7 @@ def _of_actuator(
 
 def _inputs(
     mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings, data: mujoco.MjData
-) -> Iterator[Input]:
+) -> Iterator[Row]:
     """Describe the components of a command; the data have those of the beginning."""
     for actuator in range(mj.nactuator):
         name = names["actuator"][actuator]
@@ -697,29 +597,16 @@ def _inputs(
         unit, doc = control_unit(mj, actuator), _CONTROLS[servo(mj, actuator)]
         stateful = bool(mj.actuator_actnum[actuator])
         _, always, contact = _of_actuator(trees, actuator, stateful=stateful)
-        for i in range(count):
-            limited = mj.actuator_ctrllimited[first + i]
-            low, high = mj.actuator_ctrlrange[first + i] if limited else (-math.inf, math.inf)
-            yield Input(
-                name=f"{name}.control" if count == 1 else f"{name}.control_{i}",
+        for i in range(first, first + count):
+            low, high = _ends(mj.actuator_ctrllimited[i], mj.actuator_ctrlrange[i])
+            yield Row(
+                name=f"{name}.control" if count == 1 else f"{name}.control_{i - first}",
                 unit=unit,
                 shape=(),
-                default=min(max(float(data.ctrl[first + i]), float(low)), float(high)),
-                low=float(low),
-                high=float(high),
+                default=min(max(float(data.ctrl[i]), low), high),
+                low=low,
+                high=high,
                 doc=doc,
                 always=always,
                 contact=contact,
             )
-
-
-def contact_bodies(mj: mujoco.MjModel, part_of: Mapping[str, str]) -> tuple[str, ...]:
-    """Name the body of every shape, then the flexes, as lists of contacts do."""
-    names = element_names(mj)
-    own = [names["body"][int(body)] for body in mj.geom_bodyid]
-    return (*(part_of.get(name, name) for name in own), *names["flex"])
-
-
-def body_names(mj: mujoco.MjModel) -> tuple[str, ...]:
-    """Name all bodies, by number; the first is the world."""
-    return element_names(mj)["body"]

@@ -17,16 +17,15 @@ import mujoco
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.mujoco.fields import clean, element_names, slots, tendon_unit
-from scm_world.backends.mujoco.slots import Slot
+from scm_world.backends.mujoco.fields import clean, element_names, tendon_unit
+from scm_world.backends.mujoco.slots import Finder, Slot
 from scm_world.backends.mujoco.sources import Source, realized
 from scm_world.backends.mujoco.trees import disabled
 from scm_world.errors import ModelError, nearest
 from scm_world.geometry.chains import BALL, FREE, HINGE, OFFSET, SLIDE, Chain
 from scm_world.models.model import Parameter, Readout, StateRow
-from scm_world.models.scene import ParameterKey
 
-_OBJ, _SENS, _STAGE, _TRN = mujoco.mjtObj, mujoco.mjtSensor, mujoco.mjtStage, mujoco.mjtTrn
+_JNT, _OBJ, _SENS, _STAGE = mujoco.mjtJoint, mujoco.mjtObj, mujoco.mjtSensor, mujoco.mjtStage
 _POSES = {
     "position": ("m", (3,), "Place of the {kind} in the world."),
     "orientation": ("1", (4,), "Orientation of the {kind} in the world (x, y, z, w), w >= 0."),
@@ -40,15 +39,15 @@ _MOVING = ("position", "orientation", "axis", "anchor", "ref")
 
 @lru_cache(maxsize=64)
 def _scratch(
-    source: Source, keys: tuple[ParameterKey, ...], thread: int
-) -> tuple[mujoco.MjModel, mujoco.MjData, mujoco.MjData, dict[ParameterKey, Slot]]:
-    """Give a model and data to compute on: for each thread, and for each set of parameters."""
+    source: Source, finders: tuple[Finder, ...], thread: int
+) -> tuple[mujoco.MjModel, mujoco.MjData, mujoco.MjData, list[Slot]]:
+    """Return a model and data to compute on: for each thread, and for each set of parameters."""
     compiled = realized(source)[0]
-    mj = copy.copy(compiled) if keys else compiled
+    mj = copy.copy(compiled) if finders else compiled
     data = mujoco.MjData(mj)
     for each in (data, other := mujoco.MjData(mj)):
         each.warning.number[:] = 1  # no warnings on the console
-    return mj, data, other, slots(compiled, keys, mj, data) if keys else {}
+    return mj, data, other, [finder(mj, data) for finder in finders]
 
 
 @final
@@ -60,36 +59,36 @@ class Computed:
         source: Of the model.
         states: For each state, which numbers of ``"qpos"``, ``"qvel"`` or ``"act"`` it is, and in
             which frame it is given; see ``StateRow``.
-        keys: Of the parameters.
+        finders: Places of the parameters.
         kind: Of the element: ``"site"``, ``"body"``, ``"geom"`` or ``"sensor"``.
         index: Of the element.
-        attribute: What is asked for.
+        attribute: Attribute of the element that is computed.
     """
 
     source: Source
     states: tuple[tuple[str, tuple[int, ...], str], ...]
-    keys: tuple[ParameterKey, ...]
+    finders: tuple[Finder, ...]
     kind: str
     index: int
     attribute: str
 
     def __call__(self, *values: Any) -> Floats | float:
         """Compute the value from those of the parents."""
-        mj, data, scratch, slots = _scratch(self.source, self.keys, threading.get_ident())
+        mj, data, scratch, slots = _scratch(self.source, self.finders, threading.get_ident())
         data.qpos[:], data.qvel[:] = mj.qpos0, 0.0
         for (array, numbers, _), value in zip(self.states, values, strict=False):
             getattr(data, array)[list(numbers)] = value
         for array, numbers, frame in self.states:
             for dof in numbers if (array, frame) == ("qvel", "world") else ():
                 joint = int(mj.dof_jntid[dof])  # MuJoCo has spins in the frame of the body
-                if int(mj.jnt_type[joint]) == FREE and dof == mj.jnt_dofadr[joint] + 3:
+                if mj.jnt_type[joint] == int(_JNT.mjJNT_FREE) and dof == mj.jnt_dofadr[joint] + 3:
                     start, back, spin = int(mj.jnt_qposadr[joint]) + 3, np.empty(4), np.empty(3)
                     mujoco.mju_negQuat(back, data.qpos[start : start + 4])
                     mujoco.mju_rotVecQuat(spin, data.qvel[dof : dof + 3], back)
                     data.qvel[dof : dof + 3] = spin
-        for key, value in zip(self.keys, values[len(self.states) :], strict=True):
-            slots[key].write(np.asarray(value, dtype=np.float64))
-        if any(slots[key].constant for key in self.keys):
+        for slot, value in zip(slots, values[len(self.states) :], strict=True):
+            slot.write(np.asarray(value, dtype=np.float64))
+        if any(slot.constant for slot in slots):
             mujoco.mj_setConst(mj, scratch)
         if self.kind == "sensor":
             # MuJoCo keeps what it computed for an earlier sensor until the velocity stage is over,
@@ -178,50 +177,45 @@ class _Finder:
         self._names = element_names(mj)
 
     def find(self, name: str) -> Readout | str:
-        """Describe a readout, or say what is wrong with its name."""
+        """Describe a readout, or return what is wrong with its name."""
         prefix, _, plain = name.rpartition(":")
         element, _, attribute = plain.rpartition(".")
-        taken = [row.name for row in (*self._parameters, *self._states)]
-        if name in taken:
-            kinds = [f"{kind}:{name}" for kind in _OBJECTS if clean(element) in self._names[kind]]
-            return "it is a variable already" + (f"; write {kinds[0]!r}" if kinds else "")
-        if attribute == "value":
-            return self._sensor(name, element)
-        if attribute not in _POSES:
-            allowed = ", ".join((*_POSES, "value"))
-            return f"{attribute!r} is nothing that can be computed; there are: {allowed}"
         kinds = [
-            kind for kind in _OBJECTS
+            kind for kind in (("sensor",) if attribute == "value" else _OBJECTS)
             if clean(element) in self._names[kind] and prefix in ("", kind)
         ]  # fmt: skip
+        if name in [row.name for row in (*self._parameters, *self._states)]:
+            others = [f"{kind}:{name}" for kind in _OBJECTS if clean(element) in self._names[kind]]
+            return "it is a variable already" + (f"; write {others[0]!r}" if others else "")
+        if attribute not in (*_POSES, "value"):
+            allowed = ", ".join((*_POSES, "value"))
+            return f"{attribute!r} is nothing that can be computed; there are: {allowed}"
         if len(kinds) > 1:
             choices = " or ".join(repr(f"{kind}:{plain}") for kind in kinds)
             return f"a {', a '.join(kinds)} are called {element!r}; write {choices}"
-        if kinds:
-            index = self._names[kinds[0]].index(clean(element))
-            return self._pose(name, kinds[0], index, attribute)
-        known = [n for kind in _OBJECTS for n in self._names[kind]]
-        near = nearest(element, known)
-        return f"no site, body or shape is called {element!r}" + (
-            f"; did you mean {near!r}?" if near else ""
-        )
-
-    def _pose(self, name: str, kind: str, index: int, attribute: str) -> Readout:
-        states, keys = self._parents([(kind, index)], attribute.endswith("velocity"))
+        if not kinds:
+            sought = ("sensor",) if attribute == "value" else (*_OBJECTS,)
+            near = nearest(element, [n for kind in sought for n in self._names[kind]])
+            what = "sensor" if attribute == "value" else "site, body or shape"
+            hint = f"; did you mean {near!r}?" if near else ""
+            return f"no {what} is called {element!r}{hint}"
+        kind, index = kinds[0], self._names[kinds[0]].index(clean(element))
+        if kind == "sensor":
+            return self._sensor(name, index)
+        states, parameters = self._parents([(kind, index)], attribute.endswith("velocity"))
         function: Callable[..., Any] | None = None
-        if not keys and attribute in ("position", "orientation"):
+        if not parameters and attribute in ("position", "orientation"):
             function = self._chain(kind, index, states, turn=attribute == "orientation")
         row = (name, *_POSES[attribute])
-        return self._row(*row, states, keys, (kind, index, attribute), function)
+        return self._row(*row, states, parameters, (kind, index, attribute), function)
 
-    def _chain(self, kind: str, index: int, states: Sequence[str], *, turn: bool) -> Chain:
+    def _chain(self, kind: str, index: int, states: Sequence[StateRow], *, turn: bool) -> Chain:
         """Write a pose down as a chain of joints, which is computed faster than by MuJoCo."""
         mj, first, numbers = self._mj, 0, dict[int, int]()
-        for row in self._states:
-            if row.name in states:
-                for joint in dict.fromkeys(self._joints[row.name]):
-                    numbers.setdefault(joint, first)
-                    first += self._joints[row.name].count(joint)
+        for row in states:
+            for joint in dict.fromkeys(self._joints[row.name]):
+                numbers.setdefault(joint, first)
+                first += self._joints[row.name].count(joint)
         steps: list[tuple[float, ...]] = []
         body = index
         if kind != "body":
@@ -235,11 +229,8 @@ class _Finder:
                 mj.body_jntadr[body], mj.body_jntadr[body] + max(0, mj.body_jntnum[body])
             )
             kinds = [int(mj.jnt_type[joint]) for joint in joints]
-            steps = [
-                *(_joint_step(mj, joint, numbers[joint]) for joint in joints),
-                *steps,
-            ]
-            if kinds != [int(mujoco.mjtJoint.mjJNT_FREE)]:
+            steps = [*(_joint_step(mj, joint, numbers[joint]) for joint in joints), *steps]
+            if kinds != [int(_JNT.mjJNT_FREE)]:
                 steps.insert(0, (OFFSET, 0.0, *mj.body_pos[body], *mj.body_quat[body]))
             body = int(mj.body_parentid[body])
         return Chain.of(steps, turn=turn)
@@ -250,21 +241,20 @@ class _Finder:
         unit: str,
         shape: tuple[int, ...],
         doc: str,
-        states: Sequence[str],
-        keys: tuple[ParameterKey, ...],
+        states: Sequence[StateRow],
+        parameters: Sequence[Parameter],
         what: tuple[str, int, str],
         function: Callable[..., Any] | None = None,
     ) -> Readout:
-        named = {row.key: row.name for row in self._parameters}
-        where = {row.name: (row.array, row.numbers, row.frame) for row in self._states}
-        places = tuple(where[state] for state in states)
-        parents = (*states, *(named[key] for key in keys))
-        function = function or Computed(self._source, places, keys, *what)
+        places = tuple((row.array, row.numbers, row.frame) for row in states)
+        finders = tuple(row.slot for row in parameters if row.slot is not None)
+        parents = tuple(row.name for row in (*states, *parameters))
+        function = function or Computed(self._source, places, finders, *what)
         return Readout(name, unit, shape, parents, function, doc.format(kind=what[0]))
 
     def _parents(
         self, objects: Iterable[tuple[str, int]], velocity: bool
-    ) -> tuple[list[str], tuple[ParameterKey, ...]]:
+    ) -> tuple[list[StateRow], list[Parameter]]:
         """Find the states and parameters that decide where some objects are."""
         mj, elements, joints = self._mj, set[tuple[str, str]](), set[int]()
         for kind, index in objects:
@@ -280,55 +270,52 @@ class _Finder:
         elements |= {("joint", self._names["joint"][joint]) for joint in joints}
         arrays = ("qpos", "qvel") if velocity else ("qpos",)
         states = [
-            row.name
+            row
             for row in self._states
             if row.array in arrays and not joints.isdisjoint(self._joints[row.name])
         ]
-        keys = tuple(
-            row.key
+        parameters = [
+            row
             for row in self._parameters
             if row.key[1] in _MOVING
             and any(row.key[0] in (name, f"{kind}:{name}") for kind, name in elements)
-        )
-        return states, keys
+        ]
+        return states, parameters
 
     # --- sensors -------------------------------------------------------------------------------
 
-    def _sensor(self, name: str, element: str) -> Readout | str:
-        mj, sensors = self._mj, self._names["sensor"]
-        if clean(element) not in sensors:
-            near = nearest(element, sensors)
-            return f"no sensor is called {element!r}" + (
-                f"; did you mean {near!r}?" if near else ""
-            )
-        index = sensors.index(clean(element))
+    def _sensor(self, name: str, index: int) -> Readout | str:
+        mj = self._mj
         kind = mujoco.mjtSensor(int(mj.sensor_type[index]))
         reason = self._hidden(index, kind)
         if reason:
             return reason
         velocity = mj.sensor_needstage[index] == int(_STAGE.mjSTAGE_VEL)
-        objects = self._objects(index, kind)
-        if kind in _OF_JOINTS:
-            array, joint = "qvel" if velocity else "qpos", int(mj.sensor_objid[index])
+        word, target = kind.name.removeprefix("mjSENS_"), int(mj.sensor_objid[index])
+        unit, scope = _SENSORS.get(word, ("1", "all"))
+        if "{L}" in unit:
+            if word.startswith("TENDON"):
+                length = tendon_unit(mj, target)
+            else:
+                length = "m" if mj.jnt_type[target] == int(_JNT.mjJNT_SLIDE) else "rad"
+            unit = "1" if length == "1" else unit.format(L=length)
+        states = [row for row in self._states if row.array in ("qpos", "qvel")]
+        parameters = self._parameters
+        objects = self._objects(index) if scope == "frames" else None
+        if scope == "joint":
+            array, parameters = "qvel" if velocity else "qpos", []
             states = [
-                row.name
-                for row in self._states
-                if row.array == array and joint in self._joints[row.name]
-            ]
-            keys: tuple[ParameterKey, ...] = ()
-        elif objects is None:
-            states = [row.name for row in self._states if row.array in ("qpos", "qvel")]
-            keys = tuple(row.key for row in self._parameters)
-        else:
-            states, keys = self._parents(objects, velocity)
+                row for row in states
+                if row.array == array and target in self._joints[row.name]
+            ]  # fmt: skip
+        elif objects is not None:
+            states, parameters = self._parents(objects, velocity)
         size = int(mj.sensor_dim[index])
-        shape = (size,) if size > 1 else ()
-        doc = f"The {kind.name.removeprefix('mjSENS_').lower()} sensor."
-        what = "sensor", index, "value"
-        return self._row(name, self._unit(index, kind), shape, doc, states, keys, what)
+        shape, doc = (size,) if size > 1 else (), f"The {word.lower()} sensor."
+        return self._row(name, unit, shape, doc, states, parameters, ("sensor", index, "value"))
 
     def _hidden(self, index: int, kind: mujoco.mjtSensor) -> str:
-        """Say why a sensor is no function of states and parameters, if it is none."""
+        """Return why a sensor is no function of states and parameters; empty if it is one."""
         mj = self._mj
         if disabled(mj, mujoco.mjtDisableBit.mjDSBL_SENSOR):
             return "the model disables sensors"
@@ -346,67 +333,32 @@ class _Finder:
             return "it measures forces or accelerations, which are no function of the state alone"
         return ""
 
-    def _objects(self, index: int, kind: mujoco.mjtSensor) -> list[tuple[str, int]] | None:
-        """List what decides the value of a sensor; None where that may be anything."""
-        mj = self._mj
-        if kind not in _OF_FRAMES:
-            return None
+    def _objects(self, index: int) -> list[tuple[str, int]] | None:
+        """List the objects whose frames a sensor compares; None for frames that follow more."""
+        mj, kinds = self._mj, {int(obj): name for name, obj in _OBJECTS.items()}
         ends = [(int(mj.sensor_objtype[index]), int(mj.sensor_objid[index]))]
         if mj.sensor_refid[index] >= 0:
             ends.append((int(mj.sensor_reftype[index]), int(mj.sensor_refid[index])))
-        kinds = {int(obj): name for name, obj in _OBJECTS.items()}
-        if any(obj not in kinds for obj, _ in ends):
-            return None  # inertial frames and cameras follow more
+        if any(obj not in kinds for obj, _ in ends):  # inertial frames and cameras
+            return None
         return [(kinds[obj], end) for obj, end in ends]
 
-    def _unit(self, index: int, kind: mujoco.mjtSensor) -> str:
-        """Give the unit of a sensor; ``"1"`` where it mixes or has none."""
-        mj, target = self._mj, int(self._mj.sensor_objid[index])
-        if kind in (_SENS.mjSENS_JOINTPOS, _SENS.mjSENS_JOINTVEL, _SENS.mjSENS_JOINTLIMITPOS):
-            slides = mj.jnt_type[target] == int(mujoco.mjtJoint.mjJNT_SLIDE)
-            unit = "m" if slides else "rad"
-        elif kind in (_SENS.mjSENS_TENDONPOS, _SENS.mjSENS_TENDONVEL, _SENS.mjSENS_TENDONLIMITPOS):
-            unit = tendon_unit(mj, target)
-        else:
-            return _UNITS.get(kind, "1")
-        speed = kind in (_SENS.mjSENS_JOINTVEL, _SENS.mjSENS_TENDONVEL)
-        return f"{unit}/s" if speed and unit != "1" else unit
 
-
-_OF_FRAMES = (
-    _SENS.mjSENS_FRAMEPOS,
-    _SENS.mjSENS_FRAMEQUAT,
-    _SENS.mjSENS_FRAMEXAXIS,
-    _SENS.mjSENS_FRAMEYAXIS,
-    _SENS.mjSENS_FRAMEZAXIS,
-    _SENS.mjSENS_FRAMELINVEL,
-    _SENS.mjSENS_FRAMEANGVEL,
-    _SENS.mjSENS_VELOCIMETER,
-    _SENS.mjSENS_GYRO,
-)
-_OF_JOINTS = (
-    _SENS.mjSENS_JOINTPOS,
-    _SENS.mjSENS_JOINTVEL,
-    _SENS.mjSENS_BALLQUAT,
-    _SENS.mjSENS_BALLANGVEL,
-)
-_UNITS = {
-    _SENS.mjSENS_VELOCIMETER: "m/s",
-    _SENS.mjSENS_GYRO: "rad/s",
-    _SENS.mjSENS_MAGNETOMETER: "T",
-    _SENS.mjSENS_RANGEFINDER: "m",
-    _SENS.mjSENS_BALLANGVEL: "rad/s",
-    _SENS.mjSENS_FRAMEPOS: "m",
-    _SENS.mjSENS_FRAMELINVEL: "m/s",
-    _SENS.mjSENS_FRAMEANGVEL: "rad/s",
-    _SENS.mjSENS_SUBTREECOM: "m",
-    _SENS.mjSENS_SUBTREELINVEL: "m/s",
-    _SENS.mjSENS_SUBTREEANGMOM: "kg m^2/s",
-    _SENS.mjSENS_GEOMDIST: "m",
-    _SENS.mjSENS_GEOMFROMTO: "m",
-    _SENS.mjSENS_E_POTENTIAL: "J",
-    _SENS.mjSENS_E_KINETIC: "J",
-}
+_SENSORS = {
+    "JOINTPOS": ("{L}", "joint"), "JOINTVEL": ("{L}/s", "joint"), "BALLQUAT": ("1", "joint"),
+    "BALLANGVEL": ("rad/s", "joint"), "JOINTLIMITPOS": ("{L}", "all"),
+    "TENDONPOS": ("{L}", "all"), "TENDONVEL": ("{L}/s", "all"), "TENDONLIMITPOS": ("{L}", "all"),
+    "FRAMEPOS": ("m", "frames"), "FRAMEQUAT": ("1", "frames"), "FRAMEXAXIS": ("1", "frames"),
+    "FRAMEYAXIS": ("1", "frames"), "FRAMEZAXIS": ("1", "frames"),
+    "FRAMELINVEL": ("m/s", "frames"), "FRAMEANGVEL": ("rad/s", "frames"),
+    "VELOCIMETER": ("m/s", "frames"), "GYRO": ("rad/s", "frames"),
+    "MAGNETOMETER": ("T", "all"), "RANGEFINDER": ("m", "all"), "SUBTREECOM": ("m", "all"),
+    "SUBTREELINVEL": ("m/s", "all"), "SUBTREEANGMOM": ("kg m^2/s", "all"),
+    "GEOMDIST": ("m", "all"), "GEOMFROMTO": ("m", "all"), "E_POTENTIAL": ("J", "all"),
+    "E_KINETIC": ("J", "all"),
+}  # fmt: skip
+"""Unit of a sensor, with L for that of the coordinate, and what decides its value: a joint, the
+frames that it compares, or all states and parameters."""
 
 
 def _joint_step(mj: mujoco.MjModel, joint: int, first: int) -> tuple[float, ...]:
@@ -414,10 +366,10 @@ def _joint_step(mj: mujoco.MjModel, joint: int, first: int) -> tuple[float, ...]
     axis, anchor = mj.jnt_axis[joint], mj.jnt_pos[joint]
     reference = float(mj.qpos0[mj.jnt_qposadr[joint]])
     match mujoco.mjtJoint(int(mj.jnt_type[joint])):
-        case mujoco.mjtJoint.mjJNT_HINGE:
+        case _JNT.mjJNT_HINGE:
             return (HINGE, first, *axis, *anchor, reference)
-        case mujoco.mjtJoint.mjJNT_SLIDE:
+        case _JNT.mjJNT_SLIDE:
             return (SLIDE, first, *axis, 0.0, 0.0, 0.0, reference)
-        case mujoco.mjtJoint.mjJNT_BALL:
+        case _JNT.mjJNT_BALL:
             return (BALL, first, *anchor)
     return (FREE, first)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import mujoco
-import numba
 import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
@@ -16,18 +15,17 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.contacts import Touches, touches
-from scm_world.backends.mujoco.slots import Slot
 from scm_world.backends.mujoco.states import (
+    MOTION,
     LastStep,
-    Turned,
     into_bodies,
+    into_world,
     read_rows,
-    read_vector,
     settle,
-    write_vector,
+    turned_bodies,
 )
 from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import EngineFailure, Infeasible, UnknownOption
+from scm_world.errors import EngineFailure, Infeasible, ModelError, UnknownOption
 from scm_world.models.model import Model
 from scm_world.models.scene import (
     REVERSED,
@@ -35,28 +33,6 @@ from scm_world.models.scene import (
     Parameters,
     reversed_ranges,
 )
-
-
-@numba.njit("b1(f8[::1], f8[::1], f8[::1], i4[:])", cache=True)
-def sound(positions: Floats, velocities: Floats, activations: Floats, counts: Any) -> bool:
-    """Tell whether all numbers are finite, and no contact or constraint was left out.
-
-    Args:
-        positions: Shape (nq,).
-        velocities: Shape (nv,).
-        activations: Shape (na,).
-        counts: Of MuJoCo's warnings, which begin with 1; the second is of contacts for which
-            there was no memory, the third of constraints.
-    """
-    total = 0.0
-    for value in positions:
-        total += value * 0.0
-    for value in velocities:
-        total += value * 0.0
-    for value in activations:
-        total += value * 0.0
-    return total == 0.0 and counts[1] + counts[2] == 2
-
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Everything that decides the future of a simulation of MuJoCo."""
@@ -66,11 +42,8 @@ FULL = (
     "of the model, for example with <size memory='100M'/>"
 )
 
-_NO_FORCES = np.zeros((1, 0))
-_NO_FORCES.flags.writeable = False
-
-Rows = Callable[[Any, Floats], int]
-"""Reads some states of a batch, and gives a row that is not finite, or -1."""
+_ONLY = np.zeros(1, dtype=np.int32)
+"""The row of a single vector."""
 
 
 def refuse_callbacks() -> None:
@@ -85,7 +58,7 @@ def refuse_callbacks() -> None:
 
 
 def lost(structure: Any, vector: Floats, time: float) -> str:
-    """Say which states are not finite, and when.
+    """Return which states are not finite, and when, as a sentence.
 
     Args:
         structure: With the names of the states.
@@ -101,21 +74,15 @@ def lost(structure: Any, vector: Floats, time: float) -> str:
     )
 
 
-def slots_of(
-    structure: Model, model: mujoco.MjModel, data: mujoco.MjData
-) -> dict[ParameterKey, Slot]:
-    """Find the places of all parameters in a copy of the compiled model, and in its data."""
-    rows = structure.parameters
-    keys = [row.key for row in rows if row.slot is None]
-    found = fields.slots(reading.compiled(structure), keys, model, data) if keys else {}
-    return found | {row.key: row.slot(model, data) for row in rows if row.slot is not None}
-
-
 class Realization:
     """A compiled model with parameters and a state of its own.
 
     Args:
         structure: The description of the model.
+        parameters: All that differ from it, and all that are compared later.
+
+    Raises:
+        ModelError: It is not a model.
 
     Attributes:
         structure: What was compiled.
@@ -131,16 +98,19 @@ class Realization:
             taken elsewhere, so that their contacts are not in the data.
     """
 
-    def __init__(self, structure: Model) -> None:
+    def __init__(self, structure: Any, parameters: Parameters) -> None:
+        if not isinstance(structure, Model):
+            kind = type(structure).__name__
+            raise ModelError([f"MuJoCo cannot realise a {kind}; it takes models"])
         self._compiled = compiled = reading.compiled(structure)
         self.structure = structure
         self.model = model = copy.copy(compiled)
         self.data = data = mujoco.MjData(model)
         self._scratch = mujoco.MjData(model)
-        self._slots = slots_of(structure, model, data)
+        self._slots = structure.slots(model, data)
         self._constant = frozenset(key for key, slot in self._slots.items() if slot.constant)
         self._follow_ups = {key: f for key, slot in self._slots.items() if (f := slot.follow_up)}
-        self._bodies = reading.body_names(compiled)
+        self._bodies = structure.body_names
         self.owners = structure.owners
         self.kept: dict[ParameterKey, Floats] = {}
         self.applied: Parameters | None = None
@@ -148,76 +118,66 @@ class Realization:
         self.edited = True
         self.replay: tuple[Floats, int] | None = None
         self.command = data.ctrl[: structure.n_commands]
-        self._positions, self._velocities, self._activations = data.qpos, data.qvel, data.act
         self._forces = data.qfrc_actuator
         self._places = np.concatenate(reading.permutation(structure)).astype(np.int64)
-        self._turned, places = Turned.of(structure, compiled), structure.layout.slices
+        self._motion, self._zeros = np.empty(len(self._places)), np.zeros(len(self._places))
+        self._names, self._turned, self._own = turned_bodies(structure, compiled)
+        places = structure.layout.slices
         pairs = [
             (place, number)
             for row in structure.states
             if row.reported
             for place, number in enumerate(row.numbers, places[row.name].start)
         ]
-        self._reported = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-        self.lean = not (pairs or self._turned.names)
+        self._reported = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+        self.lean = not (pairs or self._names)
         self._last: LastStep | None = None
         self._written: Floats | None = None  # since the last step, if bodies are turned
         self._counts = data.warning.number
-        self._weights = reading.inertia_of(model)
         self._size = int(mujoco.mj_stateSize(model, STATE))
         # MuJoCo prints a warning, and writes it to a file, when it counts the first of its kind.
         self._counts[:] = self._scratch.warning.number[:] = 1
+        self.edit(parameters)
 
     # --- state ---------------------------------------------------------------------------------
 
     def read(self, into: Floats) -> None:
         """Write the state into a vector, shape (layout.size,)."""
-        read_vector(
-            self._positions,
-            self._velocities,
-            self._activations,
-            self._forces,
-            self._places,
-            self._turned.vector,
-            self._reported,
-            into,
-        )
+        mujoco.mj_getState(self.model, self.data, self._motion, MOTION)
+        into[self._places] = self._motion
+        if self._reported.size:
+            into[self._reported[0]] = self._forces[self._reported[1]]
+        if self._names:
+            into_world(into[None], _ONLY, self._turned)
         if self._written is not None:
-            settle(self._written, into, self._turned.vector)
+            settle(self._written, into, self._turned)
 
     def place(self, vector: Floats) -> None:
         """Write a state; all else stays as it is. What is as the last step left it stays exact."""
-        turned = self._turned
-        if turned.names:
-            names, known, exact = self._remembered()
-            if names != turned.names:
-                where = [names.index(name) if name in names else -1 for name in turned.names]
+        remembered = self._remembered() if self._names else None
+        motion = vector[self._places]
+        if remembered is not None:
+            names, known, exact = remembered
+            if names != self._names:
+                where = [names.index(name) if name in names else -1 for name in self._names]
                 nobody = np.full((1, 7), np.nan)
                 known, exact = (np.vstack([part, nobody])[where] for part in (known, exact))
-            numbers = np.empty((len(turned.names), 7))
-            into_bodies(vector, turned.vector, known, exact, numbers)
+            into_bodies(vector, self._turned, self._own, known, exact, motion)
             self._written = vector.copy()
-        write_vector(self._positions, self._velocities, self._activations, self._places, vector)
-        if turned.names:
-            turned.write_own(numbers, self._positions, self._velocities)
+        mujoco.mj_setState(self.model, self.data, motion, MOTION)
 
     def _remembered(self) -> LastStep:
         """Return what the last physics step left of turned bodies, before the first change."""
         if self._last is None:
             vector = np.empty(self.structure.layout.size)
             self.read(vector)
-            own = self._turned.read_own(self._positions, self._velocities)
-            self._last = self._turned.names, self._turned.read(vector), own
+            self._last = self._names, vector[self._turned], self._motion[self._own]
         return self._last
 
-    def rows(self, batch: Batch) -> Rows:
-        """Return what reads states of such models out of a batch."""
-        forces = batch.bind("qfrc_actuator") if len(self._reported) else _NO_FORCES
-        states, places = batch.state, self._places
-        turned, reported = self._turned.vector, self._reported
-        return lambda which, into: int(
-            read_rows(states, forces, places, turned, reported, which, into)
-        )
+    def rows(self, batch: Batch) -> Callable[[Any, Floats], int]:
+        """Return what reads some states out of a batch, and returns a row that is not finite."""
+        forces = batch.bind("qfrc_actuator") if self._reported.size else None
+        return partial(read_rows, batch.state, forces, self._places, self._turned, self._reported)
 
     def reset(self) -> None:
         """Forget every step; parameters stay."""
@@ -234,8 +194,9 @@ class Realization:
         self.replay = self._last = self._written = None
 
     def problem(self) -> str:
-        """Say what is wrong with what a step left, or nothing."""
-        if sound(self._positions, self._velocities, self._activations, self._counts):
+        """Return why the state after a step is invalid; empty if it is valid."""
+        mujoco.mj_getState(self.model, self.data, self._motion, MOTION)
+        if self._motion @ self._zeros == 0.0 and self._counts[1] + self._counts[2] == 2:
             return ""
         full = self._counts[1] + self._counts[2] > 2
         self._counts[:] = 1
@@ -301,24 +262,13 @@ class Realization:
 
     # --- model ---------------------------------------------------------------------------------
 
-    def inertia(self, body: str) -> Floats:
-        """Copy the principal moments of inertia of a body, shape (3,) [kg m²].
-
-        Raises:
-            UnknownOption: There is no such body.
-        """
-        if body not in self._bodies:
-            raise UnknownOption("body", body, self._bodies)
-        moments: Floats = self.model.body_inertia[self._bodies.index(body)].copy()
-        return moments
-
     @cached_property
     def _dynamic(self) -> NDArray[np.bool_]:
         """Which shapes touch with coefficients of their own, shape (ngeom, ngeom)."""
         return Couplings(self._compiled).dynamic
 
     def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """Say with which shapes a friction that was changed has no effect.
+        """List with which shapes a friction that was changed has no effect.
 
         Source:
             MuJoCo, *Computation, Contact*: of two shapes the one with the higher priority decides,
@@ -356,10 +306,15 @@ class Realization:
                 raise UnknownOption("parameter", ".".join(key), map(".".join, self._slots))
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Read parameters back from the arrays of the model."""
-        keys = tuple(keys)
-        self.check(keys)
-        return {key: self._slots[key].read() for key in keys}
+        """Read parameters and moments of inertia back from the arrays of the model."""
+        found: dict[ParameterKey, Floats] = {}
+        for key in keys:
+            if key not in self._slots and key[1] == "inertia" and key[0] in self._bodies:
+                found[key] = self.model.body_inertia[self._bodies.index(key[0])].copy()
+            else:
+                self.check([key])
+                found[key] = self._slots[key].read()
+        return found
 
     def edit(self, parameters: Parameters) -> None:
         """Write parameters, then all numbers that follow from them; unchanged ones cost nothing.
@@ -401,7 +356,7 @@ class Realization:
             raise
 
     def followed(self, keys: Iterable[ParameterKey]) -> str:
-        """Compute what follows from some parameters; say what is wrong with it, or nothing."""
+        """Compute what follows from some parameters; return why that is invalid, or nothing."""
         keys = tuple(keys)
         for follow_up in {self._follow_ups[key] for key in keys if key in self._follow_ups}:
             follow_up(self.model)
@@ -414,13 +369,13 @@ class Realization:
             self._scratch.warning.number[:] = 1
             return f"MuJoCo says: {error}"
         singular = self._scratch.warning.number
-        if singular[0] != 1 or not reading.sensible(*self._weights):
+        if singular[0] != 1 or not reading.sensible(self.model):
             singular[0] = 1
             return "masses and moments of inertia would not be those of something that can move"
         return ""
 
     def _culprits(self, keys: Iterable[ParameterKey]) -> list[ParameterKey]:
-        """Name those of some parameters that no body can have; all that count if none is wrong."""
+        """List the parameters among some that no body can have; all that count if none is wrong."""
         constant = [key for key in keys if key in self._constant]
         wrong = []
         for key in constant:

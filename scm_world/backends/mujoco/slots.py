@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, final
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
 
-GRAY = (0.5, 0.5, 0.5, 1.0)
-"""The color of a shape for which MuJoCo takes that of its material."""
+GRAY = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
+"""The color of a shape for which MuJoCo takes that of its material. Source: MuJoCo, XML."""
+
+Finder = Callable[[mujoco.MjModel, mujoco.MjData], "Slot"]
+"""Finds a place in a model and its data. It can be pickled."""
 
 
 @final
@@ -44,7 +48,7 @@ def place(
     back: Callable[[Any], Any] | None = None,
     follow_up: Callable[[Any], None] | None = None,
 ) -> Slot:
-    """Give the slot of a value that stands in some views of arrays, alike in all of them.
+    """Return the slot of a value that stands in some views of arrays, alike in all of them.
 
     Args:
         views: Of any shape; the first one is read.
@@ -66,17 +70,17 @@ def place(
 
 
 def first(view: Floats) -> Any:
-    """Give the first row of several that are alike."""
+    """Return the first row of several that are alike."""
     return view[0]
 
 
-def turn(view: Floats, *, constant: bool = True) -> Slot:
-    """Give the slot of a quaternion (x, y, z, w), which MuJoCo keeps as (w, x, y, z)."""
+def turn(view: Floats, *, constant: bool = True, **_: Any) -> Slot:
+    """Return the slot of a quaternion (x, y, z, w), which MuJoCo keeps as (w, x, y, z)."""
     return place(view, to=lambda q: np.roll(q, 1), back=lambda q: np.roll(q, -1), constant=constant)
 
 
-def direction(view: Floats) -> Slot:
-    """Give the slot of a vector of which MuJoCo keeps the direction alone, with the length one."""
+def direction(view: Floats, **_: Any) -> Slot:
+    """Return the slot of a vector of which MuJoCo keeps the direction alone, of length one."""
 
     def unit(vector: Floats) -> Floats:
         squared = float(vector @ vector)
@@ -85,57 +89,77 @@ def direction(view: Floats) -> Slot:
     return place(view, to=unit, constant=True)
 
 
-def option(options: Any, name: str) -> Slot:
-    """Give the slot of a number among the options of the model."""
+# --- finders, with the model and its data as the last arguments -----------------------------------
+
+
+def at(
+    form: Callable[..., Slot],
+    arrays: str,
+    index: tuple[Any, ...],
+    constant: bool,
+    mj: mujoco.MjModel,
+    data: mujoco.MjData,
+) -> Slot:
+    """Find a value in one array or several of the model, its options or its data.
+
+    Args:
+        form: Makes a slot of the views.
+        arrays: Their names: ``"body_mass"``, ``"opt.gravity"``, ``"eq_active0 data.eq_active"``.
+        index: Place in each of them; of several rows that are alike, a value stands in each.
+        constant: See ``Slot``.
+        mj: The model.
+        data: Its data.
+    """
+    views = []
+    for array in arrays.split():
+        of, _, name = array.rpartition(".")
+        views.append(getattr({"": mj, "opt": mj.opt, "data": data}[of], name)[(*index, ...)])
+    back = first if index and isinstance(index[0], slice) else None
+    return form(*views, constant=constant, back=back)
+
+
+def option(name: str, mj: mujoco.MjModel, _: mujoco.MjData) -> Slot:
+    """Find a number among the options of the model."""
     return Slot(
-        lambda value: setattr(options, name, float(value)),
-        lambda: np.array(float(getattr(options, name))),
+        lambda value: setattr(mj.opt, name, float(value)),
+        lambda: np.array(float(getattr(mj.opt, name))),
     )
 
 
-def gain(plus: Sequence[Floats], minus: Sequence[Floats]) -> Slot:
-    """Give the slot of a gain that stands in some places, and in others with the other sign.
-
-    Args:
-        plus: Views of the places with the sign of the gain.
-        minus: Views of those with the other sign. A zero keeps the sign it has now.
-    """
-    zeros = [np.copysign(0.0, view) for view in minus]
+def gain(
+    actuator: int, places: tuple[tuple[str, int, int], ...], mj: mujoco.MjModel, _: mujoco.MjData
+) -> Slot:
+    """Find a gain of an actuator in arrays, each with a column and a sign."""
+    views = [(getattr(mj, f"actuator_{a}")[actuator, column, ...], s) for a, column, s in places]
+    zeros = [np.copysign(0.0, view) for view, _ in views]  # a negative zero stays one
 
     def write(value: Floats) -> None:
-        for view in plus:
-            view[...] = value
-        for view, zero in zip(minus, zeros, strict=True):
-            view[...] = -value if value else zero
+        for (view, sign), zero in zip(views, zeros, strict=True):
+            view[...] = sign * value if value or sign > 0 else zero
 
-    return Slot(write, lambda: plus[0].copy() if plus else 0.0 - minus[0])
+    view, sign = views[0]
+    return Slot(write, lambda: view.copy() if sign > 0 else 0.0 - view)
 
 
-def color(own: NDArray[np.float32], material: NDArray[np.float32] | None) -> Slot:
-    """Give the slot of red, green, blue and opacity, which MuJoCo keeps as 32 bits each.
+def color(geom: int, material: int, mj: mujoco.MjModel, _: mujoco.MjData) -> Slot:
+    """Find red, green, blue and opacity of a shape, which MuJoCo keeps as 32 bits each.
 
-    A shape with a material has the color of the material while its own is ``GRAY``. Colors are
-    read with the digits that 32 bits hold: 0.3 is read as 0.3.
-
-    Args:
-        own: Of the shape.
-        material: Of its material, or None.
+    A shape with a material (not -1) has its color while its own is ``GRAY``. Colors are read with
+    the digits that 32 bits hold: 0.3 is read as 0.3.
     """
-
-    def is_gray() -> bool:
-        return bool((own == np.array(GRAY, dtype=np.float32)).all())
-
-    inherits = material is not None and is_gray()
+    own: NDArray[np.float32] = mj.geom_rgba[geom]
+    other: NDArray[np.float32] = mj.mat_rgba[material] if material >= 0 else own
+    inherits = material >= 0 and bool((own == GRAY).all())
 
     def write(value: Floats) -> None:
         own[:] = value
-        if inherits and (own == material).all():
+        if inherits and (own == other).all():
             own[:] = GRAY
-        elif inherits and is_gray():  # as little as can be, so that it is shown
+        elif inherits and (own == GRAY).all():  # as little as can be, so that it is shown
             own[0] = np.nextafter(np.float32(0.5), np.float32(1.0))
 
     def read() -> Floats:
-        found = material if inherits and material is not None and is_gray() else own
+        found = other if inherits and (own == GRAY).all() else own
         return np.array([float(str(number)) for number in found])
 
     return Slot(write, read)

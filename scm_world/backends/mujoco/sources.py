@@ -125,7 +125,7 @@ def read_source(
         ModelError: It is no such thing, MuJoCo refuses it, or it has plugins.
         UnknownOption: An option is not one.
     """
-    chosen, notes, plugins = _options(options), tuple[str, ...](), ""
+    notes, plugins = tuple[str, ...](), ""
     if isinstance(source, mujoco.MjModel):
         where, stem, mj = "the MjModel", "", copy.copy(source)
     else:
@@ -140,8 +140,8 @@ def read_source(
     if mj.nplugin:
         what = f"{where} uses {mj.nplugin} plugin(s){plugins}"
         raise ModelError([f"{what}: what they act on is unknown; remove them"])
-    for option, value in chosen:
-        setattr(mj.opt, option, type(getattr(mj.opt, option))(value))
+    for option, value in options.items():
+        _set_option(mj.opt, option, value)
     binary = np.empty(mujoco.mj_sizeModel(mj), np.uint8)
     mujoco.mj_saveModel(mj, None, binary)
     name = mj.names.split(b"\0", 1)[0].decode()
@@ -150,11 +150,7 @@ def read_source(
 
 
 def _check_files(spec: mujoco.MjSpec) -> None:
-    """Refuse files that MuJoCo would read without an end.
-
-    Raises:
-        UnreadableFile: A device, a pipe, or a file that is too large.
-    """
+    """Refuse files that MuJoCo would read without an end."""
     named = [(spec.meshdir, part.file) for part in (*spec.meshes, *spec.hfields, *spec.skins)]
     for texture in spec.textures:
         named += [(spec.texturedir, name) for name in (texture.file, *texture.cubefiles)]
@@ -169,27 +165,17 @@ def _check_files(spec: mujoco.MjSpec) -> None:
                 raise UnreadableFile(str(path), str(error), advice) from None
 
 
-def _options(given: Mapping[str, Any]) -> tuple[tuple[str, float], ...]:
-    """Read options: numbers, or the words of MJCF.
-
-    Raises:
-        UnknownOption: There is no such option, or no such word.
-    """
-    found = []
-    for name, value in sorted(given.items()):
-        if name in _CHOICES:
-            words = {
-                member.partition("_")[2].lower(): float(int(kind))
-                for member, kind in _CHOICES[name].__members__.items()
-            }
-            if str(value).lower() not in words:
-                raise UnknownOption(name, value, words)
-            found.append((name, words[str(value).lower()]))
-        elif name in _NUMBERS:
-            found.append((name, float(value)))
-        else:
-            raise UnknownOption("setting", name, (*_CHOICES, *_NUMBERS))
-    return tuple(found)
+def _set_option(options: mujoco.MjOption, name: str, value: Any) -> None:
+    """Set an option to a number, or to a word of MJCF."""
+    if name not in (*_CHOICES, *_NUMBERS):
+        raise UnknownOption("setting", name, (*_CHOICES, *_NUMBERS))
+    if name in _CHOICES:
+        members = _CHOICES[name].__members__.items()
+        words = {member.partition("_")[2].lower(): int(kind) for member, kind in members}
+        if str(value).lower() not in words:
+            raise UnknownOption(name, value, words)
+        value = words[str(value).lower()]
+    setattr(options, name, type(getattr(options, name))(float(value)))
 
 
 def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
@@ -197,20 +183,15 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
 
     Returns:
         The specification, how to call it, the stem of its file, and whether it is a URDF.
-
-    Raises:
-        UnreadableFile: There is no such file, or it is no text.
-        ModelError: It is neither MJCF nor URDF, or MuJoCo does not understand it.
     """
     path = None
     if isinstance(source, mujoco.MjSpec):
         return source.copy(), "the MjSpec", "", False
     if isinstance(source, str) and source.lstrip().startswith("<"):
-        where, text, plain = "the XML text", source, True
+        where, text = "the XML text", source
     elif isinstance(source, str | os.PathLike):
         path = Path(source)
-        data = _contents(path)
-        where, text, plain = str(path), _decoded(data), _is_utf8(data)
+        where, text = str(path), _contents(path)
     else:
         raise ModelError(
             [
@@ -231,30 +212,22 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
     with understood(where):
         if path is None:
             return mujoco.MjSpec.from_string(text), where, "", tag == "robot"
-        parts = _included(text, path.parent)
-        if path.suffix in (".xml", ".urdf") and plain and all(map(_is_utf8, parts.values())):
-            spec = mujoco.MjSpec.from_file(str(path))
-        else:
-            texts = {name: _decoded(part).encode() for name, part in parts.items()}
-            spec = mujoco.MjSpec.from_string(text, include=texts)
-            spec.modelfiledir = str(path.parent)
+        spec = mujoco.MjSpec.from_string(text, include=_included(text, path.parent))
+        spec.modelfiledir = str(path.parent)
     return spec, where, path.stem, tag == "robot"
 
 
-def _contents(path: Path) -> bytes:
-    """Read a model file.
-
-    Raises:
-        UnreadableFile: There is none, or it is no text.
-    """
+def _contents(path: Path) -> str:
+    """Read and decode a model file."""
     advice = "give the path of an MJCF (.xml, .mjcf) or URDF (.urdf) file, or XML text"
     try:
         data = read_bytes(path)
     except OSError as error:
         raise UnreadableFile(str(path), (error.strerror or str(error)).lower(), advice) from error
-    if "\0" in _decoded(data).rstrip("\0"):
+    text = _decoded(data)
+    if "\0" in text.rstrip("\0"):
         raise UnreadableFile(str(path), "it is no text", advice)
-    return data
+    return text
 
 
 def _decoded(data: bytes) -> str:
@@ -278,24 +251,15 @@ def _decoded(data: bytes) -> str:
     return text.replace("\r\n", "\n")
 
 
-def _is_utf8(data: bytes) -> bool:
-    """Return whether a file is in UTF-8, which MuJoCo reads."""
-    try:
-        data.decode()
-    except UnicodeDecodeError:
-        return False
-    return True
-
-
 def _included(text: str, folder: Path) -> dict[str, bytes]:
-    """Read the files that an MJCF text includes, and those that they include."""
+    """Read the files that an MJCF text includes, and those that they include, as UTF-8."""
     found: dict[str, bytes] = {}
     texts = [text]
     for one in texts:  # which grows
         for name in re.findall(r"<include\b[^>]*\bfile\s*=\s*[\"']([^\"']+)", one):
             if name not in found and (folder / name).exists():
-                found[name] = _contents(folder / name)
-                texts.append(_decoded(found[name]))
+                texts.append(_contents(folder / name))
+                found[name] = texts[-1].encode()
     return found
 
 
@@ -330,11 +294,7 @@ def understood(where: str) -> Iterator[None]:
 
 
 def _complete(spec: mujoco.MjSpec, where: str, *, fixed_base: bool) -> None:
-    """Add to a URDF what MuJoCo leaves out: a free root, files of packages, motors, repairs.
-
-    Raises:
-        ModelError: MuJoCo does not compile it for another reason than its inertias.
-    """
+    """Add to a URDF what MuJoCo leaves out: a free root, files of packages, motors, repairs."""
     for body in () if fixed_base else spec.worldbody.bodies:
         if not body.joints:  # MuJoCo fixes the root link to the world
             body.add_freejoint()
@@ -365,11 +325,7 @@ def _packaged(name: str, folder: Path) -> Path | None:
 
 
 def _check_names(text: str, where: str) -> None:
-    """Refuse links and moving joints of a URDF that share a name, which MuJoCo would leave out.
-
-    Raises:
-        ModelError: With the names.
-    """
+    """Refuse links and moving joints of a URDF that share a name, which MuJoCo would leave out."""
     try:
         root = ElementTree.fromstring(text)  # noqa: S314 # expat bounds what entities become
     except ElementTree.ParseError:  # MuJoCo minds less, or says what is wrong
@@ -427,7 +383,7 @@ def _principal(body: Any) -> Floats:
 
 
 def _add_motors(spec: mujoco.MjSpec) -> None:
-    """Give every hinge and slide of a URDF a motor, as its joints are meant to be driven.
+    """Add a motor for every hinge and slide of a URDF, as its joints are meant to be driven.
 
     The control is the torque or force of the joint [N m] or [N], within the effort that the URDF
     allows; it is not limited where there is none. A joint that mimics another one has none.

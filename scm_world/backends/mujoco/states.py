@@ -1,17 +1,24 @@
-"""The state of a model as MuJoCo has it, and as a vector."""
+"""The state of a model as MuJoCo has it, and as a vector.
+
+MuJoCo's motion is ``qpos``, ``qvel`` and ``act`` in a row; a permutation makes a vector of it.
+Bodies that are given in the world are in addition *turned*: their quaternions get a w that is not
+negative, and their angular velocities, which MuJoCo has in the frame of the body, those in the
+world.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import mujoco
 import numba
 import numpy as np
 
 from scm_world._types import Floats, Integers
-from scm_world.backends.mujoco.reading import body_names, permutation
+from scm_world.backends.mujoco.reading import permutation
 from scm_world.models.model import Model
+
+MOTION = sum(int(getattr(mujoco.mjtState, f"mjSTATE_{part}")) for part in ("QPOS", "QVEL", "ACT"))
 
 
 @numba.njit("void(f8[::1], i8, f8[::1], b1)", cache=True, error_model="numpy")
@@ -29,83 +36,34 @@ def _rotate(turn: Floats, start: int, vector: Floats, inverse: bool) -> None:
     vector[2] = c + scale * (w * k + x * j - y * i)
 
 
-@numba.njit("void(f8[::1], i8[:, ::1])", cache=True)
-def _into_world(vector: Floats, turned: Integers) -> None:
-    """Give quaternions a w that is not negative, and turn angular velocities into the world.
+@numba.njit("void(f8[:, ::1], i4[::1], i8[:, ::1])", cache=True)
+def into_world(vectors: Floats, which: Any, turned: Integers) -> None:
+    """Make w of quaternions not negative, and turn angular velocities into the world.
 
     Args:
-        vector: A state, changed in place.
-        turned: Where in it the quaternion and the angular velocity of each body begin, shape
-            (n, 2).
+        vectors: States, one to a row, changed in place.
+        which: The rows.
+        turned: Where in a row the quaternion and the angular velocity of each body are, shape
+            (n, 7).
     """
     spin = np.empty(3)
-    for body in range(turned.shape[0]):
-        q, v = turned[body, 0], turned[body, 1]
-        for axis in range(3):
-            spin[axis] = vector[v + axis]
-        _rotate(vector, q, spin, False)
-        for axis in range(3):
-            vector[v + axis] = spin[axis]
-        if vector[q + 3] < 0.0:
-            for axis in range(4):
-                vector[q + axis] = -vector[q + axis]
+    for row in which:
+        vector = vectors[row]
+        for body in range(turned.shape[0]):
+            q, v = turned[body, 0], turned[body, 4]
+            for axis in range(3):
+                spin[axis] = vector[v + axis]
+            _rotate(vector, q, spin, False)
+            for axis in range(3):
+                vector[v + axis] = spin[axis]
+            if vector[q + 3] < 0.0:
+                for axis in range(4):
+                    vector[q + axis] = -vector[q + axis]
 
 
-@numba.njit(
-    "void(f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], i8[:, ::1], i8[:, ::1], f8[::1])", cache=True
-)
-def read_vector(
-    positions: Floats,
-    velocities: Floats,
-    activations: Floats,
-    forces: Floats,
-    places: Integers,
-    turned: Integers,
-    reported: Integers,
-    into: Floats,
-) -> None:
-    """Copy MuJoCo's coordinates into a state vector.
-
-    Args:
-        positions: Shape (nq,).
-        velocities: Shape (nv,).
-        activations: Shape (na,).
-        forces: ``qfrc_actuator``, shape (nv,).
-        places: Where in the vector each of the first three stands, in this order, shape
-            (nq + nv + na,).
-        turned: See ``_into_world``.
-        reported: Places in the vector, and in ``forces``, of what is reported, shape (m, 2).
-        into: Written, shape (nq + nv + na + m,).
-    """
-    nq, nv = positions.shape[0], velocities.shape[0]
-    for i in range(nq):
-        into[places[i]] = positions[i]
-    for i in range(nv):
-        into[places[nq + i]] = velocities[i]
-    for i in range(activations.shape[0]):
-        into[places[nq + nv + i]] = activations[i]
-    for i in range(reported.shape[0]):
-        into[reported[i, 0]] = forces[reported[i, 1]]
-    _into_world(into, turned)
-
-
-@numba.njit("void(f8[::1], f8[::1], f8[::1], i8[::1], f8[::1])", cache=True)
-def write_vector(
-    positions: Floats, velocities: Floats, activations: Floats, places: Integers, vector: Floats
-) -> None:
-    """Copy a state vector into MuJoCo's coordinates; see ``read_vector``."""
-    nq, nv = positions.shape[0], velocities.shape[0]
-    for i in range(nq):
-        positions[i] = vector[places[i]]
-    for i in range(nv):
-        velocities[i] = vector[places[nq + i]]
-    for i in range(activations.shape[0]):
-        activations[i] = vector[places[nq + nv + i]]
-
-
-@numba.njit("void(f8[::1], i8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])", cache=True)
+@numba.njit("void(f8[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1])", cache=True)
 def into_bodies(
-    vector: Floats, turned: Integers, known: Floats, exact: Floats, into: Floats
+    vector: Floats, turned: Integers, own: Integers, known: Floats, exact: Floats, motion: Floats
 ) -> None:
     """Turn angular velocities in the world into those in the frames of the bodies.
 
@@ -114,14 +72,15 @@ def into_bodies(
 
     Args:
         vector: The state to write.
-        turned: See ``_into_world``; shape (n, 2).
+        turned: Where in it the seven numbers of each body are, shape (n, 7).
+        own: Where in the motion they are: quaternion (w, x, y, z) and angular velocity.
         known: Quaternion and angular velocity that were read, nan for a new body, shape (n, 7).
-        exact: MuJoCo's own: quaternion (w, x, y, z) and angular velocity, shape (n, 7).
-        into: MuJoCo's numbers of the new state, shape (n, 7).
+        exact: MuJoCo's own numbers then, shape (n, 7).
+        motion: Written.
     """
     spin = np.empty(3)
     for body in range(turned.shape[0]):
-        q, v = turned[body, 0], turned[body, 1]
+        q, v = turned[body, 0], turned[body, 4]
         turns, spins = False, False
         for axis in range(4):
             turns |= vector[q + axis] != known[body, axis]
@@ -131,10 +90,10 @@ def into_bodies(
         sign = -1.0 if vector[q + 3] < 0.0 else 1.0
         for axis in range(4):
             place = q + (axis + 3) % 4  # w comes first
-            into[body, axis] = sign * vector[place] if turns else exact[body, axis]
+            motion[own[body, axis]] = sign * vector[place] if turns else exact[body, axis]
         _rotate(vector, q, spin, True)
-        for axis in range(3):
-            into[body, 4 + axis] = spin[axis] if turns or spins else exact[body, 4 + axis]
+        for axis in range(4, 7):
+            motion[own[body, axis]] = spin[axis - 4] if turns or spins else exact[body, axis]
 
 
 _CLOSE = 1e-14  # relative; a few roundings, far less than any physics
@@ -143,29 +102,19 @@ _CLOSE = 1e-14  # relative; a few roundings, far less than any physics
 @numba.njit("void(f8[::1], f8[::1], i8[:, ::1])", cache=True)
 def settle(written: Floats, into: Floats, turned: Integers) -> None:
     """Read an angular velocity as it was written, where only roundings differ."""
-    for body in range(turned.shape[0]):
+    for places in turned:
         error, norm = 0.0, 0.0
-        for axis in range(turned[body, 1], turned[body, 1] + 3):
-            error += abs(into[axis] - written[axis])
-            norm += abs(written[axis])
+        for place in places[4:]:
+            error += abs(into[place] - written[place])
+            norm += abs(written[place])
         if error <= _CLOSE * norm:
-            for axis in range(turned[body, 1], turned[body, 1] + 3):
-                into[axis] = written[axis]
+            for place in places[4:]:
+                into[place] = written[place]
 
 
-_FORCES = numba.types.Array(numba.float64, 2, "C", readonly=True)
-
-
-@numba.njit(
-    numba.int64(
-        numba.float64[:, ::1], _FORCES, numba.int64[::1], numba.int64[:, ::1],
-        numba.int64[:, ::1], numba.int32[::1], numba.float64[:, ::1],
-    ),
-    cache=True,
-)  # fmt: skip
 def read_rows(
     states: Floats,
-    forces: Floats,
+    forces: Any,
     places: Integers,
     turned: Integers,
     reported: Integers,
@@ -176,86 +125,49 @@ def read_rows(
 
     Args:
         states: Of all simulations, one to a row.
-        forces: ``qfrc_actuator`` of all, shape (n, nv); not read if nothing is reported.
-        places: See ``read_vector``.
-        turned: See ``read_vector``.
-        reported: See ``read_vector``.
+        forces: ``qfrc_actuator`` of all, shape (n, nv); None if nothing is reported.
+        places: Where in a vector each number of the motion is.
+        turned: See ``into_world``.
+        reported: Places in a vector, and in ``forces``, of what is reported, shape (2, m).
         which: The rows, shape (m,).
         into: The first columns of these rows are written.
 
     Returns:
         A row in which something is not finite; -1 if there is none.
     """
-    wrong = -1
-    for row in which:
-        total = 0.0
-        for i in range(places.shape[0]):
-            value = states[row, 1 + i]
-            into[row, places[i]] = value
-            total += value * 0.0
-        for i in range(reported.shape[0]):
-            into[row, reported[i, 0]] = forces[row, reported[i, 1]]
-        _into_world(into[row], turned)
-        if total != 0.0:
-            wrong = row
-    return wrong
+    rows, motion = which[:, None], states[which, 1 : 1 + len(places)]
+    into[rows, places] = motion
+    if reported.size:
+        into[rows, reported[0]] = forces[rows, reported[1]]
+    if len(turned):
+        into_world(into, which, turned)
+    wrong = which[~np.isfinite(motion).all(axis=1)]
+    return int(wrong[-1]) if len(wrong) else -1
 
 
-@final
-@dataclass(frozen=True)
-class Turned:
-    """The bodies whose orientation and angular velocity are given in the world.
+def turned_bodies(model: Model, mj: mujoco.MjModel) -> tuple[tuple[str, ...], Integers, Integers]:
+    """Find the bodies that are given in the world.
 
-    Attributes:
-        names: Of the bodies.
-        vector: Where in the state vector quaternion and angular velocity begin, shape (n, 2).
-        positions: The numbers of ``qpos`` that are their quaternions, shape (n, 4).
-        velocities: The numbers of ``qvel`` that are their angular velocities, shape (n, 3).
+    Returns:
+        Their names, and the places of their quaternions and angular velocities in the state vector
+        and in the motion, shape (n, 7) each.
     """
-
-    names: tuple[str, ...]
-    vector: Integers
-    positions: Integers
-    velocities: Integers
-
-    @staticmethod
-    def of(model: Model, mj: mujoco.MjModel) -> Turned:
-        """Find them in the tables of a model."""
-        in_world = {
-            number
-            for row in model.states
-            if row.frame == "world" and row.array == "qvel"
-            for number in row.numbers
-        }
-        qpos, qvel, _ = permutation(model)
-        names, starts, own = [], [], []
-        for joint in np.flatnonzero(mj.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)).tolist():
-            q, v = int(mj.jnt_qposadr[joint]) + 3, int(mj.jnt_dofadr[joint]) + 3
-            if v in in_world:
-                names.append(body_names(mj)[int(mj.jnt_bodyid[joint])])
-                starts.append((qpos[q + 1], qvel[v]))
-                own.append((q, v))
-        first = np.array(own, dtype=np.int64).reshape(-1, 2)
-        return Turned(
-            tuple(names),
-            np.array(starts, dtype=np.int64).reshape(-1, 2),
-            first[:, :1] + np.arange(4),
-            first[:, 1:] + np.arange(3),
-        )
-
-    def read(self, vector: Floats) -> Floats:
-        """Copy quaternions (x, y, z, w) and angular velocities of a state, shape (n, 7)."""
-        starts = self.vector
-        turns, spins = starts[:, :1] + np.arange(4), starts[:, 1:] + np.arange(3)
-        return np.hstack([vector[turns], vector[spins]])
-
-    def read_own(self, positions: Floats, velocities: Floats) -> Floats:
-        """Copy MuJoCo's quaternions (w, x, y, z) and angular velocities, shape (n, 7)."""
-        return np.hstack([positions[self.positions], velocities[self.velocities]])
-
-    def write_own(self, numbers: Floats, positions: Floats, velocities: Floats) -> None:
-        """Write MuJoCo's quaternions and angular velocities, shape (n, 7)."""
-        positions[self.positions], velocities[self.velocities] = numbers[:, :4], numbers[:, 4:]
+    spins = {
+        number
+        for row in model.states
+        if row.frame == "world" and row.array == "qvel"
+        for number in row.numbers
+    }
+    qpos, qvel, _ = permutation(model)
+    names, turned, own = [], [], []
+    for joint in np.flatnonzero(mj.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)).tolist():
+        q, v = int(mj.jnt_qposadr[joint]) + 3, int(mj.jnt_dofadr[joint]) + 3
+        if v in spins:
+            names.append(model.body_names[int(mj.jnt_bodyid[joint])])
+            turned.append([*range(qpos[q + 1], qpos[q + 1] + 4), *range(qvel[v], qvel[v] + 3)])
+            own.append([*range(q, q + 4), *range(mj.nq + v, mj.nq + v + 3)])
+    places = np.array([turned, own], dtype=np.int64).reshape(2, -1, 7)
+    return tuple(names), places[0], places[1]
 
 
 LastStep = tuple[tuple[str, ...], Floats, Floats]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from functools import cached_property
-from typing import final
+from typing import NamedTuple, final
 
 import mujoco
 import numpy as np
@@ -29,24 +29,47 @@ _OBJ, _TRN, _WRAP, _EQ, _OFF = (
     mujoco.mjtEq,
     mujoco.mjtDisableBit,
 )
-_AROUND = (int(_WRAP.mjWRAP_SPHERE), int(_WRAP.mjWRAP_CYLINDER))
+_WAYS = {
+    "joints": (int(_WRAP.mjWRAP_JOINT),),
+    "sites": (int(_WRAP.mjWRAP_SITE),),
+    "geoms": (int(_WRAP.mjWRAP_SPHERE), int(_WRAP.mjWRAP_CYLINDER)),
+}
+"""What tendons run through and around."""
 
 
 def disabled(mj: mujoco.MjModel, flag: mujoco.mjtDisableBit) -> bool:
-    """Tell whether a part of physics is switched off by a flag of the model."""
+    """Return whether a part of physics is switched off by a flag of the model."""
     return bool(mj.opt.disableflags & int(flag))
 
 
 def works(mj: mujoco.MjModel, actuator: int) -> bool:
-    """Tell whether an actuator is not switched off."""
+    """Return whether an actuator is not switched off."""
     group = int(mj.actuator_group[actuator])
     off = 0 <= group < 31 and bool(mj.opt.disableactuator & (1 << group))
     return not (off or disabled(mj, _OFF.mjDSBL_ACTUATION))
 
 
+class Link(NamedTuple):
+    """Something that joins trees for good: a tendon, a constraint, an actuator or a flex.
+
+    Attributes:
+        trees: The trees that it reaches.
+        sites: The sites whose places count: where it ends, or on which side it passes.
+        geoms: The shapes that it runs around.
+        bodies: The bodies whose places count.
+    """
+
+    trees: Trees = NONE
+    sites: frozenset[int] = frozenset()
+    geoms: frozenset[int] = frozenset()
+    bodies: frozenset[int] = frozenset()
+
+
 @final
 class Couplings:
     """The trees of a compiled model, and what reaches them.
+
+    A method with the name of a kind of elements returns the effect of an element of it.
 
     Args:
         mj: The model. It is only read.
@@ -62,7 +85,13 @@ class Couplings:
         self.roots = sorted({int(root) for root in mj.body_rootid[self._moves]})
         number = {root: i for i, root in enumerate(self.roots)}
         self._tree = np.array([number.get(int(root), -1) for root in mj.body_rootid])
-        self._coupled = _groups(len(self.roots), self._couplings())
+        self._links: dict[str, list[Link]] = {}
+        for kind, count in (
+            ("tendon", mj.ntendon), ("flex", mj.nflex), ("equality", mj.neq),
+            ("actuator", mj.nactuator),
+        ):  # fmt: skip
+            self._links[kind] = [getattr(self, f"_{kind}")(i) for i in range(count)]
+        self._coupled = _groups(len(self.roots), (link.trees for link in self._all_links()))
         self._known: dict[Trees, Effect] = {}
 
     @property
@@ -71,13 +100,13 @@ class Couplings:
         return frozenset(range(len(self.roots)))
 
     def tree(self, body: int) -> int:
-        """Give the number of the tree of a body; -1 where nothing in it can move."""
+        """Return the number of the tree of a body; -1 where nothing in it can move."""
         return int(self._tree[body])
 
     # --- what elements act on ------------------------------------------------------------------
 
     def always(self, trees: Iterable[int]) -> Effect:
-        """Give the effect of something that acts on some trees in every step."""
+        """Return the effect of something that acts on some trees in every step."""
         key = frozenset(trees)
         if key not in self._known:
             found = frozenset().union(*{self._coupled[tree] for tree in key})
@@ -85,63 +114,71 @@ class Couplings:
         return self._known[key]
 
     def touching(self, trees: Iterable[int]) -> Effect:
-        """Give the effect of something that acts on some trees by contact alone."""
+        """Return the effect of something that acts on some trees by contact alone."""
         return NONE, self._reached(trees)
 
     def body(self, body: int) -> Effect:
-        """Give the effect of the inertia of a body; a static one moves the center of its tree."""
+        """Return the effect of the inertia of a body; a static one moves the center of its tree."""
         tree = self.tree(body)
         return NOTHING if tree < 0 else self.always([tree])
 
+    def joint(self, joint: int) -> Effect:
+        """Return the effect of a joint: that of the inertia of its body."""
+        return self.body(int(self._mj.jnt_bodyid[joint]))
+
     def frame(self, body: int) -> Effect:
-        """Give the effect of the place of a body in its parent, with all that hangs from it."""
+        """Return the effect of the place of a body in its parent, with all that hangs from it."""
+        if self._moves[body]:
+            return self.body(body)
         parents, found = self._mj.body_parentid, {body}
         for other in range(body + 1, self._mj.nbody):
             if int(parents[other]) in found:
                 found.add(other)
-        if self._moves[body]:
-            return self.body(body)
         trees = {self.tree(b) for b in found if self.tree(b) >= 0}
-        always, contact = self.always(trees | self._held(found))
+        held = (link.trees for link in self._all_links() if not found.isdisjoint(link.bodies))
+        always, contact = self.always(trees.union(*held))
         shapes = [g for g in range(self._mj.ngeom) if int(self._mj.geom_bodyid[g]) in found]
         touched = self._reached({tree for g in shapes for tree in self._touched(g)})
         return always, (contact | touched) - always
 
     def contact_of(self, geom: int) -> Effect:
-        """Give the effect of how a shape behaves in contact."""
+        """Return the effect of how a shape behaves in contact."""
         return self.touching(self._touched(geom))
 
-    def shape(self, geom: int) -> Effect:
-        """Give the effect of the size or place of a shape: contact, tendons around it, a medium."""
-        body, trees = int(self._mj.geom_bodyid[geom]), self._wrapped.get(geom, NONE)
+    def geom(self, geom: int) -> Effect:
+        """Return the effect of the size or place of a shape: contact, tendons, a medium."""
+        body = int(self._mj.geom_bodyid[geom])
+        trees = NONE.union(*(link.trees for link in self._all_links() if geom in link.geoms))
         if self._fluid and self._moves[body] and self._mj.geom_fluid[geom, 0] > 0.0:
             trees |= {self.tree(body)}
         always, contact = self.always(trees)
         return always, (contact | self._reached(self._touched(geom))) - always
 
     def site(self, site: int) -> Effect:
-        """Give the effect of the place of a site: on what is attached to it."""
-        return self.always(self._attached.get(site, NONE))
+        """Return the effect of the place of a site: on what is attached to it."""
+        return self.always(
+            NONE.union(*(link.trees for link in self._all_links() if site in link.sites))
+        )
 
     def pair(self, pair: int) -> Effect:
-        """Give the effect of how a declared pair of shapes behaves in contact."""
+        """Return the effect of how a declared pair of shapes behaves in contact."""
         if not self._contacts_on:
             return NOTHING
         geoms = int(self._mj.pair_geom1[pair]), int(self._mj.pair_geom2[pair])
         return self.touching(self._moving([int(self._mj.geom_bodyid[g]) for g in geoms]))
 
     def tendon(self, tendon: int) -> Effect:
-        """Give the effect of a tendon: on what it reaches."""
-        return self.always(self._of_tendon(tendon))
+        """Return the effect of a tendon: on what it reaches."""
+        return self.always(self._links["tendon"][tendon].trees)
 
     def equality(self, equality: int) -> Effect:
-        """Give the effect of an equality constraint: on what it joins."""
+        """Return the effect of an equality constraint: on what it joins."""
         if disabled(self._mj, _OFF.mjDSBL_EQUALITY):
             return NOTHING
-        return self.always(self._of_equality(equality))
+        return self.always(self._links["equality"][equality].trees)
 
     def actuator(self, actuator: int) -> Effect:
-        """Give the effect of an actuator: on what its transmission reaches."""
+        """Return the effect of an actuator: on what its transmission reaches."""
         mj = self._mj
         if not works(mj, actuator):
             return NOTHING
@@ -149,10 +186,14 @@ class Couplings:
             body = int(mj.actuator_trnid[actuator, 0])
             shapes = [g for g in range(mj.ngeom) if int(mj.geom_bodyid[g]) == body]
             return self.touching({tree for g in shapes for tree in self._touched(g)})
-        return self.always(self._of_actuator(actuator))
+        return self.always(self._links["actuator"][actuator].trees)
+
+    def option(self, _: int) -> Effect:
+        """Return the effect of an option of the whole model."""
+        return self.always(self.every)
 
     def highest_condim(self, geom: int) -> int:
-        """Give the largest number of dimensions of the contacts of a shape; 0 if it has none."""
+        """Return the largest number of dimensions of the contacts of a shape; 0 if it has none."""
         others = np.flatnonzero(self.dynamic[geom])
         if not len(others):
             return 0
@@ -210,7 +251,7 @@ class Couplings:
         return found
 
     def _touched(self, geom: int) -> Trees:
-        """Give the trees that feel a shape: its own, or those that touch it if it is static."""
+        """Return the trees that feel a shape: its own, or those that touch it if it is static."""
         others = self._mj.geom_bodyid[np.flatnonzero(self.touches[geom])]
         body = int(self._mj.geom_bodyid[geom])
         meets = self._flexes_at(geom)
@@ -221,25 +262,25 @@ class Couplings:
         return self._moving(others.tolist()) | meets
 
     def _flexes_at(self, geom: int) -> Trees:
-        """Give the trees of the flexes that may touch a shape."""
+        """Return the trees of the flexes that may touch a shape."""
         mj, found = self._mj, NONE
         for flex in range(mj.nflex if self._contacts_on else 0):
             one = mj.geom_contype[geom] & mj.flex_conaffinity[flex]
             if one or mj.geom_conaffinity[geom] & mj.flex_contype[flex]:
-                found |= self._of_flex(flex)
+                found |= self._links["flex"][flex].trees
         return found
 
     @cached_property
     def _islands(self) -> list[Trees]:
         """For each tree, all those that a chain of contacts and couplings may link to it."""
         mj = self._mj
-        links: list[Iterable[int]] = [*self._couplings()]
+        links: list[Iterable[int]] = [link.trees for link in self._all_links()]
         tree = np.where(self._moves, self._tree, -1)[mj.geom_bodyid]
         for first, second in np.argwhere(np.triu(self.touches)):
             if tree[first] >= 0 and tree[second] >= 0 and tree[first] != tree[second]:
                 links.append((int(tree[first]), int(tree[second])))
         for flex in range(mj.nflex if self._contacts_on else 0):
-            own = self._of_flex(flex)
+            own = self._links["flex"][flex].trees
             links += [
                 own | {int(tree[g])}
                 for g in range(mj.ngeom)
@@ -248,7 +289,7 @@ class Couplings:
             for other in range(flex):
                 one = mj.flex_contype[flex] & mj.flex_conaffinity[other]
                 if one or mj.flex_contype[other] & mj.flex_conaffinity[flex]:
-                    links.append(own | self._of_flex(other))
+                    links.append(own | self._links["flex"][other].trees)
         return _groups(len(self.roots), links)
 
     def _reached(self, trees: Iterable[int]) -> Trees:
@@ -256,139 +297,77 @@ class Couplings:
 
     # --- couplings -----------------------------------------------------------------------------
 
-    def _couplings(self) -> Iterator[Trees]:
-        """List the groups of trees that something joins for good."""
-        mj = self._mj
-        yield from (self._of_tendon(i) for i in range(mj.ntendon))
-        yield from (self._of_equality(i) for i in range(mj.neq))
-        yield from (self._of_actuator(i) for i in range(mj.nactuator))
-        yield from (self._of_flex(i) for i in range(mj.nflex))
+    def _all_links(self) -> Iterator[Link]:
+        return (link for links in self._links.values() for link in links)
 
     def _moving(self, bodies: Iterable[int]) -> Trees:
-        """Give the trees of the bodies that can move."""
+        """Return the trees of the bodies that can move."""
         return frozenset(self.tree(body) for body in bodies if self._moves[body])
 
-    def _of_tendon(self, tendon: int) -> Trees:
+    def _link(
+        self,
+        *,
+        joints: Iterable[int] = (),
+        sites: Iterable[int] = (),
+        geoms: Iterable[int] = (),
+        bodies: Iterable[int] = (),
+        beside: Iterable[int] = (),
+    ) -> Link:
+        """Return what joins some elements; the places of sites beside it count, too."""
+        mj, places = self._mj, {*sites, *beside}
+        geoms, bodies = frozenset(geoms), {*bodies, *(int(mj.site_bodyid[s]) for s in sites)}
+        bodies |= {int(mj.geom_bodyid[geom]) for geom in geoms}
+        trees = self._moving({*bodies, *(int(mj.jnt_bodyid[joint]) for joint in joints)})
+        bodies |= {int(mj.site_bodyid[site]) for site in beside}
+        return Link(trees, frozenset(places), geoms, frozenset(bodies))
+
+    def _tendon(self, tendon: int) -> Link:
         mj, first = self._mj, int(self._mj.tendon_adr[tendon])
-        bodies = []
-        for i in range(first, first + int(mj.tendon_num[tendon])):
-            kind, element = int(mj.wrap_type[i]), int(mj.wrap_objid[i])
-            if kind == int(_WRAP.mjWRAP_JOINT):
-                bodies.append(int(mj.jnt_bodyid[element]))
-            elif kind == int(_WRAP.mjWRAP_SITE):
-                bodies.append(int(mj.site_bodyid[element]))
-            elif kind in _AROUND:
-                bodies.append(int(mj.geom_bodyid[element]))
-        return self._moving(bodies)
+        way = range(first, first + int(mj.tendon_num[tendon]))
+        of = {kind: [i for i in way if mj.wrap_type[i] in kinds] for kind, kinds in _WAYS.items()}
+        found = {kind: [int(mj.wrap_objid[i]) for i in places] for kind, places in of.items()}
+        sides = (int(mj.wrap_prm[i]) for i in of["geoms"])
+        return self._link(**found, beside=[side for side in sides if side >= 0])
 
-    def _bodies_of_equality(self, equality: int) -> list[int]:
-        """List the bodies that a connection or weld holds together."""
-        mj = self._mj
-        if mj.eq_type[equality] not in (int(_EQ.mjEQ_CONNECT), int(_EQ.mjEQ_WELD)):
-            return []
-        sites = mj.eq_objtype[equality] == int(_OBJ.mjOBJ_SITE)
-        ends = int(mj.eq_obj1id[equality]), int(mj.eq_obj2id[equality])
-        return [int(mj.site_bodyid[end]) if sites else end for end in ends]
-
-    def _of_equality(self, equality: int) -> Trees:
+    def _equality(self, equality: int) -> Link:
         mj = self._mj
         ends = [int(e) for e in (mj.eq_obj1id[equality], mj.eq_obj2id[equality]) if e >= 0]
         match mujoco.mjtEq(int(mj.eq_type[equality])):
             case _EQ.mjEQ_CONNECT | _EQ.mjEQ_WELD:
-                return self._moving(self._bodies_of_equality(equality))
+                if mj.eq_objtype[equality] == int(_OBJ.mjOBJ_SITE):
+                    return self._link(sites=ends)
+                return self._link(bodies=ends)
             case _EQ.mjEQ_JOINT:
-                return self._moving(int(mj.jnt_bodyid[end]) for end in ends)
+                return self._link(joints=ends)
             case _EQ.mjEQ_TENDON:
-                return frozenset().union(*map(self._of_tendon, ends))
+                return Link(NONE.union(*(self._links["tendon"][end].trees for end in ends)))
             case _:
-                return self._of_flex(ends[0])
+                return self._links["flex"][ends[0]]
 
-    def _of_actuator(self, actuator: int) -> Trees:
-        mj = self._mj
-        first, second = (int(end) for end in mj.actuator_trnid[actuator])
-        match mujoco.mjtTrn(int(mj.actuator_trntype[actuator])):
+    def _actuator(self, actuator: int) -> Link:
+        ends = [int(end) for end in self._mj.actuator_trnid[actuator] if end >= 0]
+        match mujoco.mjtTrn(int(self._mj.actuator_trntype[actuator])):
             case _TRN.mjTRN_JOINT | _TRN.mjTRN_JOINTINPARENT:
-                return self._moving([int(mj.jnt_bodyid[first])])
-            case _TRN.mjTRN_SO3 if second < 0:
-                return self._moving([int(mj.jnt_bodyid[first])])
+                return self._link(joints=ends[:1])
+            case _TRN.mjTRN_SO3 if len(ends) == 1:
+                return self._link(joints=ends)
             case _TRN.mjTRN_TENDON:
-                return self._of_tendon(first)
+                return Link(self._links["tendon"][ends[0]].trees)
             case _TRN.mjTRN_SITE | _TRN.mjTRN_SLIDERCRANK | _TRN.mjTRN_SO3:
-                ends = [end for end in (first, second) if end >= 0]
-                return self._moving(int(mj.site_bodyid[end]) for end in ends)
+                return self._link(sites=ends)
             case _:
-                return NONE  # adhesion acts by contact
+                return Link()  # adhesion acts by contact
 
-    def _of_flex(self, flex: int) -> Trees:
+    def _flex(self, flex: int) -> Link:
         mj = self._mj
         vertex, node = int(mj.flex_vertadr[flex]), int(mj.flex_nodeadr[flex])
         vertices = mj.flex_vertbodyid[vertex : vertex + int(mj.flex_vertnum[flex])]
         nodes = mj.flex_nodebodyid[node : node + int(mj.flex_nodenum[flex])]
-        return self._moving(int(b) for b in (*vertices, *nodes) if b >= 0)
-
-    # --- what is attached to bodies ------------------------------------------------------------
-
-    @cached_property
-    def _attached(self) -> dict[int, Trees]:
-        """Map sites to the trees of the tendons, actuators and constraints that use them."""
-        mj, found = self._mj, dict[int, Trees]()
-        uses = [*self._sites_of_tendons()]
-        for i in range(mj.nactuator):  # the sites that actuators act on or refer to
-            ends = [int(end) for end in mj.actuator_trnid[i] if end >= 0]
-            kind = mujoco.mjtTrn(int(mj.actuator_trntype[i]))
-            joint = kind == _TRN.mjTRN_SO3 and len(ends) == 1
-            if kind in (_TRN.mjTRN_SITE, _TRN.mjTRN_SLIDERCRANK, _TRN.mjTRN_SO3) and not joint:
-                uses += [(end, self._of_actuator(i)) for end in ends]
-        for i in range(mj.neq):
-            if mj.eq_objtype[i] == int(_OBJ.mjOBJ_SITE):
-                ends = [int(mj.eq_obj1id[i]), int(mj.eq_obj2id[i])]
-                uses += [(site, self._of_equality(i)) for site in ends]
-        for site, trees in uses:
-            found[site] = found.get(site, NONE) | trees
-        return found
-
-    def _sites_of_tendons(self) -> Iterator[tuple[int, Trees]]:
-        """List the sites on the ways of tendons, and those that say on which side they pass."""
-        mj = self._mj
-        for tendon in range(mj.ntendon):
-            first, trees = int(mj.tendon_adr[tendon]), self._of_tendon(tendon)
-            for i in range(first, first + int(mj.tendon_num[tendon])):
-                if mj.wrap_type[i] == int(_WRAP.mjWRAP_SITE):
-                    yield int(mj.wrap_objid[i]), trees
-                elif mj.wrap_type[i] in _AROUND and mj.wrap_prm[i] >= 0:
-                    yield int(mj.wrap_prm[i]), trees
-
-    @cached_property
-    def _wrapped(self) -> dict[int, Trees]:
-        """Map shapes to the trees of the tendons that run around them."""
-        mj = self._mj
-        found: dict[int, Trees] = {}
-        for tendon in range(mj.ntendon):
-            first = int(mj.tendon_adr[tendon])
-            for i in range(first, first + int(mj.tendon_num[tendon])):
-                if mj.wrap_type[i] in _AROUND:
-                    geom = int(mj.wrap_objid[i])
-                    found[geom] = found.get(geom, NONE) | self._of_tendon(tendon)
-        return found
-
-    def _held(self, bodies: set[int]) -> Trees:
-        """Give the trees that tendons, actuators and constraints tie to some static bodies."""
-        mj = self._mj
-        found = NONE
-        for i in range(mj.neq):
-            if bodies & set(self._bodies_of_equality(i)):
-                found |= self._of_equality(i)
-        for site, trees in self._attached.items():
-            if int(mj.site_bodyid[site]) in bodies:
-                found |= trees
-        for geom, trees in self._wrapped.items():
-            if int(mj.geom_bodyid[geom]) in bodies:
-                found |= trees
-        return found
+        return Link(self._moving(int(b) for b in (*vertices, *nodes) if b >= 0))
 
 
 def _groups(n: int, links: Iterable[Iterable[int]]) -> list[Trees]:
-    """Merge what is linked, directly or through others; give the group of each."""
+    """Merge what is linked, directly or through others; return the group of each."""
     group = [{i} for i in range(n)]
     for link in links:
         joined = {id(group[i]): group[i] for i in link}

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
 from scm_world._types import Floats, Integers
-from scm_world.backends.renderer.kernels import TIE, Canvas, View, camera_view, draw
-from scm_world.backends.renderer.meshes import (
-    LOWEST,
+from scm_world.backends.renderer.kernels import (
     NO_COLORS,
+    NO_GROUND,
     NO_OWNERS,
     NO_SHADOW,
+    TIE,
+    Canvas,
     Ground,
-    draw_ground,
-    draw_mesh,
-    lamp,
-    shadow_map,
+    View,
+    camera_view,
+    draw,
+    parallel_view,
 )
+from scm_world.backends.renderer.meshes import draw_mesh
 from scm_world.geometry import rotation_matrix
 from scm_world.models.camera import Camera
 from scm_world.models.scene import GoalRegion, Light
@@ -40,19 +43,40 @@ NOTHING = -1
 
 SKY = (178, 199, 222)  # red, green, blue
 SHADOW_TEXELS = 64, 256  # least and most along an edge; between them as many as a picture has rows
+SHADOW_BLUR = 2  # passes of a box filter three texels wide
 AROUND = 2.0  # how much larger the square of a shadow is than that of what moves
+LOWEST = 1e-3  # [1] the height of a light below which nothing throws a shadow on the floor
 LYING = 0.7  # [1] the height of the normal of a plane above which it is a floor
 MOST_KEPT = 16  # pictures of what does not move
+
+Shadow = tuple[Floats, Floats]
+"""See ``Ground.shadow`` and ``Ground.square``."""
+
+
+@final
+@dataclass(frozen=True)
+class Still:
+    """Shapes that do not move, which are equal to others that look alike.
+
+    Attributes:
+        look: All of their numbers.
+        shapes: Kept: their arrays must not change.
+        rows: Which of them, shape (k,).
+    """
+
+    look: tuple[Any, ...]
+    shapes: Shapes = field(compare=False)
+    rows: Integers = field(compare=False)
 
 
 class Parts(NamedTuple):
     """Shapes, and in which order they are drawn.
 
     Attributes:
-        shapes: What there is.
-        still: What does not move.
-        moving: Rows of what is drawn anew in each picture, shape (k,).
-        clear: Rows of what one can look through, shape (m,).
+        shapes: All of them.
+        still: Those that do not move.
+        moving: Rows of those that are drawn anew in each picture, shape (k,).
+        clear: Rows of those that are transparent, shape (m,).
         shadows: Whether there are any.
     """
 
@@ -63,33 +87,11 @@ class Parts(NamedTuple):
     shadows: bool
 
 
-@final
-class Still:
-    """Rows of shapes that do not move, which are equal to others that look alike.
-
-    Args:
-        shapes: Kept: their arrays must not change.
-        rows: Which of them, shape (k,).
-    """
-
-    def __init__(self, shapes: Shapes, rows: Integers) -> None:
-        self.shapes, self.rows = shapes, rows
-        meshes = [(i, id(mesh)) for i, mesh in shapes.meshes.items()]
-        tiles = shapes.tiles.items()
-        self._look = *(column[rows].tobytes() for column in shapes.table), *meshes, *tiles
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Still) and self._look == other._look
-
-    def __hash__(self) -> int:
-        return hash(self._look)
-
-
 def parted(shapes: Shapes, *, shadows: bool) -> Parts:
-    """Decide how shapes are drawn: first what does not move, then all else, then what is clear.
+    """Decide how shapes are drawn: first those that do not move, then the others, then clear ones.
 
     Args:
-        shapes: What is drawn. Its arrays must not change afterwards.
+        shapes: Their arrays must not change afterwards.
         shadows: Whether there are any. They fall on floors: on planes that lie.
     """
     table = shapes.table
@@ -97,9 +99,11 @@ def parted(shapes: Shapes, *, shadows: bool) -> Parts:
     solid, moves = opacity >= 1.0, shapes.moves
     if shadows:
         moves = moves | (table.kinds == PLANE) & (table.rotations[:, 2, 2] > LYING)
-    still = Still(shapes, np.flatnonzero(solid & ~moves))
+    rows = np.flatnonzero(solid & ~moves)
+    meshes = [(i, id(mesh)) for i, mesh in shapes.meshes.items()]
+    look = *(column[rows].tobytes() for column in table), *meshes, *shapes.tiles.items()
     moving, clear = np.flatnonzero(solid & moves), np.flatnonzero(~solid & (opacity > 0.0))
-    return Parts(shapes, still, moving, clear, shadows)
+    return Parts(shapes, Still(look, shapes, rows), moving, clear, shadows)
 
 
 def draw_parts(
@@ -120,17 +124,16 @@ def draw_parts(
         canvas = Canvas(depth.copy(), owners.copy(), rgb.copy())
     else:
         canvas = _backdrop(still, camera, light, samples, colors=colors)
-    view = camera_view(camera, samples)
-    grounds = {}
-    for row in moving[shapes.table.kinds[moving] == PLANE].tolist():
-        shadow = _shadow(parts, row, light, camera.height) if shadows and colors else _NO_SHADOW
-        grounds[row] = _ground(shapes, row, *shadow)
-    _draw(shapes, moving, grounds, view, light, canvas)
+    view, towards, thrown = camera_view(camera, samples), lamp(light), dict[int, Shadow]()
+    if shadows and colors:
+        planes = moving[shapes.table.kinds[moving] == PLANE]
+        thrown = {row: _shadow(parts, row, towards, camera.height) for row in planes.tolist()}
+    _draw(shapes, moving, thrown, view, towards, canvas)
     if colors and len(clear):
         away = np.linalg.norm(shapes.table.positions[clear] - camera.eye, axis=1)
         away[shapes.table.kinds[clear] == PLANE] = np.inf  # behind all else
         for row in clear[np.argsort(-away, kind="stable")].tolist():
-            _blend(shapes, row, view, light, canvas)
+            _blend(shapes, row, view, towards, canvas)
     return canvas
 
 
@@ -149,45 +152,39 @@ def _backdrop(still: Still, camera: Camera, light: Light, samples: int, *, color
     if colors:
         rgb = np.empty((3, height, width), dtype=np.uint8)
         rgb[:] = np.reshape(SKY, (3, 1, 1))
-    canvas, shapes, rows = Canvas(depth, owners, rgb), still.shapes, still.rows
-    planes = rows[shapes.table.kinds[rows] == PLANE].tolist()
-    grounds = {row: _ground(shapes, row, *_NO_SHADOW) for row in planes}
-    _draw(shapes, rows, grounds, camera_view(camera, samples), light, canvas)
+    canvas = Canvas(depth, owners, rgb)
+    _draw(still.shapes, still.rows, {}, camera_view(camera, samples), lamp(light), canvas)
     return canvas
 
 
 def _draw(
     shapes: Shapes,
     rows: Integers,
-    grounds: Mapping[int, Ground],
+    shadows: Mapping[int, Shadow],
     view: View,
-    light: Light,
+    towards: Floats,
     canvas: Canvas,
 ) -> None:
     """Draw solid shapes: those that are neither planes nor meshes, then those."""
-    table, towards = shapes.table, lamp(light)
-    draw(table, rows[table.kinds[rows] < PLANE], view, towards, 1.0, canvas)
-    for row, ground in grounds.items():
-        draw_ground(ground, table, row, view, towards, 1.0, canvas)
-    if shapes.meshes:
-        for row in rows[table.kinds[rows] == MESH].tolist():
-            draw_mesh(shapes.meshes[row], table, row, view, towards, 1.0, canvas)
+    table, kinds = shapes.table, shapes.table.kinds[rows]
+    draw(table, rows[kinds < PLANE], NO_GROUND, view, towards, 1.0, canvas)
+    for row in rows[kinds == PLANE]:
+        ground = _ground(shapes, row, shadows.get(int(row), NO_SHADOW))
+        draw(table, np.array([row]), ground, view, towards, 1.0, canvas)
+    for row in rows[kinds == MESH].tolist():
+        draw_mesh(shapes.meshes[row], table, row, view, towards, 1.0, canvas)
 
 
-def _blend(shapes: Shapes, row: int, view: View, light: Light, canvas: Canvas) -> None:
+def _blend(shapes: Shapes, row: int, view: View, towards: Floats, canvas: Canvas) -> None:
     """Draw one clear shape over what is there."""
-    table, towards = shapes.table, lamp(light)
-    alpha = float(table.colors[row, 3])
-    if table.kinds[row] == PLANE:
-        ground = _ground(shapes, row, *_NO_SHADOW)
-        draw_ground(ground, table, row, view, towards, alpha, canvas)
-    elif table.kinds[row] == MESH:
+    table, alpha = shapes.table, float(shapes.table.colors[row, 3])
+    if table.kinds[row] == MESH:
         mesh, nearest = shapes.meshes[row], canvas.depth - np.float32(TIE)
         layer = Canvas(nearest, NO_OWNERS, NO_COLORS)
         draw_mesh(mesh, table, row, view, towards, 1.0, layer)
         draw_mesh(mesh, table, row, view, towards, alpha, canvas._replace(depth=nearest))
     else:
-        draw(table, np.array([row]), view, towards, alpha, canvas)
+        draw(table, np.array([row]), _ground(shapes, row), view, towards, alpha, canvas)
 
 
 def goal_shapes(goals: Iterable[GoalRegion]) -> Shapes:
@@ -205,30 +202,41 @@ def goal_shapes(goals: Iterable[GoalRegion]) -> Shapes:
     return Shapes.of(shapes)
 
 
-_NO_SHADOW = NO_SHADOW, np.zeros(3)
-
-
-def _ground(shapes: Shapes, row: int, shadow: Floats, square: Floats) -> Ground:
+def _ground(shapes: Shapes, row: int, shadow: Shadow = NO_SHADOW) -> Ground:
     """Prepare what lies on a plane."""
     tiles = shapes.tiles.get(row)
     if tiles is None:
-        return Ground(np.ones(2), shapes.table.colors[row, :3].copy(), shadow, square)
-    return Ground(np.array(tiles.size), np.array(tiles.color), shadow, square)
+        return Ground(np.ones(2), shapes.table.colors[row, :3].copy(), *shadow)
+    return Ground(np.array(tiles.size), np.array(tiles.color), *shadow)
 
 
-def _shadow(parts: Parts, plane: int, light: Light, rows: int) -> tuple[Floats, Floats]:
-    """Make the shadow map of a plane, and the middle and half the edge of its square.
+@lru_cache(maxsize=32)
+def lamp(light: Light) -> Floats:
+    """Return the unit vector towards the light, and the ambient brightness, shape (4,).
+
+    Raises:
+        ValueError: The light comes from nowhere.
+    """
+    length = math.hypot(*light.direction)
+    if not (length > 0.0 and math.isfinite(length)):
+        raise ValueError(f"light: the direction must have a length, got {light.direction}")
+    return np.array([*(x / length for x in light.direction), light.ambient])
+
+
+def _shadow(parts: Parts, plane: int, light: Floats, rows: int) -> Shadow:
+    """Look from a plane towards the light, and soften what stands in the way.
 
     Args:
         parts: With all that can throw a shadow.
-        plane: Its row.
-        light: Of the picture.
+        plane: Row of the plane.
+        light: Unit vector towards the light, and the ambient brightness, shape (4,).
         rows: Of the picture.
+
+    Returns:
+        See ``Ground``; nothing where the light comes from the side or from below.
     """
     table = parts.shapes.table
-    turn, towards = table.rotations[plane], lamp(light)[:3] @ table.rotations[plane]
-    if towards[2] < LOWEST:
-        return _NO_SHADOW
+    turn, towards = table.rotations[plane], light[:3] @ table.rotations[plane]
     others = np.concatenate([parts.moving, parts.still.rows])
     others = np.sort(others[table.kinds[others] != PLANE])
     local = table._replace(
@@ -237,8 +245,8 @@ def _shadow(parts: Parts, plane: int, light: Light, rows: int) -> tuple[Floats, 
     )
     corners = parts.shapes._replace(table=local).corners(others)
     high = corners[:, :, 2].max(axis=1) > 0.0
-    if not high.any():
-        return _NO_SHADOW
+    if towards[2] < LOWEST or not high.any():
+        return NO_SHADOW
     above, corners = others[high], corners[high]
     moves = parts.shapes.moves[above]
     points = (corners[moves] if moves.any() else corners).reshape(-1, 3)
@@ -246,10 +254,16 @@ def _shadow(parts: Parts, plane: int, light: Light, rows: int) -> tuple[Floats, 
     least, most = feet.min(axis=0), feet.max(axis=0)
     middle, half = (least + most) / 2.0, max(AROUND * float((most - least).max()) / 2.0, 1e-6)
     local = local._replace(positions=local.positions - [*middle, 0.0])
-    there = replace(light, direction=tuple(towards.tolist()))
-    texels = min(max(rows, SHADOW_TEXELS[0]), SHADOW_TEXELS[1])
-    shadow = shadow_map(local, parts.shapes.meshes, above, there, half=half, n=texels)
-    return shadow, np.array([*middle, half])
+    n = min(max(rows, SHADOW_TEXELS[0]), SHADOW_TEXELS[1])
+    canvas = Canvas(np.full((n, n), np.inf, dtype=np.float32), NO_OWNERS, NO_COLORS)
+    view = parallel_view(towards / towards[2], half, n)
+    _draw(parts.shapes._replace(table=local), above, {}, view, light, canvas)
+    shadow = np.isfinite(canvas.depth).astype(np.uint8)
+    for _ in range(2 * SHADOW_BLUR):  # along the first axis, and then along the second one
+        sums = 3 * shadow
+        sums[1:-1] = shadow[:-2] + shadow[1:-1] + shadow[2:]
+        shadow = sums.T
+    return shadow / 9.0**SHADOW_BLUR, np.array([*middle, half])
 
 
 def corners_of_what_moves(shapes: Shapes) -> Floats:

@@ -12,9 +12,8 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Values
-from scm_world.geometry.filling import overlap_fraction_kernel
+from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction_kernel
 from scm_world.geometry.hulls import Hull
-from scm_world.geometry.overlap import aabb_overlap_fraction
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import shapes

@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import Floats
-from scm_world.geometry.overlap import WORKSPACE, overlap_kernel
-from scm_world.geometry.rotations import angle_between_kernel
+from scm_world.geometry.filling import overlap_kernel
+from scm_world.geometry.rotations import angle_between
 
 CARRIED = 0.15  # [m] how high a block should be lifted over a wall
 PLACED = 0.02  # [m] how near the first block of a tower must be to its goal
@@ -46,7 +46,7 @@ def block_progress(block: Floats, block_before: Floats, goal: Floats) -> float:
 @njit(cache=True)
 def turn_progress(orientation: Floats, orientation_before: Floats, goal: Floats) -> float:
     """Compute by how much the angle between block and goal shrank [rad]."""
-    return angle_between_kernel(orientation_before, goal) - angle_between_kernel(orientation, goal)
+    return angle_between(orientation_before, goal) - angle_between(orientation, goal)
 
 
 @njit(cache=True)
@@ -59,10 +59,7 @@ def filled(
     goal_orientation: Floats,
 ) -> float:
     """Compute the fraction of one goal that one block fills, in [0, 1]."""
-    work = np.empty(WORKSPACE)
-    shared = overlap_kernel(
-        size, position, orientation, goal_size, goal_position, goal_orientation, work
-    )
+    shared = overlap_kernel(size, position, orientation, goal_size, goal_position, goal_orientation)
     fraction: float = shared / (goal_size[0] * goal_size[1] * goal_size[2])
     return min(1.0, fraction)
 

@@ -24,11 +24,12 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.base import Capabilities, EngineSnapshot, InMemory
+from scm_world.backends import Capabilities, EngineSnapshot, register
+from scm_world.backends.base import InMemory
 from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
 from scm_world.geometry.rotations import quaternion_product, to_rotation_vector
 from scm_world.models.scene import Difference, Parameters, Scene
-from scm_world.tasks.trifinger import fake, hardware
+from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping.bodies import turn_about_z
 from scm_world.tasks.trifinger.kinematics import forward, inverse
 from scm_world.tasks.trifinger.state import PhysicalState
@@ -49,6 +50,7 @@ of bounds here): an intervention that sets them, on any backend, tells how much 
 
 
 @final
+@register
 class TriFingerPlatform(InMemory):
     """One cube and the TriFinger Pro, for playing policies.
 
@@ -62,17 +64,13 @@ class TriFingerPlatform(InMemory):
     """
 
     name: ClassVar[str] = "trifinger_platform"
-    capabilities: ClassVar[Capabilities] = Capabilities(snapshot="replay")
+    capabilities: ClassVar[Capabilities] = Capabilities()
     _platform: Any
 
     def __init__(self) -> None:
         if find_spec("trifinger_simulation") is None:
             raise MissingEngine(self.name, "pip install 'scm-world[trifinger]'")
-
-    @property
-    def version(self) -> str:
-        """Version of the platform's simulation."""
-        return version("trifinger_simulation")
+        self.version = version("trifinger_simulation")
 
     def build(self, scene: Scene) -> None:
         """Keep the scene; the platform is started with the first step.
@@ -97,14 +95,10 @@ class TriFingerPlatform(InMemory):
         """
         if difference.structure is not None:
             raise UnknownOption("scene of the TriFinger platform", "another one", ("one cube",))
-        self._fits(self._structure, difference.parameters)
+        self._fits(self.structure, difference.parameters)
         super().apply(difference)
         if difference:
             self._begin()
-
-    def inertia(self, body: str) -> Floats:
-        """Compute the principal moments of inertia of a solid cube, shape (3,) [kg m²]."""
-        return fake.inertia(self._structure, self._parameters, body)
 
     def step(self, command: Floats, substeps: int) -> None:
         """Let the fingertips go where a command would bring those of this package's robot.
@@ -112,7 +106,7 @@ class TriFingerPlatform(InMemory):
         Raises:
             EngineFailure: Torques are commanded, or a number is not finite.
         """
-        if self._structure.torques:
+        if self.structure.torques:
             advice = "use action_mode='joint_positions', or relative to them"
             raise EngineFailure(f"the platform takes joint positions only; {advice}", self.name)
         if self._platform is None:
@@ -126,13 +120,13 @@ class TriFingerPlatform(InMemory):
 
     def snapshot(self) -> EngineSnapshot:
         """Save where the platform began, and all commands since."""
-        scene = Scene(self._structure, dict(self._parameters), self._state.copy())
-        return self.sealed((scene, self._first.copy(), list(self._played)))
+        scene = Scene(self.structure, dict(self._parameters), self._state.copy())
+        return EngineSnapshot.of(self, (scene, self._first.copy(), list(self._played)))
 
     def restore(self, snapshot: EngineSnapshot) -> None:
         """Go back to a snapshot; the commands before it are repeated with the next step."""
-        scene, first, played = self.opened(snapshot)
-        super().restore(self.sealed(scene))
+        scene, first, played = snapshot.opened(self)
+        super().restore(EngineSnapshot.of(self, scene))
         self._begin()
         self._first, self._played[:] = first.copy(), played
 
@@ -185,7 +179,7 @@ class TriFingerPlatform(InMemory):
             for body, link in bodies:
                 pybullet.changeDynamics(body, link, physicsClientId=client, **more)
 
-        block, table = self._structure.blocks[0], robot._table_id
+        block, table = self.structure.blocks[0], robot._table_id
         write([(self._platform.cube._object_id, -1)], block, mass=float(found[block, "mass"]))
         write([(getattr(table, "_object_id", table), -1)], "floor")
         write([(robot._containment_id, -1)], "stage")
@@ -201,7 +195,7 @@ class TriFingerPlatform(InMemory):
         """Hold a command, and read what the platform observes then."""
         platform = self._platform
         wanted = platform.Action(position=self._posed(command, self._joints))
-        for _ in range(round(substeps * self._structure.timestep / platform.get_time_step())):
+        for _ in range(round(substeps * self.structure.timestep / platform.get_time_step())):
             at = platform.append_desired_action(wanted)
         robot, seen = platform.get_robot_observation(at), platform.get_camera_observation(at)
         self._joints = np.array(robot.position)

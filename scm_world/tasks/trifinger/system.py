@@ -28,12 +28,12 @@ import mujoco
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.mujoco.fields import Field, Slots
+from scm_world.backends.mujoco.fields import numbers
 from scm_world.backends.mujoco.reading import read_model
-from scm_world.backends.mujoco.slots import Slot, first, place, turn
+from scm_world.backends.mujoco.slots import Finder, Slot, first, place, turn
 from scm_world.backends.mujoco.trees import NOTHING, Couplings, Effect
 from scm_world.geometry.hulls import Hull
-from scm_world.models.model import Model
+from scm_world.models.model import Model, Parameter
 from scm_world.models.scene import State
 from scm_world.tasks.trifinger import fake, hardware
 from scm_world.tasks.trifinger.cameras import VIEWS
@@ -206,7 +206,7 @@ def _read(parts: Parts) -> Model:
         keyframe=START,
         states=states,
         controls=[f"{joint}_servo" for joint in _JOINT_NAMES],
-        bindings=lambda mj, trees: (field for field, _ in _rows(mj, trees, parts)),
+        bindings=lambda mj, data, trees: (one for one, _ in _rows(mj, data, trees, parts)),
         frame="world",
         part_of={tip_name(finger): link_name(finger, 3) for finger in FINGERS},
     )
@@ -268,8 +268,8 @@ def _compiled(parts: Parts) -> mujoco.MjModel:
     if parts.published:
         restore(model)
     scratch = mujoco.MjData(model)
-    for field, default in _rows(model, Couplings(model), parts):
-        slot = field.slot(model, scratch)  # type: ignore[misc] # every binding has one
+    for bound, default in _rows(model, scratch, Couplings(model), parts):
+        slot = bound.slot(model, scratch)  # type: ignore[misc] # every binding has one
         slot.write(np.asarray(default, dtype=np.float64))
     couple(model)
     mujoco.mj_setConst(model, scratch)
@@ -448,36 +448,30 @@ GAINS: tuple[tuple[Any, ...], ...] = (
 )
 """Name, default and unit; then array, first actuator, column and sign of each place."""
 
-Row = tuple[Field, object]
+Row = tuple[Parameter, object]
 """A parameter, and its default."""
 
 
-def _rows(mj: mujoco.MjModel, trees: Couplings, parts: Parts) -> Iterator[Row]:
+def _rows(mj: mujoco.MjModel, data: mujoco.MjData, trees: Couplings, parts: Parts) -> Iterator[Row]:
     """List the parameters: what each is, where it is written, on which trees it acts, default."""
     fingers = [trees.tree(mj.body(link_name(finger, 1)).id) for finger in FINGERS]
     everything, touching = trees.always(trees.every), trees.touching(trees.every)
     touched, robot = trees.touching(fingers), trees.always(fingers)
 
     def row(
-        name: str, default: object, unit: str, slot: Slots, effect: Effect, doc: str, **rest: Any
+        name: str, default: object, unit: str, slot: Finder, effect: Effect, doc: str, **rest: Any
     ) -> Row:
-        element, _, attribute = name.rpartition(".")
-        field = Field("binding", element, attribute, unit, doc, slot, lambda: effect, name=name)
-        return replace(field, **rest), default
+        now, (always, contact) = slot(mj, data).read(), effect
+        bounds = numbers(now), -math.inf, math.inf
+        made = Parameter(name, unit, now.shape, *bounds, doc, always, contact, slot=slot, **rest)
+        return made, default
 
     def color(element: str, default: object, shapes: Sequence[str]) -> Row:
-        def slot(mj: mujoco.MjModel, _: Any) -> Slot:  # MuJoCo keeps 32 bits of each
-            return place(*(mj.geom_rgba[mj.geom(name).id, :3] for name in shapes))
-
-        doc = "Red, green and blue."
+        slot, doc = partial(_color, shapes=tuple(shapes)), "Red, green and blue."
         return row(f"{element}.color", default, "1", slot, NOTHING, doc, visual=True)
 
     def friction(element: str, default: float, shapes: Sequence[str], effect: Effect) -> Row:
-        def slot(mj: mujoco.MjModel, _: Any) -> Slot:
-            views = (mj.geom_friction[mj.geom(name).id, 0, ...] for name in shapes)
-            return place(*views, follow_up=couple)
-
-        doc = "Factor of all its contacts."
+        slot, doc = partial(_friction, shapes=tuple(shapes)), "Factor of all its contacts."
         return row(f"{element}.friction", default, "1", slot, effect, doc)
 
     down, free = (0.0, 0.0, -9.81), "Acceleration of free fall."
@@ -529,9 +523,10 @@ def _rows(mj: mujoco.MjModel, trees: Couplings, parts: Parts) -> Iterator[Row]:
         effect = trees.contact_of(mj.geom(name).id)
         center = (0.02 * index - 0.1, 0.15, 0.005)
         for what, default in (("size", (0.01,) * 3), ("position", center), ("orientation", AHEAD)):
-            unit, nature = ("m", "real") if default is not AHEAD else ("1", "rotation")
+            unit = "m" if default is not AHEAD else "1"
+            nature: Any = "real" if default is not AHEAD else "rotation"
             slot = partial(_obstacle, name=name, quantity=what)
-            yield row(f"{name}.{what}", default, unit, slot, effect, "Of the box.", nature=nature)
+            yield row(f"{name}.{what}", default, unit, slot, effect, "Of the box.", kind=nature)
         yield friction(name, 0.5, [name], effect)
         yield color(name, (0.0,) * 3, [name])
 
@@ -584,6 +579,17 @@ def _gains(mj: mujoco.MjModel, _: Any, *, places: Sequence[tuple[str, int, int, 
 
     view, sign = views[0]
     return Slot(write, lambda: sign * view[: N_JOINTS // len(FINGERS)])
+
+
+def _friction(mj: mujoco.MjModel, _: Any, *, shapes: tuple[str, ...]) -> Slot:
+    """Find the factor of one body. Contact pairs get products; the factors rest in the shapes."""
+    views = (mj.geom_friction[mj.geom(name).id, 0, ...] for name in shapes)
+    return place(*views, follow_up=couple)
+
+
+def _color(mj: mujoco.MjModel, _: Any, *, shapes: tuple[str, ...]) -> Slot:
+    """Find red, green, blue, shape (3,); MuJoCo keeps 32 bits of each."""
+    return place(*(mj.geom_rgba[mj.geom(name).id, :3] for name in shapes))
 
 
 def _scaled_mass(mj: mujoco.MjModel, _: Any, *, body: str, per_mass: tuple[float, ...]) -> Slot:

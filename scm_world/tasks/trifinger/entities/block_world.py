@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, final
 from scm_world._types import Values
 from scm_world.models import GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.camera import Camera
-from scm_world.models.scene import Overlap, State
+from scm_world.models.scene import Overlap
 from scm_world.tasks.base import Timing
 from scm_world.tasks.composition import Composition, Entity
-from scm_world.tasks.model import ModelComposition, causes_of
+from scm_world.tasks.model import causes_of
 from scm_world.tasks.trifinger.conventions import TriFingerConventions
 from scm_world.tasks.trifinger.entities.robot import RobotCommands
 from scm_world.tasks.trifinger.entities.stage import cameras_of, light_of
@@ -58,14 +58,15 @@ class BlockWorld(Composition):
         self.obstacles = tuple(e.name for e in entities if e.kind == "obstacle")
         blocks = (e for e in entities if e.kind == "block")
         self.hulls = tuple((e.name, e.hull) for e in blocks if e.hull is not None)
-        self.commands = RobotCommands(timing.action_mode)
+        self.bodies, self.hides_goals = (*self.blocks, *self.obstacles), bool(self.obstacles)
         self._systems: dict[str, TriFinger] = {}
+        super().__init__(self._system(PRESET_NAMES[0]), RobotCommands(timing.action_mode))
 
     def structure(self, values: Values) -> TriFinger:
         """Return the model of the bodies, with the settings that a preset stands for."""
         return self._system(PRESET_NAMES[int(values[PRESET])])
 
-    def _system(self, name: str = PRESET_NAMES[0]) -> TriFinger:
+    def _system(self, name: str) -> TriFinger:
         if name not in self._systems:
             from scm_world.tasks.trifinger.system import trifinger  # it loads an engine
 
@@ -106,7 +107,7 @@ class BlockWorld(Composition):
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable; edges into states follow from the kinematic trees."""
-        system = self._system()
+        system = self.system
         trees = {row.name: row.trees for row in system.states}
         every = frozenset(range(len(system.trees)))
         rows = {row.key: row for row in system.parameters}
@@ -138,14 +139,6 @@ class BlockWorld(Composition):
         """Return which variable sets which physical parameter."""
         return {k: v for entity in self.entities for k, v in entity.parameters.items()}
 
-    def slices(self) -> Mapping[str, slice]:
-        """Return the place of each state in the state vector."""
-        return self._system().layout.slices
-
-    def empty_state(self) -> State:
-        """Return a state to read into."""
-        return self._system().empty_state()
-
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         """List goals that lie in an obstacle."""
         return buried_goals(scene, names)
@@ -153,10 +146,6 @@ class BlockWorld(Composition):
     def movers(self) -> tuple[str, ...]:
         """Name the fingers, then the blocks. The bases of fingers are fixed."""
         return (*(f"robot_finger_{finger}" for finger in FINGERS), *self.blocks)
-
-    def touched(self) -> Mapping[str, tuple[str, ...]]:
-        """Map links and blocks to the states of their trees; what is fixed has none."""
-        return ModelComposition(self._system()).touched()
 
     def shaped(self) -> Mapping[str, str]:
         """Map parameters to the body that they are a property of."""
