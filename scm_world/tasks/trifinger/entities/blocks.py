@@ -182,14 +182,7 @@ class ToolBlock(Entity):
         doc = "Angular velocity in the world frame."
         spin = moving("angular_velocity", numbers.ANGULAR_VELOCITIES, ZERO, doc)
         own = (kind, size, mass, friction, paint, *coordinates(name, spaces=spaces))
-        set_by = ("mass", "friction", "color") if hull else ("mass", "size", "friction", "color")
-        super().__init__(
-            name,
-            (*own, place, turn, slide, spin),
-            {f"{name}.{quantity}": (name, quantity) for quantity in set_by},
-            kind="block",
-            hull=hull,
-        )
+        super().__init__(name, (*own, place, turn, slide, spin), kind="block", hull=hull)
 
 
 def block_size(

@@ -57,8 +57,6 @@ CONTROLLER = (
     ),
 )
 """The joint controller."""
-SERVO = ("position_gains", "velocity_gains")
-"""Those of it that have no effect where torques are commanded."""
 
 MOVES = (
     (numbers.JOINTS, "Angles of the joints of {}."),
@@ -121,9 +119,6 @@ class RobotCommands(Commands):
         return action
 
 
-OF_LINKS = ("mass", "color")
-
-
 def robot(
     action_mode: str,
     start: tuple[float, ...] = hardware.REST,
@@ -137,11 +132,7 @@ def robot(
         resolution: One of ``RESOLUTIONS``. What is finer than ``"vector"`` is put together again
             in bundles under the names of the whole robot.
     """
-    unit, range_ = ACTIONS[action_mode]
-    by_tips = action_mode == "end_effector_positions"
-    groups = joints_of(resolution)
-    # A tip is a point: its three coordinates are those of no single joint.
-    acting = joints_of("finger") if by_tips and resolution == "joint" else groups
+    (unit, range_), groups = ACTIONS[action_mode], joints_of(resolution)
     actions = [
         Action(
             name=joints.action,
@@ -150,7 +141,7 @@ def robot(
             bounds=joints.cut(range_),
             doc=f"What the policy commands of {joints.of}: {action_mode}.",
         )
-        for joints in acting
+        for joints in _acting(action_mode, resolution)
     ]
     states = [_moving(quantity, joints, start) for quantity in range(3) for joints in groups]
     variables: list[Variable] = list(actions)
@@ -176,28 +167,29 @@ def robot(
             parts = states[index * len(groups) : (index + 1) * len(groups)]
             spaces = {"bounds": kind.bounds, "a": kind.a, "b": kind.b}
             variables.append(bundle(name, parts, doc=doc.format("all fingers"), **spaces))
-    acted_on = {
+    return Entity("robot", (*variables, *states))
+
+
+def acted_on(action_mode: str, resolution: str) -> dict[str, tuple[str, ...]]:
+    """Map what acts through commands to the states of the joints that it acts on in every step."""
+    groups, by_tips = joints_of(resolution), action_mode == "end_effector_positions"
+    found = {
         joints.action: tuple(
             name
             for other in groups
             if not set(other.fingers).isdisjoint(joints.fingers)
             for name in other.names
         )
-        for joints in acting
+        for joints in _acting(action_mode, resolution)
     }
-    always = ("robot_height", ACTUATOR_NOISE) if by_tips else (ACTUATOR_NOISE,)
-    acted_on |= dict.fromkeys(always, tuple(name for joints in groups for name in joints.names))
-    torques = action_mode == "joint_torques"
-    parameters = {
-        "robot_height": ("robot", "height"),
-        "finger_friction": ("robot", "friction"),
-        "joint_damping": ("robot", "joint_damping"),
-        **{
-            v.name: ("controller", v.name) for v in CONTROLLER if not torques or v.name not in SERVO
-        },
-        **{f"{link}.{what}": (link, what) for link in hardware.LINK_NAMES for what in OF_LINKS},
-    }
-    return Entity("robot", (*variables, *states), parameters, acted_on)
+    others = ("robot_height", ACTUATOR_NOISE) if by_tips else (ACTUATOR_NOISE,)
+    return found | dict.fromkeys(others, tuple(name for joints in groups for name in joints.names))
+
+
+def _acting(action_mode: str, resolution: str) -> tuple[JointGroup, ...]:
+    """List the joints of each action. A tip is a point: its coordinates are of no single joint."""
+    whole = action_mode == "end_effector_positions" and resolution == "joint"
+    return joints_of("finger" if whole else resolution)
 
 
 def _moving(quantity: int, joints: JointGroup, start: tuple[float, ...]) -> Measured:
