@@ -52,16 +52,6 @@ def start(size: Floats, orientation: Floats, *, index: float) -> Floats:
     return np.array([STEP * x, STEP * y, lowest_point(size, orientation)])
 
 
-def piece(airborne: bool, **which: float) -> Piece:
-    """Describe where a block, and its place in the pile, come from."""
-    return Piece(
-        size=((SIZE,), Function(cube)),
-        place=((PILE,), Function(piles.part_of, constants=which)),
-        turn=((PILE,), Function(piles.turn_of, constants=which)),
-        start=((), Function(start, constants=which)),
-    )
-
-
 @final
 class General(Building):
     """Blocks on the floor, and the places where such blocks came to lie that were dropped.
@@ -85,7 +75,12 @@ class General(Building):
     decided_by = (COUNT,)
     goal_causes = (COUNT, MASS, SIZE, PLACES, TURNS)
     interleaved = False
-    piece = staticmethod(piece)
+    piece = Piece(
+        size=(cube, SIZE),
+        place=(piles.part_of, PILE),
+        start=(start,),
+        turn=(piles.turn_of, PILE),
+    )
 
     def __init__(
         self,

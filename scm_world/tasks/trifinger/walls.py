@@ -35,16 +35,6 @@ RANDOM = 1  # the category of ``wall_pattern``
 LOW = 0.25  # [m] what is lower fits under the raised fingers
 
 
-def piece(airborne: bool, **which: float) -> Piece:
-    """Describe where a block of a wall, and its place in it, come from."""
-    first = Function(layouts.start, constants={**which, "airborne": float(airborne)})
-    return Piece(
-        size=((LAYOUT, SIZE), Function(layouts.brick_size, constants=which)),
-        place=((LAYOUT, SIZE), Function(layouts.brick_place, constants=which)),
-        start=((LAYOUT, SIZE, PATTERN), first),
-    )
-
-
 class StackedBlocks(Building):
     """A wall, regular or random; each block has its place in it.
 
@@ -70,7 +60,11 @@ class StackedBlocks(Building):
     name = "stacked_blocks"
     decided_by: ClassVar[tuple[str, ...]] = (LAYOUT,)
     goal_causes = (LEVELS, MASS, SIZE, WIDTH, NOISE)
-    piece = staticmethod(piece)
+    piece = Piece(
+        size=(layouts.brick_size, LAYOUT, SIZE),
+        place=(layouts.brick_place, LAYOUT, SIZE),
+        start=(layouts.start, LAYOUT, SIZE, PATTERN),
+    )
     levels: ClassVar[numbers.Range] = numbers.STACK_LEVELS
 
     def __init__(
