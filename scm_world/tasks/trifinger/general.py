@@ -126,22 +126,22 @@ class General(Building):
 
 def _drops() -> Iterable[Variable]:
     """Declare what the predecessor takes from a global generator."""
-    region, turns = _repeated(Box(*numbers.DROP_REGION)), Box(0.0, 2.0 * math.pi)
-    bounds, shape = _repeated(numbers.POSITION_BOUNDS), (piles.MOST, 3)
-    yield numbers.Range(bounds, region, region, "m", shape).declare(
+    region, anywhere = (
+        Box(*(tuple(end) * piles.MOST for end in ends))
+        for ends in (numbers.DROP_REGION, numbers.POSITION_ENDS)
+    )
+    bounds, turns, shape = (
+        Box(-2.0 * math.pi, 2.0 * math.pi),
+        Box(0.0, 2.0 * math.pi),
+        (piles.MOST, 3),
+    )
+    yield numbers.Range(anywhere, region, region, "m", shape).declare(
         PLACES,
         tuple(x for i in range(piles.MOST) for x in DROPS[i % len(DROPS)]),
         "Where the center of each block is let go, or above it if something is there.",
     )
-    bounds = Box(-2.0 * math.pi, 2.0 * math.pi)
     yield numbers.Range(bounds, turns, turns, "rad", shape).declare(
         TURNS,
         (0.0,) * (3 * piles.MOST),
         "How each block is turned when it is let go, as a rotation vector.",
     )
-
-
-def _repeated(box: Box) -> Box:
-    """Return the bounds of points in a row, from those of one."""
-    low, high = box.bounds((3,), {})
-    return Box(tuple(low.tolist()) * piles.MOST, tuple(high.tolist()) * piles.MOST)

@@ -54,16 +54,8 @@ def touched(
 ) -> tuple[dict[str, Value], Floats, float]:
     """Stand the first block somewhere, with all three fingertips about to touch it.
 
-    Args:
-        world: Where.
-        rng: Random numbers of the probe.
-        middle: x and y of its center [m].
-        bottom: Height of its lower face [m].
-        heights: Between which parts of its height it is touched.
-        yaw: How far it may be turned [rad].
-
-    Returns:
-        States to set, the direction in which each finger stands [rad], and their height [m].
+    The block is turned by up to ``yaw`` [rad], and touched between two parts of its height.
+    Return the states to set, the direction in which each finger stands [rad], and their height [m].
     """
     name, size = world.composition.blocks[0], sizes(world)[0]
     angles = facing(rng)

@@ -61,15 +61,8 @@ def floor_of_tower(center: Floats, size: Floats, orientation: Floats, *, side: f
 def beside(size: Floats, orientation: Floats, *, place: Floats, other: Floats) -> Floats:
     """Stand a block on the floor, at least ``GAP`` away from another one of the same size.
 
-    Args:
-        size: Edge lengths, shape (3,) [m].
-        orientation: Quaternion (x, y, z, w).
-        place: x, y and the height of the lowest point where it stands if there is room, shape
-            (3,) [m]. Else it is farther away in the same direction.
-        other: Those of the other block, shape (3,) [m].
-
-    Returns:
-        The center, shape (3,) [m].
+    It stands at ``place`` (x, y and the height of its lowest point) if there is room, else farther
+    away from ``other`` in the same direction. Return its center, shape (3,) [m].
     """
     offset, room = place[:2] - other[:2], size[:2] + GAP
     apart = np.abs(offset) > 1e-9

@@ -25,15 +25,9 @@ def on_the_floor(polar: Floats, height: Floats) -> Floats:
 
 
 def turned_on_the_floor(polar: Floats, size: Floats, orientation: Floats) -> Floats:
-    """Put a turned box on the floor at a radius and an angle: its lowest point touches it.
+    """Put a turned box on the floor: compute its center, shape (..., 3) [m].
 
-    Args:
-        polar: Radius [m] and angle [rad], shape (..., 2).
-        size: Edge lengths, shape (..., 3) [m].
-        orientation: Quaternion (x, y, z, w), shape (..., 4).
-
-    Returns:
-        The center, shape (..., 3) [m].
+    It is at a radius [m] and an angle [rad], shape (..., 2), and its lowest point is on the floor.
     """
     height = (np.abs(rotation_matrix(orientation)[..., 2, :]) * size).sum(axis=-1)
     return on_the_floor(polar, height / 2.0)

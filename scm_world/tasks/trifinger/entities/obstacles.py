@@ -63,7 +63,7 @@ def scattering(default: int) -> Iterable[Variable]:
     x, y = radius * np.cos(_ANGLE * index), radius * np.sin(_ANGLE * index)
     inside, top = ARENA_HALF_WIDTH - 0.005, ARENA_HEIGHT - 0.005
     space = Box((-inside, -inside, 0.005) * MOST, (inside, inside, top) * MOST)
-    bounds = Box((-0.24, -0.24, 0.0) * MOST, (0.24, 0.24, 0.5) * MOST)
+    bounds = Box(*(end * MOST for end in numbers.POSITION_ENDS))
     yield numbers.Range(bounds, space, space, "m", (MOST, 3)).declare(
         PLACES,
         tuple(np.stack([x, y, height], axis=-1).ravel().tolist()),
