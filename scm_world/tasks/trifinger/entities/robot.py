@@ -38,7 +38,13 @@ ACTIONS = {
 
 _SPEC = ControllerSpec()
 
-CONTROLLER = (
+HIDDEN = (
+    numbers.FRICTION.declare(
+        "finger_friction",
+        numbers.FINGER_FRICTION,
+        "Friction of all links; a contact has the product of two frictions.",
+    ),
+    numbers.JOINT_DAMPING.declare("joint_damping", 0.0, "Passive damping of every joint."),
     numbers.POSITION_GAINS.declare(
         "position_gains", _SPEC.kp, "Proportional gain of the three joints of a finger."
     ),
@@ -55,8 +61,13 @@ CONTROLLER = (
         _SPEC.limit,
         "Largest torque of a joint. Torques that are commanded end at 0.36 N m for any value.",
     ),
+    numbers.NOISE.declare(
+        ACTUATOR_NOISE,
+        0.0,
+        "Standard deviation of a command, as a fraction of half the range of an action.",
+    ),
 )
-"""The joint controller."""
+"""What the predecessor keeps to itself: friction, damping, the joint controller, and noise."""
 
 MOVES = (
     (numbers.JOINTS, "Angles of the joints of {}."),
@@ -161,7 +172,7 @@ def robot(
         doc = f"Mass of the link; its inertia scales with it.{still}"
         variables.append(numbers.LINK_MASSES.declare(f"{link}.mass", mass, doc))
         variables.append(numbers.color(f"{link}.color", hardware.LINK_COLORS[finger]))
-    variables += [*_hidden(), *_tips(groups)]
+    variables += [*HIDDEN, *_tips(groups)]
     if len(groups) > 1:
         for index, (name, (kind, doc)) in enumerate(zip(QUANTITIES, MOVES, strict=True)):
             parts = states[index * len(groups) : (index + 1) * len(groups)]
@@ -208,22 +219,6 @@ def _moving(quantity: int, joints: JointGroup, start: tuple[float, ...]) -> Meas
         doc.format(joints.of),
         settable_state=quantity < 2,
         **spaces,
-    )
-
-
-def _hidden() -> Iterable[Variable]:
-    """Declare what the predecessor keeps to itself: friction, damping, control and noise."""
-    yield numbers.FRICTION.declare(
-        "finger_friction",
-        numbers.FINGER_FRICTION,
-        "Friction of all links; a contact has the product of two frictions.",
-    )
-    yield numbers.JOINT_DAMPING.declare("joint_damping", 0.0, "Passive damping of every joint.")
-    yield from CONTROLLER
-    yield numbers.NOISE.declare(
-        ACTUATOR_NOISE,
-        0.0,
-        "Standard deviation of a command, as a fraction of half the range of an action.",
     )
 
 
