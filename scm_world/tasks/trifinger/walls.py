@@ -105,27 +105,31 @@ class StackedBlocks(Building):
             ),
         )
 
-    def arrange(self, values: Values) -> Any:
-        """Count the blocks of each level.
+    def arrange(self, values: Values) -> tuple[tuple[int, ...], int]:
+        """Count the blocks of each level, and the obstacles.
 
         Raises:
-            InterventionError: There are none.
+            InterventionError: There are no blocks.
         """
         counts = layouts.counts(values[LAYOUT])
         if not counts:
             message = f"do({LAYOUT}): a wall has at least one block; give one a width above zero"
             raise InterventionError(message, variable=LAYOUT)
-        return counts
+        return counts, int(values.get(COUNT, 0))
 
     @property
-    def counts(self) -> tuple[int, ...]:
-        """How many blocks each level has."""
-        found: tuple[int, ...] = self.arranged
-        return found
+    def obstacles(self) -> tuple[str, ...]:
+        """The small boxes, if the family has some."""
+        return obstacle_names(self.arranged[1])
+
+    def entities(self) -> Iterable[Entity]:
+        """List the blocks, their places in the wall, and small boxes."""
+        yield from super().entities()
+        yield from scattered(self.arranged[1])
 
     def parts(self) -> Iterable[Part]:
         """List the blocks, level by level."""
-        for level, count in enumerate(self.counts):
+        for level, count in enumerate(self.arranged[0]):
             for num in range(count):
                 yield f"level_{level}_num_{num}", {"level": float(level), "num": float(num)}
 
@@ -136,7 +140,7 @@ class StackedBlocks(Building):
             place = layouts.brick_place(values[LAYOUT], values[SIZE], **which)
             found[f"tool_{name}.cartesian_position"] = place
             found[f"tool_{name}.orientation"] = np.array(numbers.IDENTITY)
-        if len(self.counts) * float(values[SIZE]) > LOW:
+        if len(self.arranged[0]) * float(values[SIZE]) > LOW:
             found["joint_positions"] = np.array(hardware.ASIDE)
         return found
 
@@ -210,28 +214,8 @@ class CreativeStackedBlocks(StackedBlocks):
         )
         self.roots += (*scattering(number_of_obstacles),)
 
-    def arrange(self, values: Values) -> tuple[tuple[int, ...], int]:
-        """Count the blocks of each level, and the obstacles."""
-        return super().arrange(values), int(values[COUNT])
-
-    @property
-    def counts(self) -> tuple[int, ...]:
-        """How many blocks each level has."""
-        found: tuple[int, ...] = self.arranged[0]
-        return found
-
     @property
     def targets(self) -> dict[str, str]:
         """The goals of the first level and of the last."""
-        ends = (0, len(self.counts) - 1)
+        ends = (0, len(self.arranged[0]) - 1)
         return {f"goal_{p}": f"tool_{p}" for p, which in self.parts() if which["level"] in ends}
-
-    @property
-    def obstacles(self) -> tuple[str, ...]:
-        """The small boxes."""
-        return obstacle_names(self.arranged[1])
-
-    def entities(self) -> Iterable[Entity]:
-        """The wall, and small boxes."""
-        yield from super().entities()
-        yield from scattered(self.arranged[1])
