@@ -169,7 +169,7 @@ def on_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
 
 
 def block_in_air(world: Any, rng: ProbeGenerator) -> Setting:
-    """Let the first block fall and tumble."""
+    """Drop the first block, tumbling."""
     name = world.composition.blocks[0]
     states = {
         f"{name}.cartesian_position": np.array([*rng.uniform(-0.03, 0.03, 2), 0.06]),
@@ -216,7 +216,7 @@ def tower(world: Any, rng: ProbeGenerator) -> Setting:
 
 
 def block_at_wall(world: Any, rng: ProbeGenerator) -> Setting:
-    """Let the blocks slide along the wall, on one another."""
+    """Slide the blocks along the wall, on one another."""
     size = sizes(world)[0]
     angle = rng.uniform(-np.pi, np.pi)
     out, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
@@ -289,7 +289,7 @@ def obstacle_ahead(world: Any, rng: ProbeGenerator) -> Setting:
 
 
 def _newcomer(world: Any) -> tuple[Floats, float] | None:
-    """Find where a further block or obstacle would be: its middle and its top [m]."""
+    """Return where a further block or obstacle would be: its middle and its top [m]."""
     before = world.snapshot()
     for request in world.task.nearby(world.values()):
         try:

@@ -179,7 +179,7 @@ def _noise() -> Iterable[Variable]:
 class CreativeStackedBlocks(StackedBlocks):
     """A wall, regular or random; the blocks of the first and last level have their places.
 
-    What is between the two, the robot has to make up. Small boxes may be in the way. The other
+    The robot has to make up the levels between the two. Small boxes may be in the way. The other
     variables are those of ``StackedBlocks``.
 
     Args:

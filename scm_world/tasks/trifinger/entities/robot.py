@@ -140,7 +140,7 @@ def robot(
     Args:
         action_mode: One of ``ACTIONS``.
         start: Joint positions at the start, shape (9,) [rad].
-        resolution: One of ``RESOLUTIONS``. What is finer than ``"vector"`` is put together again
+        resolution: One of ``RESOLUTIONS``. Variables finer than ``"vector"`` are put together again
             in bundles under the names of the whole robot.
     """
     (unit, range_), groups = ACTIONS[action_mode], joints_of(resolution)
