@@ -105,8 +105,8 @@ class StackedBlocks(Building):
             ),
         )
 
-    def arrange(self, values: Values) -> tuple[tuple[int, ...], int]:
-        """Count the blocks of each level, and the obstacles.
+    def arrange(self, values: Values) -> Any:
+        """Count the blocks of each level, and the obstacles if the family has some.
 
         Raises:
             InterventionError: There are no blocks.
@@ -115,21 +115,26 @@ class StackedBlocks(Building):
         if not counts:
             message = f"do({LAYOUT}): a wall has at least one block; give one a width above zero"
             raise InterventionError(message, variable=LAYOUT)
-        return counts, int(values.get(COUNT, 0))
+        return (counts, int(values[COUNT])) if COUNT in self.decided_by else counts
+
+    @property
+    def built(self) -> tuple[tuple[int, ...], int]:
+        """How many blocks each level has, and how many obstacles there are."""
+        return self.arranged if COUNT in self.decided_by else (self.arranged, 0)
 
     @property
     def obstacles(self) -> tuple[str, ...]:
         """The small boxes, if the family has some."""
-        return obstacle_names(self.arranged[1])
+        return obstacle_names(self.built[1])
 
     def entities(self) -> Iterable[Entity]:
         """List the blocks, their places in the wall, and small boxes."""
         yield from super().entities()
-        yield from scattered(self.arranged[1])
+        yield from scattered(self.built[1])
 
     def parts(self) -> Iterable[Part]:
         """List the blocks, level by level."""
-        for level, count in enumerate(self.arranged[0]):
+        for level, count in enumerate(self.built[0]):
             for num in range(count):
                 yield f"level_{level}_num_{num}", {"level": float(level), "num": float(num)}
 
@@ -140,7 +145,7 @@ class StackedBlocks(Building):
             place = layouts.brick_place(values[LAYOUT], values[SIZE], **which)
             found[f"tool_{name}.cartesian_position"] = place
             found[f"tool_{name}.orientation"] = np.array(numbers.IDENTITY)
-        if len(self.arranged[0]) * float(values[SIZE]) > LOW:
+        if len(self.built[0]) * float(values[SIZE]) > LOW:
             found["joint_positions"] = np.array(hardware.ASIDE)
         return found
 
@@ -217,5 +222,5 @@ class CreativeStackedBlocks(StackedBlocks):
     @property
     def targets(self) -> dict[str, str]:
         """The goals of the first level and of the last."""
-        ends = (0, len(self.arranged[0]) - 1)
+        ends = (0, len(self.built[0]) - 1)
         return {f"goal_{p}": f"tool_{p}" for p, which in self.parts() if which["level"] in ends}
