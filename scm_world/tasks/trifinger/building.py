@@ -12,13 +12,8 @@ from typing import Any, final
 import numpy as np
 from numba import njit
 
-<<<<<<< HEAD
 from scm_world._types import ArrayLike, Floats, Values
-from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction_kernel
-=======
-from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction
->>>>>>> ren
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.tasks.trifinger import catalogue as numbers
@@ -51,21 +46,9 @@ def filled(numbers: Floats, tools: float) -> float:
         numbers: Size, position and quaternion of each block, then of each goal, shape (10 n,).
         tools: How many blocks there are.
     """
-<<<<<<< HEAD
     rows, of = numbers.reshape(-1, BOX), int(tools)
     size, position, turn = rows[:, :3].copy(), rows[:, 3:6].copy(), rows[:, 6:].copy()
-    return overlap_fraction_kernel(
-=======
-    n = len(numbers) // BOX
-    size, position, turn = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4))
-    for i in range(n):
-        for k in range(3):
-            size[i, k], position[i, k] = numbers[BOX * i + k], numbers[BOX * i + 3 + k]
-        for k in range(4):
-            turn[i, k] = numbers[BOX * i + 6 + k]
-    of = int(tools)
     return overlap_fraction(
->>>>>>> ren
         size[:of], position[:of], turn[:of], size[of:], position[of:], turn[of:]
     )
 
@@ -82,13 +65,7 @@ def fraction_of(
     shape: Hull | None, published: bool, achieved: ArrayLike, desired: ArrayLike
 ) -> Floats:
     """Compute how much of the desired boxes, or of the desired hull, is filled, shape (...)."""
-<<<<<<< HEAD
     vertices = None if shape is None else np.array(shape.vertices)
-=======
-    have, want = np.asarray(achieved, dtype=float), np.asarray(desired, dtype=float)
-    if shape is None:
-        boxes = aabb_overlap_fraction if published else overlap_fraction
->>>>>>> ren
 
     def one(mine: Floats, its: Floats) -> float:
         if vertices is None:
