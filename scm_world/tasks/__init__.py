@@ -1,4 +1,4 @@
-"""Goal families: what stands in the world and what counts."""
+"""Tasks: goal families of the robot, models from files, and step functions."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def register(kind: Kind) -> Kind:
         The same class.
 
     Raises:
-        ModelError: It is no class of tasks, methods are missing, it has no name or no weights, or
-            an argument has no default.
+        ModelError: It is not a class of tasks, methods are missing, it has no name or no weights,
+            or an argument has no default.
         UnknownOption: Another one has this name.
     """
 

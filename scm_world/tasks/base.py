@@ -76,8 +76,8 @@ class Goal:
     """What a task asks for, in one of its structures.
 
     Attributes:
-        achieved: Variables that say what is achieved.
-        desired: Variables that say what is desired, as many numbers together.
+        achieved: Variables whose numbers should become those of ``desired``.
+        desired: Their goals, as many numbers together.
         causes: The variables that a new goal is drawn for.
         measures: Functions of the two vectors, shapes (..., n), with values of shape (...): the
             reward terms that they decide, such as ``success``, and ``published_overlap``, the
@@ -96,7 +96,7 @@ class Goal:
     targets: Mapping[str, str] = field(default_factory=dict)
 
     def vectors(self, values: Values) -> tuple[Floats, Floats]:
-        """Return what is achieved and what is desired, two vectors of one shape."""
+        """Return the achieved and the desired vector, which have one shape."""
         achieved, desired = (
             np.concatenate([np.empty(0), *(np.ravel(values[name]) for name in names)])
             for names in (self.achieved, self.desired)
@@ -140,12 +140,6 @@ def checked(
     option: str, value: Any, allowed: Box | Integers, *, shape: tuple[int, ...] = ()
 ) -> Any:
     """Return an argument that lies within the bounds of the variable whose default it is.
-
-    Args:
-        option: Its name.
-        value: The argument.
-        allowed: The bounds.
-        shape: Shape of the variable.
 
     Raises:
         UnknownOption: It is not a number, of another shape, or out of bounds.
@@ -289,7 +283,7 @@ class Task(ABC):
         frame_skip: Default length of a control step.
         seconds: Length of an episode [s].
         weights: Weight of each reward term, by the name of its variable.
-        goal: What is achieved, what is desired, and what follows from that.
+        goal: The variables that are achieved and desired, and their measures.
         observation: What is observed and measured.
         decided_by: The shared variables that decide which entities there are.
         plan: The structure, from ``arrange``; None where that is always the same.
@@ -357,7 +351,7 @@ class Task(ABC):
 
     @abstractmethod
     def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
-        """Declare all variables, and what they mean to a backend."""
+        """Declare all variables, and their meaning to a backend."""
 
     def on(self, backend: Backend) -> Self:
         """Return the same task as far as a backend can realise it."""

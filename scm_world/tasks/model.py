@@ -56,8 +56,22 @@ class DeclaredTask(Task):
     Every argument can also be an attribute of a class of your own.
 
     Args:
-        kind: The class whose options there are in addition to those of this class.
+        kind: The class whose options there are in addition to those below.
         settings: Values of options.
+
+    Attributes:
+        system: The model, or the step function with its tables.
+        commands: What draws the noise of a step function.
+        outcomes: Names of readouts (``"tip.position"`` of a site, ``"torso.orientation"`` of a
+            body, ``"gyro.value"`` of a sensor), or ``Measured`` variables with a mechanism.
+        reward: A ``Measured`` variable called ``"reward"``, or a function and the names of its
+            parents: ``(upright, "hinge.position")``. A parent may be a ``Parent`` with lag 1.
+        success: The same for ``"success"``, 0 or 1.
+        terminated: The same for ``"terminated"``: whether the episode ends here.
+        start: Where episodes begin: for states a value, or a space or distribution to draw from.
+        observe: Names of the observed variables; all states if None.
+        goal: The variables that are achieved and desired, for ``goal_env``, planners and
+            ``sample_goal``.
 
     Raises:
         UnknownOption: An argument does not exist.
@@ -142,23 +156,15 @@ class ModelTask(DeclaredTask):
     Args:
         model: A path to an MJCF or URDF file, XML text, an ``MjSpec``, an ``MjModel``, or a
             ``Model`` that was read before.
-        name: Of the task; that of the model if None.
+        name: The name of the task; that of the model if None.
         expose: Patterns of the parameters that become variables (``"*.mass"``); all that are safe
             to change if None.
         spaces: For each variable a dictionary with ``a``, ``b``, ``bounds`` (spaces, or a pair of
             ends), ``default``, ``distribution`` (drawn at every reset) or ``doc``.
         ties: Derived variables that decide parameters, such as a density that decides masses, and
             the variables that they follow. One with the name of a parameter takes its place.
-        outcomes: Names of readouts (``"tip.position"`` of a site, ``"torso.orientation"`` of a
-            body, ``"gyro.value"`` of a sensor), or ``Measured`` variables with a mechanism.
-        reward: A ``Measured`` variable called ``"reward"``, or a function and the names of its
-            parents: ``(upright, "hinge.position")``. A parent may be a ``Parent`` with lag 1.
-        success: The same for ``"success"``, 0 or 1.
-        terminated: The same for ``"terminated"``: whether the episode ends here.
-        start: Where episodes begin: for states a value, or a space or distribution to draw from.
-        observe: Names of the observed variables; all states if None.
-        goal: What is achieved, what is desired, and what follows from that: for ``goal_env``,
-            planners and ``sample_goal``.
+        outcomes, reward, success, terminated, start, observe, goal: What counts, and where episodes
+            begin; see ``DeclaredTask``.
         seconds: Length of an episode [s].
         control_dt: Length of a control step [s], a multiple of the physics step.
         frame_skip: The same in physics steps.
@@ -215,17 +221,20 @@ class ModelTask(DeclaredTask):
         self._check_names()
 
     def _check_options(self) -> None:
-        """Check what was given as lists and dictionaries; a text alone is a list of one."""
-        patterns = [self.expose] if isinstance(self.expose, str) else self.expose
-        if patterns is not None and not all(isinstance(one, str) for one in _listed(patterns)):
-            raise UnknownOption("expose", self.expose, ("patterns such as '*.mass'",))
-        for option in ("outcomes", "observe", "ties"):
-            value = getattr(self, option)
-            value = [value] if isinstance(value, str) else value
-            kinds = {"ties": Variable, "observe": str}.get(option, (str, Measured))
-            if value is not None and not all(isinstance(one, kinds) for one in _listed(value)):
-                raise UnknownOption(option, value, ("names", "or declared variables"))
-            setattr(self, option, value if value is None else tuple(value))
+        """Check options that are lists or dictionaries; a text alone is a list of one."""
+        names = "names", "or declared variables"
+        for option, kinds, allowed in (
+            ("expose", str, ("patterns such as '*.mass'",)),
+            ("outcomes", (str, Measured), names),
+            ("observe", str, names),
+            ("ties", Variable, names),
+        ):
+            given: Any = getattr(self, option)
+            value = (given,) if isinstance(given, str) or not isinstance(given, Iterable) else given
+            if given is not None:
+                setattr(self, option, tuple(value))
+                if not all(isinstance(one, kinds) for one in getattr(self, option)):
+                    raise UnknownOption(option, given, allowed)
         for option in ("spaces", "start"):
             if not isinstance(getattr(self, option), Mapping):
                 raise UnknownOption(option, getattr(self, option), ("a dictionary by name",))
@@ -242,7 +251,7 @@ class ModelTask(DeclaredTask):
                 raise UnknownOption("outcomes", name, known)
 
     def _steps(self) -> int:
-        """Give the length of a control step in physics steps."""
+        """Return the length of a control step in physics steps."""
         for option in ("seconds", "control_dt"):
             value = getattr(self, option)
             if value is not None and _numbers(option, value, ()) <= 0.0:
@@ -278,7 +287,7 @@ class ModelTask(DeclaredTask):
                     raise UnknownOption(f"spaces[{name!r}]", what, _OVERRIDES)
 
     def on(self, backend: Backend) -> Self:
-        """Give the same task with the parameters that a backend has."""
+        """Return the same task with the parameters that a backend has."""
         kept = tuple(
             row
             for row in self.system.parameters
@@ -295,7 +304,7 @@ class ModelTask(DeclaredTask):
         return other
 
     def idle(self, world: Any) -> Floats:
-        """Return the controls of the keyframe; zero, or what is nearest to it, if there is none."""
+        """Return the controls of the keyframe; zero, or the nearest ones, if there is none."""
         start = [row.default for row in self.system.inputs]
         return np.asarray(np.clip(start, world.action_low, world.action_high))
 
@@ -303,12 +312,15 @@ class ModelTask(DeclaredTask):
         """Declare what the tables of the model have."""
         system, ties = self.system, {variable.name: variable for variable in self.ties}
         parameters: list[Variable] = [
-            self._tie(ties.pop(row.name), row) if row.name in ties else self._parameter(row)
-            for row in system.parameters
+            Exogenous(**self._fields(row, "default", "distribution")) for row in system.parameters
         ]
-        yield from (*ties.values(), *parameters)
+        for index, given in enumerate(parameters):
+            if given.name in ties:  # it has the bounds of the parameter, if none of its own
+                tie = ties.pop(given.name)
+                bounds = given.bounds if tie.bounds is None else tie.bounds
+                parameters[index] = tie.model_copy(update={"bounds": bounds})
         actions = [self._action(row) for row in system.inputs]
-        yield from actions
+        yield from (*ties.values(), *parameters, *actions)
         if len(actions) > 1:
             yield bundle("action", actions, doc="All controls.")
         acting = (
@@ -319,47 +331,32 @@ class ModelTask(DeclaredTask):
         effects = {row.name: (row.always, row.contact) for row in acting}
         causes = causes_of(effects, {row.trees for row in system.states})
         for row in system.states:
-            default = self.spaces.get(row.name, {}).get("default", row.default)
             state = Measured(
-                **self._fields(row, row.kind),
-                default=_numbers(f"spaces[{row.name!r}]['default']", default, row.shape),
+                **self._fields(row, "default"),
                 parents=Coupled(*causes[row.trees], ()),
                 settable_state=not row.reported,
             )
             yield from beginning(state, self.start.get(row.name))
 
-    def _fields(self, row: Row, kind: str = "real") -> dict[str, Any]:
-        """Return what all kinds of declarations have in common, with what was asked for."""
+    def _fields(self, row: Row, *more: str) -> dict[str, Any]:
+        """Return fields of a declaration, with what was asked for."""
         given, where = self.spaces.get(row.name, {}), f"spaces[{row.name!r}]"
+        kind, shape = getattr(row, "kind", "real"), row.shape
         limited = np.isfinite(row.low).any() or np.isfinite(row.high).any()
         box = Box(row.low, row.high) if limited else None
         special = {"rotation": Rotations(keeps_sign=True), "switch": Integers(0, 1)}
         bounds: Any = special.get(kind, box)
-        within = _space(f"{where}['bounds']", given.get("bounds", bounds), row.shape, bounds)
-        return {
-            "name": row.name,
-            "dtype": "integer" if kind == "switch" else "real",
-            "unit": row.unit,
-            "shape": row.shape,
-            "doc": given.get("doc", row.doc),
-            "bounds": within,
-            "a": _space(f"{where}['a']", given.get("a"), row.shape, within),
-            "b": _space(f"{where}['b']", given.get("b"), row.shape, within),
-        }
-
-    def _parameter(self, row: Any) -> Exogenous:
-        given = self.spaces.get(row.name, {})
-        where = f"spaces[{row.name!r}]"
-        return Exogenous(
-            **self._fields(row, row.kind),
-            default=_numbers(f"{where}['default']", given.get("default", row.default), row.shape),
-            distribution=_space(f"{where}['distribution']", given.get("distribution"), row.shape),
-        )
-
-    def _tie(self, tie: Variable, row: Row) -> Variable:
-        """Complete a derived variable that takes the place of a parameter: it has its bounds."""
-        bounds = self._fields(row, getattr(row, "kind", "real"))["bounds"]
-        return tie if tie.bounds is not None else tie.model_copy(update={"bounds": bounds})
+        bounds = _space(f"{where}['bounds']", given.get("bounds", bounds), shape, bounds)
+        fields = {"doc": row.doc, "default": row.default, **given, "bounds": bounds}
+        for name in ("a", "b"):
+            fields[name] = _space(f"{where}[{name!r}]", given.get(name), shape, bounds)
+        option = f"{where}['distribution']"
+        fields["distribution"] = _space(option, given.get("distribution"), shape)
+        fields["default"] = _numbers(f"{where}['default']", fields["default"], shape)
+        fields |= {"name": row.name, "unit": row.unit, "shape": shape}
+        fields["dtype"] = "integer" if kind == "switch" else "real"
+        left_out = {"default", "distribution"}.difference(more)
+        return {name: value for name, value in fields.items() if name not in left_out}
 
     def _action(self, row: Row) -> Action:
         fields = self._fields(row)
@@ -400,42 +397,28 @@ def causes_of(
 
 
 def beginning(state: Measured, begin: Any) -> tuple[Variable, ...]:
-    """Say where a state is when an episode begins.
+    """Declare a state with its value at the start of an episode, after the variable it is drawn as.
 
     Args:
         state: Its declaration.
         begin: A value, or a space or distribution to draw from; the default stays if None.
-
-    Returns:
-        The state, and before it the variable that is drawn, if one is.
     """
     if begin is None:
         return (state,)
-    option = f"start[{state.name!r}]"
-    if state.shape == () and isinstance(begin, tuple | list):
+    option, shape = f"start[{state.name!r}]", state.shape
+    if shape == () and isinstance(begin, tuple | list):
         begin = _space(option, begin, ())
     if isinstance(begin, int | float | list | tuple | np.ndarray):
-        return (state.model_copy(update={"default": _numbers(option, begin, state.shape)}),)
-    begin = _space(option, begin, state.shape, state.bounds)
-    name = f"{state.name}.{START}"
+        return (state.model_copy(update={"default": _numbers(option, begin, shape)}),)
     drawn = Exogenous(
-        name=name,
-        unit=state.unit,
-        shape=state.shape,
-        dtype=state.dtype,
-        bounds=state.bounds,
+        name=f"{state.name}.{START}",
+        **{field: getattr(state, field) for field in ("unit", "shape", "dtype", "bounds")},
         default=0.0 if state.default is None else state.default,
-        distribution=begin,
+        distribution=_space(option, begin, shape, state.bounds),
         doc=f"Where {state.name} is at the beginning of an episode.",
     )
-    parents = (*state.parents, Parent(name, 0, "set"))
-    function = Function(same_value)
-    return drawn, state.model_copy(update={"parents": parents, "start": function})
-
-
-def _listed(value: Any) -> list[Any]:
-    """List what was given, or the thing itself where it cannot be listed."""
-    return list(value) if isinstance(value, Iterable) else [value, None]
+    parents = (*state.parents, Parent(drawn.name, 0, "set"))
+    return drawn, state.model_copy(update={"parents": parents, "start": Function(same_value)})
 
 
 def _numbers(option: str, value: Any, shape: tuple[int, ...], wanted: str = "") -> Any:
@@ -488,11 +471,5 @@ def _readout(row: Readout) -> Measured:
     mechanism = Function(row.function)
     if isinstance(row.function, chains.Chain):
         mechanism = Function(pose, constants={"links": row.function.links})
-    return Measured(
-        name=row.name,
-        unit=row.unit,
-        shape=row.shape,
-        parents=row.parents,
-        mechanism=mechanism,
-        doc=row.doc,
-    )
+    fields = {name: getattr(row, name) for name in ("name", "unit", "shape", "parents", "doc")}
+    return Measured(mechanism=mechanism, **fields)

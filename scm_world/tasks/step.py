@@ -17,7 +17,6 @@ from scm_world.tasks.composition import Commands, Composition
 from scm_world.tasks.model import DeclaredTask, _numbers, beginning
 from scm_world.variables import (
     Action,
-    Box,
     Derived,
     Distribution,
     Exogenous,
@@ -46,7 +45,7 @@ class ProcessNoise(Commands):
         self._drawn = [(name, source, shapes[name]) for name, source in sources.items()]
 
     def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
-        """Give the action and the noise of a control step, shape (n_commands,)."""
+        """Return the action and the noise of a control step, shape (n_commands,)."""
         drawn = [
             np.ravel(key.draw(source, name, shape, values, "process noise"))
             for name, source, shape in self._drawn
@@ -74,7 +73,7 @@ class StepTask(DeclaredTask):
 
     Args:
         step: The function; see ``StepModel`` for what it is given and gives.
-        name: Of the task; that of the function if None.
+        name: The name of the task; that of the function if None.
         parameters: ``Exogenous`` variables, or ``Derived`` and ``Fixed`` ones.
         states: ``Measured`` variables without a mechanism. ``do`` may set each of them.
         actions: ``Action`` variables. The command is one after another.
@@ -83,12 +82,8 @@ class StepTask(DeclaredTask):
             named like a state has its shape; else it is a number, or has the shape of the ends
             of its box.
         outcomes: ``Measured`` or ``Derived`` variables that are computed from others.
-        reward: A ``Measured`` variable called ``"reward"``, or a function and the names of its
-            parents: ``(harvested, "prey", "catch")``. A parent may be a ``Parent`` with lag 1.
-        success: The same for ``"success"``, 0 or 1.
-        terminated: The same for ``"terminated"``: whether the episode ends here.
-        start: Where episodes begin: for states a value, or a space or distribution to draw from.
-        observe: Names of what a policy observes; all states if None.
+        reward, success, terminated, start, observe, goal: What counts, and where episodes begin;
+            see ``DeclaredTask``.
         seconds: Length of an episode [s]; 100 control steps if None.
         vectorized: Whether the function takes many systems together, with a leading axis.
         signature: ``"dicts"``, or ``"arrays"`` for flat arrays in the order of declaration.
@@ -118,14 +113,16 @@ class StepTask(DeclaredTask):
         function = type(self).step if step is None else step
         self.parameters, self.actions = tuple(self.parameters), tuple(self.actions)
         self.states, self.outcomes = tuple(self.states), tuple(self.outcomes)
-        self._refuse(function)
+        problems = [*self._of_another_kind(function)] or [*self._not_fitting()]
+        if problems:
+            raise ModelError(problems)
         named = "step" if type(self) is StepTask else type(self).__name__
         self.name = getattr(self, "name", getattr(step, "__name__", named))
         self.time_unit = float(self.control_dt)
         if self.seconds is None:
             self.seconds = 100 * self.time_unit
-        shapes = {state.name: state.shape for state in self.states}
-        shapes = {name: shapes.get(name, _shape(given)) for name, given in self.noise.items()}
+        shapes = {n: np.shape(getattr(given, "low", 0.0)) for n, given in self.noise.items()}
+        shapes |= {state.name: state.shape for state in self.states if state.name in shapes}
         self.commands = ProcessNoise(self.noise, shapes) if self.noise else None
         self.generated_graph = any(not _lagged(state) for state in self.states)
         self.system = StepModel(
@@ -143,23 +140,18 @@ class StepTask(DeclaredTask):
             self.signature,
         )
 
-    def _refuse(self, function: Any) -> None:
-        """Refuse what cannot be meant.
-
-        Raises:
-            ModelError: With all of it.
-        """
-        problems = []
+    def _of_another_kind(self, function: Any) -> Iterable[str]:
+        """List arguments of which the type or the number is wrong."""
         if not callable(function):
-            problems.append(f"step={function!r} is no function")
+            yield f"step={function!r} is no function"
         elif hasattr(function, "py_func") and self.signature == "dicts":
-            problems.append('a compiled function takes no dicts: set signature="arrays"')
+            yield 'a compiled function takes no dicts: set signature="arrays"'
         if self.signature not in ("dicts", "arrays"):
-            problems.append(f'signature={self.signature!r} must be "dicts" or "arrays"')
+            yield f'signature={self.signature!r} must be "dicts" or "arrays"'
         if not 0.0 < self.control_dt < np.inf:
-            problems.append(f"control_dt={self.control_dt!r} must be a positive number [s]")
+            yield f"control_dt={self.control_dt!r} must be a positive number [s]"
         if not self.states:
-            problems.append("there is no state: give states=[sw.Measured(name=…, parents=…)]")
+            yield "there is no state: give states=[sw.Measured(name=…, parents=…)]"
         kinds = {
             "parameters": (Exogenous, Derived, Fixed),
             "states": (Measured,),
@@ -168,17 +160,12 @@ class StepTask(DeclaredTask):
         }
         for option, allowed in kinds.items():
             choices = " or ".join(kind.__name__ for kind in allowed)
-            problems += [
-                f"{option}: {getattr(given, 'name', given)!r} must be {choices}"
-                for given in getattr(self, option)
-                if not isinstance(given, allowed)
-            ]
-        problems = problems or [*self._about_states(), *self._about_noise()]
-        if problems:
-            raise ModelError(problems)
+            for given in getattr(self, option):
+                if not isinstance(given, allowed):
+                    yield f"{option}: {getattr(given, 'name', given)!r} must be {choices}"
 
-    def _about_states(self) -> Iterable[str]:
-        """Say what is wrong with the declaration of states."""
+    def _not_fitting(self) -> Iterable[str]:
+        """List states, actions and distributions that do not fit to the step function."""
         given = {variable.name for variable in (*self.parameters, *self.states, *self.actions)}
         for state in self.states:
             if state.mechanism is not None:
@@ -195,12 +182,8 @@ class StepTask(DeclaredTask):
         for action in self.actions:
             if action.dtype != "real":
                 yield f"{action.name!r}: actions are real numbers; round it in the step function"
-        for name in self.start:
-            if name not in {state.name for state in self.states}:
-                yield f"start: {name!r} is no state"
-
-    def _about_noise(self) -> Iterable[str]:
-        """Say what is wrong with the distributions of the noise."""
+        for name in sorted(set(self.start) - {state.name for state in self.states}):
+            yield f"start: {name!r} is no state"
         for name, source in self.noise.items():
             if not hasattr(source, "n_uniforms"):
                 yield f"noise: {name!r} is no distribution: {source!r}"
@@ -208,7 +191,7 @@ class StepTask(DeclaredTask):
                 yield f"noise: {name!r} must not follow variables; scale it in the step function"
 
     def on(self, backend: Backend) -> Self:
-        """Give the task as it is.
+        """Return the task as it is.
 
         Raises:
             UnknownOption: The backend is one of bodies.
@@ -218,7 +201,7 @@ class StepTask(DeclaredTask):
         return self
 
     def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
-        """Declare all variables, and what they mean to the backend.
+        """Declare all variables, and their meaning to the backend.
 
         Raises:
             UnknownOption: A control step is to be several calls of the function: the declared
@@ -252,13 +235,7 @@ def _lagged(state: Measured) -> tuple[Parent, ...]:
 
 
 def _quantity(variable: Any) -> Quantity:
-    """Say what the function is given, or gives, of a variable."""
+    """Return the row of a variable in the tables of the function."""
     default = getattr(variable, "value", getattr(variable, "default", None))
     default = 0.0 if default is None else default
     return Quantity(variable.name, variable.shape, default, integer=variable.dtype != "real")
-
-
-def _shape(source: Any) -> tuple[int, ...]:
-    """Give the shape of what is drawn from a distribution by itself."""
-    ends: Any = source.low if isinstance(source, Box) else 0.0
-    return np.shape(ends)

