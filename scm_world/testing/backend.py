@@ -165,7 +165,7 @@ class BackendConformance(ABC):
     def backend(self, scene: Scene) -> Iterator[Backend]:
         """Provide a backend in the middle of an episode."""
         with self.built(scene) as backend:
-            self.play(backend, 3, seed=1)
+            self.play(backend, 2, seed=1)
             yield backend
 
     @contextmanager
@@ -234,7 +234,7 @@ class BackendConformance(ABC):
         """There are none before the first step; a change of the state does not change them."""
         with self.built(scene) as backend:
             assert backend.contacts() == ()
-            self.play(backend, 2, seed=1)
+            self.play(backend, 3, seed=1)
             contacts = backend.contacts()
             assert bool(contacts) == backend.capabilities.physics
             for contact in contacts:
