@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 import scm_world as sw
-from scm_world.backends.renderer import now_pixels
-from scm_world.geometry.filling import overlap_kernel
+from scm_world.backends.renderer import camera_pixels
+from scm_world.geometry.filling import overlap_fraction
 from scm_world.queries.experiments.versions import versions
 from scm_world.tasks.trifinger.cameras import CAMERAS
 from scm_world.tasks.trifinger.hardware import REST
@@ -83,13 +83,17 @@ def drawing() -> dict[str, float]:
     """Draw three cameras, compute an overlap and an inverse kinematics."""
     scene = _scene(1)
     out = np.empty((3, 3, 128, 128), dtype=np.uint8)
-    found = {"three-camera sets per second": 1e6 / median(lambda: now_pixels(scene, CAMERAS, out))}
-    generator = np.random.default_rng(0)
-    turn = generator.normal(size=4)
-    size, place = np.full(3, 0.065), np.zeros(3)
-    box = (size, place + 0.01, turn / np.linalg.norm(turn))
+    found = {
+        "three-camera sets per second": 1e6 / median(lambda: camera_pixels(scene, CAMERAS, out))
+    }
+    turn = np.random.default_rng(0).normal(size=(1, 4))
+    size, place, upright = (
+        np.full((1, 3), 0.065),
+        np.zeros((1, 3)),
+        np.array([[0.0, 0.0, 0.0, 1.0]]),
+    )
     found["overlap of two boxes [µs]"] = median(
-        lambda: overlap_kernel(size, place, np.array([0.0, 0.0, 0.0, 1.0]), *box), 2000
+        lambda: overlap_fraction(size, place, upright, size, place + 0.01, turn), 2000
     )
     tips, joints = forward(np.array(REST), 0.34) + 0.01, np.array(REST)
     found["inverse kinematics [µs]"] = median(lambda: inverse_kernel(tips, 0.34, joints), 2000)

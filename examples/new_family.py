@@ -15,7 +15,7 @@ from scm_world import World
 from scm_world.tasks import Building, Common
 from scm_world.tasks.trifinger.building import Piece, blocks_mass
 from scm_world.tasks.trifinger.entities.blocks import block_size
-from scm_world.variables import Exogenous, Function, Integers
+from scm_world.variables import Exogenous, Integers
 
 LEVELS, SIZE = "pyramid_levels", "block.size"
 GAP = 0.01  # [m] between blocks at the start
@@ -33,22 +33,13 @@ def start(size: np.ndarray, orientation: np.ndarray, *, level: float, num: float
     return np.array([column * (size[0] + GAP), row * (size[1] + GAP), size[2] / 2])
 
 
-def piece(airborne: bool, **which: float) -> Piece:
-    """Describe where a block, and its place in the pyramid, come from: causes and function."""
-    return Piece(
-        size=((SIZE,), None),  # a copy
-        place=((LEVELS, SIZE), Function(place, constants=which)),
-        start=((), Function(start, constants=which)),  # follows size and orientation anyway
-    )
-
-
 class Pyramid(Building):
     """Blocks of one size, each level with one block less than the level below."""
 
     name = "pyramid"
     decided_by = (LEVELS,)  # what decides which entities there are …
     goal_causes = (LEVELS,)  # … and what a new goal is drawn for
-    piece = staticmethod(piece)
+    piece = Piece(size=SIZE, place=(place, LEVELS, SIZE), start=(start,))  # the size is a copy
 
     def __init__(self, *, levels: int = 2, **common: Unpack[Common]) -> None:
         super().__init__(**common)  # weights, custom terms, where the robot begins

@@ -113,11 +113,11 @@ class StepModel:
         return StateLayout(tuple(quantity.name for quantity, _ in pieces), sizes, tuple(start))
 
     def empty_state(self) -> State:
-        """Give a state to read into."""
+        """Return a state to read into."""
         return State(self.layout)
 
     def default_scene(self) -> Scene:
-        """Give the scene in which every parameter and every state has its default."""
+        """Return the scene in which every parameter and every state has its default."""
         parameters = {quantity.key: quantity.value for quantity in self.parameters}
         return Scene(self, parameters, self.empty_state())
 
@@ -172,7 +172,7 @@ class StepModel:
         return result
 
     def _failure(self, what: str) -> EngineFailure:
-        """Say what the function did."""
+        """Return an error about the function."""
         return EngineFailure(f"the step function of {self.name!r} {what}", StepFunction.name)
 
     def _named(self, kind: str, numbers: Floats) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -118,13 +119,17 @@ def _or_same(value: Any, other: Any) -> str:
 
 def _pictures(scenes: Sequence[Any]) -> list[Any]:
     """Return a picture of each scene; none of systems without bodies."""
-    from scm_world.backends.renderer import automatic_camera, picture
+    from scm_world.backends.renderer import automatic_camera, picture, shapes_of
     from scm_world.backends.step import StepModel
     from scm_world.models import Model
+    from scm_world.models.shapes import Shapes
 
     if not scenes or isinstance(scenes[0].structure, StepModel):
         return []
-    camera = automatic_camera(*scenes) if isinstance(scenes[0].structure, Model) else None
+    camera = None
+    if isinstance(scenes[0].structure, Model):
+        shown = (shapes_of(scene, goals=False) for scene in scenes)
+        camera = automatic_camera(reduce(Shapes.joined, shown))
     return [picture(scene, camera, samples=2) for scene in scenes]
 
 

@@ -14,10 +14,10 @@ from scm_world._types import Values
 from scm_world.backends.renderer import (
     ORIGINAL,
     PLAIN,
+    camera_pixels,
     following_camera,
-    goal_pixels,
-    now_pixels,
     scene_camera,
+    shapes_of,
     views_of,
 )
 from scm_world.env.observer import STACKS
@@ -165,7 +165,7 @@ class Pixels:
         if not self._shows_goals:
             pairs = zip(self._given, self._cameras, strict=True)
             cameras = [placed(scene, given, camera) for given, camera in pairs]
-            now_pixels(scene, cameras, pictures, convention=layout)
+            camera_pixels(scene, cameras, pictures, convention=layout)
             return self._stacked(pictures)
         if self._version != self._world.version:
             self._version = self._world.version
@@ -176,8 +176,8 @@ class Pixels:
                 else camera
                 for camera, follows in zip(self._cameras, self._follows, strict=True)
             )
-            goal_pixels(scene, self._cameras, self._goals, convention=layout)
-        now_pixels(scene, self._cameras, pictures[:n], convention=layout)
+            camera_pixels(scene, self._cameras, self._goals, goals=True, convention=layout)
+        camera_pixels(scene, self._cameras, pictures[:n], convention=layout)
         pictures[n:] = self._goals
         return self._stacked(pictures)
 
@@ -191,7 +191,7 @@ def placed(scene: Scene, given: str | Camera, camera: Camera) -> Camera:
         camera: The same, as it is in the default scene.
     """
     if given == AUTOMATIC:
-        return following_camera(camera, scene)
+        return following_camera(camera, shapes_of(scene, goals=False))
     if isinstance(given, str):
         return scene_camera(scene, given, (camera.height, camera.width))
     return camera

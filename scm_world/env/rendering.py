@@ -131,15 +131,13 @@ class Looks:
                 ``"overview"``, of a model one in its file, or ``"automatic"``. The last one if
                 None.
         """
-        from scm_world.backends.renderer import depth_and_segmentation
+        from scm_world.backends.renderer import render
 
-        scene, cameras = self.world.scene(), (self._camera(camera),)
-        found: NDArray[np.float32] = depth_and_segmentation(scene, cameras)[0][0]
-        return found
+        return render(self.world.scene(), self._camera(camera), colors=False).depth
 
     def _camera_of(self, scene: Scene) -> Camera:
         """Give the camera of pictures for people: of a model it follows what moves."""
-        from scm_world.backends.renderer import following_camera, scene_camera, views_of
+        from scm_world.backends.renderer import following_camera, scene_camera, shapes_of, views_of
         from scm_world.env.pixels import AUTOMATIC
 
         views = views_of(self.world.structure)
@@ -149,7 +147,7 @@ class Looks:
             return views.overview
         if self._automatic is None:
             self._automatic = scene_camera(self.world.structure.default_scene())
-        return following_camera(self._automatic, scene)
+        return following_camera(self._automatic, shapes_of(scene, goals=False))
 
     def segmentation(
         self, camera: Camera | str | None = None
@@ -163,7 +161,7 @@ class Looks:
             Shape (h, w): an index into the names of the bodies, -1 where there is nothing; and
             these names.
         """
-        from scm_world.backends.renderer import body_names, depth_and_segmentation
+        from scm_world.backends.renderer import render
 
-        scene, cameras = self.world.scene(), (self._camera(camera),)
-        return depth_and_segmentation(scene, cameras)[1][0], body_names(scene.structure)
+        image = render(self.world.scene(), self._camera(camera), colors=False)
+        return image.segmentation, image.names

@@ -34,11 +34,6 @@ _CUBE = np.array(
 """The edges of the cube from -1 to 1, shape (24, 7)."""
 
 
-def _rows(values: ArrayLike, width: int) -> Floats:
-    """Copy rows of numbers, of which there may be none, so that no kernel is compiled twice."""
-    return np.array(values, dtype=np.float64, order="C").reshape(-1, width)
-
-
 @njit(cache=True)
 def box_kernel(
     size: Floats, position: Floats, orientation: Floats, edges: Floats, planes: Floats
@@ -190,69 +185,13 @@ def remainder_kernel(edges: Floats, within: Floats, others: Floats) -> float:
 
 
 @njit(cache=True)
-def overlap_kernel(
-    size_a: Floats,
-    position_a: Floats,
-    orientation_a: Floats,
-    size_b: Floats,
-    position_b: Floats,
-    orientation_b: Floats,
-) -> float:
-    """Compute the volume that two boxes share [m³]; see ``box_kernel``."""
-    edges, planes = np.empty((2, 24, 7)), np.empty((2, 6, 4))
-    box_kernel(size_a, position_a, orientation_a, edges[0], planes[0])
-    box_kernel(size_b, position_b, orientation_b, edges[1], planes[1])
-    shared = remainder_kernel(edges[0], planes[1], planes[:0])
-    most = min(size_a[0] * size_a[1] * size_a[2], size_b[0] * size_b[1] * size_b[2])
-    return float(min(shared, most))
-
-
-@njit(cache=True)
-def overlap_fraction_kernel(
+def overlap_fraction(
     sizes: Floats,
     positions: Floats,
     orientations: Floats,
     goal_sizes: Floats,
     goal_positions: Floats,
     goal_orientations: Floats,
-) -> float:
-    """Compute the fraction of the goals that the blocks fill; see ``overlap_fraction``.
-
-    Args:
-        sizes: Of the blocks, shape (n, 3) [m].
-        positions: Of the blocks, shape (n, 3) [m].
-        orientations: Of the blocks, shape (n, 4).
-        goal_sizes: Shape (m, 3) [m].
-        goal_positions: Shape (m, 3) [m].
-        goal_orientations: Shape (m, 4).
-
-    Returns:
-        The fraction, in [0, 1].
-    """
-    n, m = len(sizes), len(goal_sizes)
-    edges, planes = np.empty((n + m, 24, 7)), np.empty((n + m, 6, 4))
-    for b in range(n):  # the last one first: what comes before block and goal lies side by side
-        at = n - 1 - b
-        box_kernel(sizes[b], positions[b], orientations[b], edges[at], planes[at])
-    for g in range(m):
-        at = n + g
-        box_kernel(goal_sizes[g], goal_positions[g], goal_orientations[g], edges[at], planes[at])
-    wanted, filled = 0.0, 0.0
-    for g in range(m):
-        wanted += remainder_kernel(edges[n + g], planes[n + g], planes[n : n + g])
-        for b in range(n):
-            before = planes[n - b : n + g]
-            filled += remainder_kernel(edges[n - 1 - b], planes[n + g], before)
-    return min(filled / wanted, 1.0) if wanted > 0.0 else 1.0
-
-
-def overlap_fraction(
-    sizes: ArrayLike,
-    positions: ArrayLike,
-    orientations: ArrayLike,
-    goal_sizes: ArrayLike,
-    goal_positions: ArrayLike,
-    goal_orientations: ArrayLike,
 ) -> float:
     """Compute how much of the volume that the goals cover the blocks cover, too.
 
@@ -268,29 +207,43 @@ def overlap_fraction(
         goal_orientations: Shape (m, 4).
 
     Returns:
-        The fraction, dimensionless, in [0, 1]. A world without goals, or whose goals have no
+        The fraction, in [0, 1]. A world without goals, or whose goals have no
         volume, is fulfilled: 1.0.
 
     Example:
         Two goals share a third of what they cover, and the block lies just there.
 
-        >>> upright = [[0.0, 0.0, 0.0, 1.0]]
-        >>> goals = ([[2.0, 1.0, 1.0]] * 2, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], upright * 2)
-        >>> round(overlap_fraction([[1.0, 1.0, 1.0]], [[0.5, 0.0, 0.0]], upright, *goals), 12)
+        >>> upright = np.array([[0.0, 0.0, 0.0, 1.0]])
+        >>> goals = np.full((2, 3), 2.0), np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+        >>> block = np.array([[1.0, 2.0, 2.0]]), np.array([[0.5, 0.0, 0.0]])
+        >>> round(overlap_fraction(*block, upright, *goals, np.repeat(upright, 2, axis=0)), 12)
         0.333333333333
 
     Source:
         Ahmed et al., *CausalWorld*, ICLR 2021, "fractional success".
     """
-    blocks = (_rows(sizes, 3), _rows(positions, 3), _rows(orientations, 4))
-    goals = (_rows(goal_sizes, 3), _rows(goal_positions, 3), _rows(goal_orientations, 4))
-    return float(overlap_fraction_kernel(*blocks, *goals))
+    n, m = len(sizes), len(goal_sizes)
+    edges, planes = np.empty((n + m, 24, 7)), np.empty((n + m, 6, 4))
+    for b in range(n):  # the last one first: what comes before block and goal lies side by side
+        at = n - 1 - b
+        box_kernel(sizes[b], positions[b], orientations[b], edges[at], planes[at])
+    for g in range(m):
+        at = n + g
+        box_kernel(goal_sizes[g], goal_positions[g], goal_orientations[g], edges[at], planes[at])
+    wanted, filled = 0.0, 0.0
+    for g in range(m):
+        wanted += remainder_kernel(edges[n + g], planes[n + g][:0], planes[n : n + g])
+        for b in range(n):
+            before = planes[n - b : n + g]
+            filled += remainder_kernel(edges[n - 1 - b], planes[n + g], before)
+    return min(filled / wanted, 1.0) if wanted > 0.0 else 1.0
 
 
 def _corners(sizes: ArrayLike, positions: ArrayLike, orientations: ArrayLike) -> Floats:
     """Compute the lower and the upper corner of the axis-aligned hulls, shape (2, n, 3) [m]."""
-    half, center = 0.5 * _rows(sizes, 3), _rows(positions, 3)
-    spread = np.einsum("nij,nj->ni", np.abs(rotation_matrix(_rows(orientations, 4))), half)
+    size, center = (np.reshape(rows, (-1, 3)).astype(float) for rows in (sizes, positions))
+    turns = np.abs(rotation_matrix(np.reshape(orientations, (-1, 4))))
+    spread = np.einsum("nij,nj->ni", turns, 0.5 * size)
     return np.stack((center - spread, center + spread))
 
 

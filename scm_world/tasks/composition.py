@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Container, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -36,8 +36,6 @@ class Entity:
         name: Prefix of its variables.
         variables: Its declarations. A ``Measured`` variable without a mechanism is a state: its
             parents are those that act when something is set, and physics adds the others.
-        parameters: The variables that set a physical parameter, each with which one.
-        actions: What acts through commands, with the states that it acts on in every step.
         kind: What it is, such as ``"goal"``, where it can be taken away; else empty.
         hull: The shape of a block or goal that is not a box.
         shape: The shape of a goal without a hull: ``"box"`` or ``"sphere"``.
@@ -45,8 +43,6 @@ class Entity:
 
     name: str
     variables: tuple[Variable, ...]
-    parameters: Mapping[str, ParameterKey] = field(default_factory=dict)
-    actions: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     kind: str = ""
     hull: Hull | None = None
     shape: str = "box"

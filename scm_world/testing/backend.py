@@ -165,7 +165,7 @@ class BackendConformance(ABC):
     def backend(self, scene: Scene) -> Iterator[Backend]:
         """Provide a backend in the middle of an episode."""
         with self.built(scene) as backend:
-            self.play(backend, 2, seed=1)
+            self.play(backend, 3, seed=1)
             yield backend
 
     @contextmanager

@@ -18,11 +18,8 @@ from scm_world.backends.renderer import (
     ORIGINAL,
     PLAIN,
     Convention,
-    depth_and_segmentation,
-    goal_pixels,
-    now_pixels,
+    camera_pixels,
     render,
-    resized,
 )
 from scm_world.models import GoalRegion, Light, Scene
 from scm_world.models.camera import Camera
@@ -40,10 +37,11 @@ def pixels(
     convention: Convention = PLAIN,
 ) -> NDArray[np.uint8]:
     """Draw what cameras see now, and then what they should see."""
-    cameras = cameras if size is None else resized(cameras, *size)
+    if size is not None:
+        cameras = [replace(camera, height=size[0], width=size[1]) for camera in cameras]
     out = np.empty((2 * len(cameras), *convention.shape(cameras[0])), dtype=np.uint8)
-    now_pixels(scene, cameras, out[: len(cameras)], convention=convention)
-    goal_pixels(goals or scene, cameras, out[len(cameras) :], convention=convention)
+    camera_pixels(scene, cameras, out[: len(cameras)], convention=convention)
+    camera_pixels(goals or scene, cameras, out[len(cameras) :], goals=True, convention=convention)
     return out
 
 
@@ -79,7 +77,7 @@ def parked(scene: Scene, *, obstacles: bool = True) -> Scene:
 def now(scene: Scene) -> np.ndarray:
     """Draw what the three cameras see now."""
     out = np.empty((3, 3, 128, 128), dtype=np.uint8)
-    now_pixels(scene, CAMERAS, out)
+    camera_pixels(scene, CAMERAS, out)
     return out
 
 
@@ -98,7 +96,7 @@ def test_pixels_are_those_of_render_but_for_shadows(scene: Scene) -> None:
 def test_goal_pixels_are_those_of_render_but_for_shadows(scene: Scene) -> None:
     """A goal picture shows goals, obstacles and a parked robot, and no blocks."""
     out = np.empty((3, 3, 128, 128), dtype=np.uint8)
-    goal_pixels(scene, CAMERAS, out)
+    camera_pixels(scene, CAMERAS, out, goals=True)
     for got, image in zip(out, [render(parked(scene), camera) for camera in CAMERAS], strict=True):
         unlike = (got.transpose(1, 2, 0) != image.rgb).any(axis=2)
         assert not (unlike & ~image.shows("floor")).any()
@@ -118,10 +116,10 @@ def test_without_shadows_pixels_are_those_of_render(scene: Scene) -> None:
 
 
 def test_observation_is_now_and_then_the_goal(scene: Scene) -> None:
-    """The first half is ``now_pixels``, the second half ``goal_pixels``."""
+    """The first half is what cameras see now, the second half what they should see."""
     both = pixels(scene, CAMERAS)
     then = np.empty((3, 3, 128, 128), dtype=np.uint8)
-    goal_pixels(scene, CAMERAS, then)
+    camera_pixels(scene, CAMERAS, then, goals=True)
 
     assert both.shape == (6, 3, 128, 128)
     assert both.dtype == np.uint8
@@ -193,7 +191,6 @@ def test_any_size(scene: Scene, size: tuple[int, int]) -> None:
     cameras = [replace(camera, height=size[0], width=size[1]) for camera in CAMERAS[:2]]
 
     assert both.shape == (4, 3, *size)
-    assert resized(CAMERAS[:2], *size) == tuple(cameras)
     np.testing.assert_array_equal(both, pixels(scene, cameras))
     inside = render(scene.with_(goals=()), cameras[0])
     mask = ~inside.shows("floor")
@@ -232,9 +229,9 @@ def test_any_array_can_be_written(scene: Scene) -> None:
     """Arrays that are parts of others, or lie in memory in another order, are filled as well."""
     expected = now(scene)
     gaps = np.zeros((6, 3, 128, 128), dtype=np.uint8)
-    now_pixels(scene, CAMERAS, gaps[::2])
+    camera_pixels(scene, CAMERAS, gaps[::2])
     columns = np.zeros((3, 3, 128, 128), dtype=np.uint8, order="F")
-    now_pixels(scene, CAMERAS, columns)
+    camera_pixels(scene, CAMERAS, columns)
 
     np.testing.assert_array_equal(gaps[::2], expected)
     np.testing.assert_array_equal(columns, expected)
@@ -244,29 +241,24 @@ def test_any_array_can_be_written(scene: Scene) -> None:
 def test_arrays_that_do_not_fit_are_refused(scene: Scene) -> None:
     """Wrong shapes and dtypes, mixed sizes and no cameras are answered."""
     with pytest.raises(ValueError, match="out: expected dtype uint8, got float64"):
-        now_pixels(scene, CAMERAS, np.zeros((3, 3, 128, 128)))
+        camera_pixels(scene, CAMERAS, np.zeros((3, 3, 128, 128)))
     with pytest.raises(ValueError, match=r"out: expected shape \(3, 3, 128, 128\)"):
-        now_pixels(scene, CAMERAS, np.zeros((3, 128, 128, 3), dtype=np.uint8))
+        camera_pixels(scene, CAMERAS, np.zeros((3, 128, 128, 3), dtype=np.uint8))
     with pytest.raises(ValueError, match="out: expected shape"):
         pixels(scene, [CAMERAS[0], OVERVIEW])
     with pytest.raises(ValueError, match="out: expected shape"):
-        now_pixels(scene, [], np.zeros((3, 3, 128, 128), dtype=np.uint8))
-    with pytest.raises(ValueError, match="cameras"):
-        depth_and_segmentation(scene, [CAMERAS[0], OVERVIEW])
+        camera_pixels(scene, [], np.zeros((3, 3, 128, 128), dtype=np.uint8))
 
 
 def test_depth_and_segmentation_are_those_of_render(scene: Scene) -> None:
-    """They are equal bit for bit, goals or not."""
-    depths, owners = depth_and_segmentation(scene, CAMERAS)
-    flipped = depth_and_segmentation(scene, CAMERAS, convention=ORIGINAL)
-
-    assert depths.dtype == np.float32
-    assert owners.dtype == np.int32
-    for i, image in enumerate([render(scene, camera) for camera in CAMERAS]):
-        np.testing.assert_array_equal(depths[i], image.depth)
-        np.testing.assert_array_equal(owners[i], image.segmentation)
-        np.testing.assert_array_equal(flipped[0][i], image.depth[::-1])
-        np.testing.assert_array_equal(flipped[1][i], image.segmentation[::-1])
+    """They are equal bit for bit whether pixels are colored or not."""
+    for camera in CAMERAS:
+        image, plain = render(scene, camera), render(scene, camera, colors=False)
+        assert plain.rgb.size == 0
+        assert plain.depth.dtype == np.float32
+        assert plain.segmentation.dtype == np.int32
+        np.testing.assert_array_equal(plain.depth, image.depth)
+        np.testing.assert_array_equal(plain.segmentation, image.segmentation)
 
 
 def test_scene_is_left_alone(scene: Scene) -> None:
@@ -285,11 +277,11 @@ def test_scene_is_left_alone(scene: Scene) -> None:
 
 SNIPPET = """
 import hashlib, numpy
-from scm_world.backends.renderer import now_pixels
+from scm_world.backends.renderer import camera_pixels
 from scm_world.tasks.trifinger.system import trifinger
 from scm_world.tasks.trifinger.cameras import CAMERAS
 pixels = numpy.empty((3, 3, 128, 128), numpy.uint8)
-now_pixels(trifinger(("a", "b")).default_scene(), CAMERAS, pixels)
+camera_pixels(trifinger(("a", "b")).default_scene(), CAMERAS, pixels)
 print(hashlib.sha256(pixels.tobytes()).hexdigest())
 """
 
@@ -297,7 +289,7 @@ print(hashlib.sha256(pixels.tobytes()).hexdigest())
 def test_pixels_are_equal_between_processes() -> None:
     """Another process sees the same pixels, bit for bit."""
     ours = np.empty((3, 3, 128, 128), np.uint8)
-    now_pixels(trifinger(("a", "b")).default_scene(), CAMERAS, ours)
+    camera_pixels(trifinger(("a", "b")).default_scene(), CAMERAS, ours)
     theirs = subprocess.run(  # noqa: S603 (our own interpreter and our own program)
         [sys.executable, "-c", SNIPPET], capture_output=True, text=True, check=True
     )

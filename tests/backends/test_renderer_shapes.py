@@ -11,7 +11,7 @@ from robot_scenes import box_hull
 
 from scm_world._types import Floats
 from scm_world.backends.renderer.kernels import Canvas
-from scm_world.backends.renderer.picture import following, framing
+from scm_world.backends.renderer.picture import automatic_camera, following_camera
 from scm_world.backends.renderer.shapes import SKY, draw_parts, goal_shapes, parted
 from scm_world.geometry import rotation_matrix
 from scm_world.models.camera import Camera
@@ -290,7 +290,7 @@ def test_framing_shows_all_that_moves_and_fills_the_picture() -> None:
     ]
     wall = shape("box", (20.0, 0.1, 20.0), (0.0, 30.0, 0.0))
     size = 90, 200
-    camera = framing(Shapes.of([FLOOR, wall, *moving]), size)
+    camera = automatic_camera(Shapes.of([FLOOR, wall, *moving]), size)
     points = camera.project(np.concatenate([corners(one) for one in moving]))
     share = points[:, :2] / (200, 90)
 
@@ -303,20 +303,22 @@ def test_framing_shows_all_that_moves_and_fills_the_picture() -> None:
 def test_framing_of_what_stands_still() -> None:
     """Where nothing moves, everything but planes is seen."""
     table = shape("box", (0.5, 0.5, 0.1), (1.0, 1.0, 0.5))
-    assert framing(Shapes.of([FLOOR, table]), (60, 80)).target == pytest.approx((1.0, 1.0, 0.5))
+    assert automatic_camera(Shapes.of([FLOOR, table]), (60, 80)).target == pytest.approx(
+        (1.0, 1.0, 0.5)
+    )
 
 
 def test_following_keeps_a_body_near_the_middle() -> None:
     """A camera stays while a body moves a little, and then goes along with it."""
     body = shape("ellipsoid", (0.1, 0.1, 0.1), moves=True)
-    camera = framing(Shapes.of([FLOOR, body]), (60, 80))
+    camera = automatic_camera(Shapes.of([FLOOR, body]), (60, 80))
     near = Shapes.of([body._replace(position=np.array([0.02, 0.0, 0.0]))])
-    assert following(camera, near) is camera
+    assert following_camera(camera, near) is camera
 
     offset = np.subtract(camera.eye, camera.target)
     for x in np.linspace(0.0, 10.0, 50):
         there = body._replace(position=np.array([x, 0.0, np.sin(x)]))
-        camera = following(camera, Shapes.of([FLOOR, there]))
+        camera = following_camera(camera, Shapes.of([FLOOR, there]))
         pixels = camera.project(corners(there))[:, :2]
         assert (pixels > 0.0).all()
         assert (pixels < (80.0, 60.0)).all()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from envs import MADE, PUSHING, REACHING, make, roll
 
-from scm_world.backends.renderer import goal_pixels
+from scm_world.backends.renderer import camera_pixels
 from scm_world.env.vector import WIDE, bounds, corners
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.geometry import from_rotation_vector, rotation_matrix
@@ -222,7 +222,7 @@ def test_pixels_show_now_and_then_the_goal() -> None:
     expected = np.empty((2, 3, 24, 32), np.uint8)
     cameras = env.unwrapped._observer._cameras
     assert [camera.name for camera in cameras] == ["300", "60"]
-    goal_pixels(env.unwrapped.world.scene(), cameras, expected)
+    camera_pixels(env.unwrapped.world.scene(), cameras, expected, goals=True)
     np.testing.assert_array_equal(first[2:], expected)
     moved = env.step(np.ones(9))[0]
     assert not np.array_equal(moved[:2], first[:2])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from itertools import product
 from pathlib import Path
 
@@ -12,9 +11,9 @@ from robot_scenes import box_hull
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from scm_world._types import Floats
-from scm_world.errors import MissingExtra, ModelError, UnknownOption
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry import rotation_matrix
-from scm_world.geometry.filling import overlap_kernel
+from scm_world.geometry.filling import overlap_fraction
 from scm_world.geometry.hulls import Hull, extents, hull_of, hull_overlap, load_hull
 
 HERE, UPRIGHT = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
@@ -213,11 +212,17 @@ def test_files_that_are_no_meshes(tmp_path: Path) -> None:
         load_hull(flat, scale=-1.0)
 
 
-def test_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the package, the command that installs it is given."""
-    file = write_obj(tmp_path / "cube.obj", cube_corners())
-    monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(MissingExtra, match="mesh"):
+def test_binary_stl_is_read(tmp_path: Path) -> None:
+    """A binary STL has a header, a count, and 50 bytes for each triangle; a cut one is refused."""
+    triangles = TETRAHEDRON[[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]].astype("<f4")
+    data = bytes(80) + (4).to_bytes(4, "little")
+    data += b"".join(bytes(12) + triangle.tobytes() + bytes(2) for triangle in triangles)
+    file = tmp_path / "body.stl"
+    file.write_bytes(data)
+
+    assert load_hull(file).volume == pytest.approx(1.0)
+    file.write_bytes(data[:-1])
+    with pytest.raises(ModelError, match=r"body\.stl: .* no volume"):
         load_hull(file)
 
 
@@ -237,10 +242,11 @@ def test_overlap_of_boxes(seed: int) -> None:
         turn_b = turn_a + 1e-9 * rng.normal(size=4)
         size_b, shift = size_a, HERE
     boxes = (size_a, shift, turn_a, size_b, HERE, turn_b)
+    shared = overlap_fraction(*(row[None].astype(float) for row in boxes)) * np.prod(size_b)
     hulls = (box_hull(size_a), shift, turn_a, box_hull(size_b), HERE, turn_b)
 
     smaller = min(np.prod(size_a), np.prod(size_b))
-    assert hull_overlap(*hulls) == pytest.approx(overlap_kernel(*boxes), abs=1e-12 * smaller)
+    assert hull_overlap(*hulls) == pytest.approx(shared, abs=1e-12 * smaller)
 
 
 @pytest.mark.parametrize("seed", range(10))

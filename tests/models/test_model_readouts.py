@@ -81,6 +81,27 @@ def test_readouts_are_what_the_engine_computes(name: str) -> None:
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-14)
 
 
+def test_velocities_of_a_body_that_is_given_in_the_world() -> None:
+    """The angular velocity of its frame is its state, and moves its shapes as a rigid body does."""
+    text = """<mujoco><worldbody><body name="cube"><freejoint/><geom size="0.1"/>
+    <site name="corner" pos="0.1 0.2 0.3"/></body></worldbody></mujoco>"""
+    names = [f"corner.{attribute}" for attribute in ("position", *POSES[2:])]
+    model = read_model(text, readouts=names, frame="world")
+    spin = np.array([0.3, -0.7, 1.1])
+    values: dict[str, Any] = {
+        "cube.cartesian_position": np.zeros(3),
+        "cube.orientation": np.array([0.5, 0.1, -0.4, 0.7]) / np.sqrt(0.91),
+        "cube.linear_velocity": np.zeros(3),
+        "cube.angular_velocity": spin,
+    }
+    place, speed, turning = (
+        readout.function(*(values[parent] for parent in readout.parents))
+        for readout in model.readouts
+    )
+    np.testing.assert_allclose(turning, spin, atol=1e-15)
+    np.testing.assert_allclose(speed, np.cross(spin, place), atol=1e-15)
+
+
 def test_a_readout_is_a_function() -> None:
     """The same values give the same bits, in any order of calls and in any thread."""
     place = only(read_model(PENDULUM, readouts=["tip.position"])).function

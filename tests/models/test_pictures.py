@@ -20,13 +20,12 @@ from scm_world.backends.renderer import (
     Convention,
     automatic_camera,
     body_names,
-    depth_and_segmentation,
+    camera_pixels,
     following_camera,
-    goal_pixels,
-    now_pixels,
     picture,
     render,
     scene_camera,
+    shapes_of,
 )
 from scm_world.backends.step import StepModel
 from scm_world.errors import ModelError, UnknownOption
@@ -124,7 +123,7 @@ def software(scene: Scene, camera: Camera | str | None = None) -> np.ndarray:
 
 def test_every_body_is_seen(scene: Scene) -> None:
     """The automatic camera sees every body that moves, and the floor."""
-    image = render(scene, automatic_camera(scene, size=(120, 160)))
+    image = render(scene, automatic_camera(shapes_of(scene), (120, 160)))
 
     assert image.names == body_names(scene.structure) == ("world", "ball", "arm", "pin")
     for name in image.names:
@@ -237,7 +236,7 @@ def test_named_cameras_and_their_errors(scene: Scene) -> None:
 
 def test_the_size_of_a_picture(scene: Scene) -> None:
     """It is what is asked for, or that of the camera, or 480 by 640."""
-    camera = automatic_camera(scene, size=(30, 50))
+    camera = automatic_camera(shapes_of(scene), (30, 50))
 
     assert picture(scene, camera).shape == (30, 50, 3)
     assert picture(scene, camera, SIZE).shape == (*SIZE, 3)
@@ -250,7 +249,7 @@ def test_the_size_of_a_picture(scene: Scene) -> None:
 def test_one_camera_for_two_scenes(scene: Scene) -> None:
     """A camera for several scenes sees what moves in each of them."""
     away = moved(scene, ball_cartesian_position=(6.0, 0.0, 1.0))
-    camera = automatic_camera(scene, away, size=SIZE)
+    camera = automatic_camera(shapes_of(scene).joined(shapes_of(away)), SIZE)
 
     for one in (scene, away):
         column, row, _ = camera.project(
@@ -258,7 +257,7 @@ def test_one_camera_for_two_scenes(scene: Scene) -> None:
         )
         assert 0 < column < SIZE[1]
         assert 0 < row < SIZE[0]
-    assert following_camera(camera, scene).eye != camera.eye
+    assert following_camera(camera, shapes_of(scene)).eye != camera.eye
 
 
 def test_pictures_of_the_trifinger_are_those_of_render() -> None:
@@ -317,19 +316,19 @@ def test_pixels_for_policies(scene: Scene) -> None:
     now, then, image = (
         np.empty((1, 3, *SIZE), np.uint8), np.empty((1, 3, *SIZE), np.uint8), render(scene, camera)
     )  # fmt: skip
-    now_pixels(wanted, (camera,), now)
-    goal_pixels(wanted, (camera,), then)
+    camera_pixels(wanted, (camera,), now)
+    camera_pixels(wanted, (camera,), then, goals=True)
     ball = image.shows("ball")
-    depth, numbers = depth_and_segmentation(wanted, (camera,))
+    plain = render(wanted, camera, colors=False)
     last = Convention(channels_last=True)
 
     np.testing.assert_array_equal(now[0].transpose(1, 2, 0)[ball], image.rgb[ball])
     assert (then[0, 1][ball] > 100).all()
     other = np.empty((1, *SIZE, 3), np.uint8)
-    now_pixels(wanted, (camera,), other, convention=last)
+    camera_pixels(wanted, (camera,), other, convention=last)
     np.testing.assert_array_equal(other[0], now[0].transpose(1, 2, 0))
-    np.testing.assert_array_equal(depth[0], image.depth)
-    np.testing.assert_array_equal(numbers[0], image.segmentation)
+    np.testing.assert_array_equal(plain.depth, image.depth)
+    np.testing.assert_array_equal(plain.segmentation, image.segmentation)
 
 
 # --- models that nobody here wrote -------------------------------------------------------------
@@ -357,7 +356,7 @@ def test_models_of_others_are_framed(path: tuple[str, ...]) -> None:
     """Everything that moves is in the picture, away from its edges, and large enough to be seen."""
     model = read_model(inside(*path))
     scene = model.default_scene()
-    image = render(scene, automatic_camera(scene, size=(120, 160)))
+    image = render(scene, automatic_camera(shapes_of(scene), (120, 160)))
     rows, columns = np.nonzero(image.segmentation > 0)
 
     assert rows.min() > 2
@@ -371,7 +370,7 @@ def test_a_robot_of_meshes_is_drawn_quickly() -> None:
     """A Panda of 10^5 triangles takes well under a second, and its looks hide what collides."""
     model = read_model(inside("robosuite", "models", "assets", "robots", "panda", "robot.xml"))
     scene = model.default_scene()
-    camera = automatic_camera(scene, size=(240, 320))
+    camera = automatic_camera(shapes_of(scene), (240, 320))
     picture(scene, camera)  # compiles
     start = perf_counter()
     rgb = picture(scene, camera).astype(int)
@@ -388,10 +387,10 @@ def test_the_camera_of_a_film_follows() -> None:
     """A half cheetah that runs for twenty meters stays in the picture."""
     model = read_model(inside("gymnasium", "envs", "mujoco", "assets", "half_cheetah.xml"))
     scene = model.default_scene()
-    camera = automatic_camera(scene, size=SIZE)
+    camera = automatic_camera(shapes_of(scene), SIZE)
     for x in np.linspace(0.0, 20.0, 41):
         there = moved(scene, rootx_position=x)
-        camera = following_camera(camera, there)
+        camera = following_camera(camera, shapes_of(there))
         columns = np.nonzero(render(there, replace(camera)).segmentation > 0)[1]
 
         assert columns.min() > 0

@@ -12,7 +12,7 @@ import numpy as np
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends import Backend
-from scm_world.backends.mujoco.backend import realize
+from scm_world.backends.mujoco.realization import Realization
 from scm_world.geometry.hulls import Hull, hull_of
 from scm_world.geometry.rotations import from_rotation_vector, quaternion_product
 from scm_world.models.scene import Difference, ParameterKey, Scene
@@ -61,7 +61,7 @@ def link_frames(joint_positions: ArrayLike) -> tuple[Floats, Floats]:
         Origins, shape (15, 3) [m], and quaternions (x, y, z, w), shape (15, 4).
     """
     scene = trifinger().default_scene()
-    model = realize(scene.structure, scene.parameters).model
+    model = Realization(scene.structure, scene.parameters).model
     data = mujoco.MjData(model)
     data.qpos[:9] = joint_positions
     mujoco.mj_kinematics(model, data)

@@ -219,8 +219,10 @@ class BulletBackend(Backend):
 
     def _bring(self, wish: Instant, *, light: bool = False) -> None:
         """Make a world the present, which stays as it was, should the engine fail half way."""
-        self._spare = self._spare or Client(self._engine)
-        client = self.base() if light else self._spare
+        if light:
+            client = self.base()
+        else:
+            client = self._spare = self._spare or Client(self._engine)
         try:
             if light:
                 client.edit(wish.parameters)
@@ -239,7 +241,8 @@ class BulletBackend(Backend):
         now = self._now
         if self._light:
             old = self._last.parameters
-            pending = {k: v for k, v in now.parameters.items() if not alike({k: v}, old, [k])}
+            given = now.parameters.items()
+            pending = {key: v for key, v in given if not alike(now.parameters, old, [key])}
             if pending:
                 self._history.edits.append((len(self._history.rows), pending))
         else:

@@ -88,7 +88,7 @@ class Unit:
     rows: list[list[Any]] = field(default_factory=list)
     shapes: list[tuple[dict[str, Any], float]] = field(default_factory=list)
     gears: list[tuple[int, int, float, float]] = field(default_factory=list)
-    rest: tuple[bytes, ...] = ()
+    rest: tuple[Any, ...] = ()
 
     def add(
         self,
@@ -138,8 +138,9 @@ class Built:
         data, engine, kept = mujoco.MjData(mj), self._engine, 0
         mujoco.mj_kinematics(mj, data)
         units = list(_units(mj, touching))
+        paired = {*mj.pair_geom1.tolist(), *mj.pair_geom2.tolist()}
         for unit in units:
-            _describe(unit, mj, data)
+            _describe(unit, mj, data, paired)
         for old, new in zip(self._units, units, strict=False):
             if old != new:
                 break
@@ -174,7 +175,7 @@ class Built:
                 rows[link][1] = number
         for row in rows:
             row[8] = getattr(engine, row[8])
-        # What touches what is said by pairs alone, also within the multibody.
+        # Pairs of shapes alone decide what touches, also within the multibody.
         flags = engine.URDF_USE_SELF_COLLISION | engine.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
         columns = dict(zip(LINK, map(list, zip(*rows, strict=True)), strict=bool(rows)))
         made = engine.createMultiBody(flags=flags if unit.bodies else 0, **base, **columns)
@@ -217,7 +218,7 @@ class Built:
                 engine.changeDynamics(made, link, collisionMargin=max(HULL_MARGIN, margin))
 
 
-def _describe(unit: Unit, mj: mujoco.MjModel, data: mujoco.MjData) -> None:
+def _describe(unit: Unit, mj: mujoco.MjModel, data: mujoco.MjData, paired: set[int]) -> None:
     """Fill in what a unit is made of."""
     carrier: dict[int, int] = {}  # the link whose frame moves with a body
     origin: dict[int, Floats | None] = {}  # of that frame, in the frame of the body
@@ -270,12 +271,13 @@ def _describe(unit: Unit, mj: mujoco.MjModel, data: mujoco.MjData) -> None:
     for geom in unit.geoms:
         shape = _shape(mj, geom, origin[int(mj.geom_bodyid[geom])])
         unit.shapes.append((shape, float(mj.geom_margin[geom])))
-    for equality in couplings(mj, unit.joints):
+    for equality in couplings(mj, unit.joints) if unit.joints else ():
         ends = hinges[int(mj.eq_obj1id[equality])], hinges[int(mj.eq_obj2id[equality])]
         unit.gears.append((*ends, *mj.eq_data[equality, :2].tolist()))
-    paired = np.isin(unit.geoms, [mj.pair_geom1, mj.pair_geom2])
-    rest = (mj.jnt_limited[unit.joints], paired, mj.numeric_data, np.array(mj.opt.disableflags))
-    unit.rest = tuple(part.tobytes() for part in rest)
+    unit.rest = (
+        *(mj.jnt_limited[unit.joints].tobytes(), mj.numeric_data.tobytes(), mj.opt.disableflags),
+        *(geom in paired for geom in unit.geoms),
+    )
 
 
 def _shape(mj: mujoco.MjModel, geom: int, origin: Floats | None) -> dict[str, Any]:

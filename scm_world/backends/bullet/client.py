@@ -58,7 +58,7 @@ def alike(one: Parameters, other: Parameters, keys: Iterable[ParameterKey]) -> b
 
 
 def shares(mj: mujoco.MjModel, geoms: Iterable[int], usual: float) -> dict[int, float]:
-    """Give each shape a number, so that a contact has the product of two as its friction.
+    """Compute a number for each shape, so that a contact has the product of two as its friction.
 
     A model says the larger of two coefficients. The product is that wherever a moving shape
     touches fixed ones that are all alike, and wherever one of two moving shapes has the usual
@@ -88,14 +88,14 @@ def shares(mj: mujoco.MjModel, geoms: Iterable[int], usual: float) -> dict[int, 
 
 
 def usual_friction(mj: mujoco.MjModel) -> float:
-    """Give the coefficient in the middle of those of the moving shapes that touch something."""
+    """Return the coefficient in the middle of those of the moving shapes that touch something."""
     shapes = Couplings(mj).touches.any(axis=1) & (mj.body_treeid[mj.geom_bodyid] >= 0)
     found = np.where(mj.geom_condim == 1, 0.0, mj.geom_friction[:, 0])[shapes]
     return float(statistics.median_low(found.tolist() or [0.0]))
 
 
 def spinning_shares(mj: mujoco.MjModel) -> dict[int, float]:
-    """Give each shape in a pair what it gets of the spinning friction of its pairs.
+    """Compute the share of each shape in the spinning friction of its pairs.
 
     The engine combines two shapes to ``s1 f2 + s2 f1`` with the factors f of sliding friction. With
     these shares that is the spinning friction of the pair where one of the two has the largest
@@ -112,7 +112,7 @@ def spinning_shares(mj: mujoco.MjModel) -> dict[int, float]:
 
 
 def restitution(damping: float) -> float:
-    """Give what is left of the speed after half a period of a spring with a damping ratio."""
+    """Compute the share of speed that half a period of a spring with a damping ratio leaves."""
     if not 0.0 <= damping < 1.0:
         return 0.0
     return math.exp(-math.pi * damping / math.sqrt(1.0 - damping * damping))
@@ -177,7 +177,7 @@ class Client:
         self._twin.place(instant.state)
         for part in self._parts:
             part.put(self._twin.data)
-        for place in self._built.geoms.values():  # what touches what is said by pairs
+        for place in self._built.geoms.values():  # pairs decide what touches
             self.engine.setCollisionFilterGroupMask(*place, 0, 0)
         self._check(instant.state)
 
@@ -205,11 +205,11 @@ class Client:
             self._connect()
             self._parts = parts(self.engine, mj, self._built.joints, range(mj.ntree))
             self._trees, self._driven = set[int](), list[Part]()
-            self._inside, self._twin.edited = parameters, True
+            self._inside, self._changed = parameters, True
         self._tell_all()
 
     def _connect(self) -> None:
-        """Say which shapes may touch, pair by pair."""
+        """Set which shapes may touch, pair by pair."""
         geoms = self._built.geoms
         wanted = {(*geoms[first], *geoms[second]) for first, second in self._touching}
         self._ruled |= wanted  # this holds as long as the client
@@ -218,7 +218,7 @@ class Client:
             self.engine.setCollisionFilterPair(body, other, link, its, enabled)
 
     def _check(self, state: Floats) -> None:
-        """Make sure that the engine took the state, up to rounding and the sign of a quaternion.
+        """Check that the engine took the state, up to rounding and the sign of a quaternion.
 
         Raises:
             EngineFailure: It did not.
@@ -244,14 +244,15 @@ class Client:
         self._tell_all()
 
     def _take(self, parameters: Parameters) -> None:
-        """Give MuJoCo's model what it was not given before."""
+        """Write the parameters that are new to MuJoCo's model."""
         fresh = {k: v for k, v in parameters.items() if self._given.get(k) is not v}
-        self._twin.edit(fresh)
-        self._given |= fresh
+        if fresh:
+            self._twin.edit(fresh)
+            self._given, self._changed = {**self._given, **fresh}, True
 
     def _tell_all(self) -> None:
-        """Tell the engine what differs from what it was told before."""
-        if not self._twin.edited:
+        """Set in the engine whatever differs from its last setting."""
+        if not self._changed:
             return
         for what, value in self._settings():
             if self._told.get(what) != value:
@@ -262,7 +263,7 @@ class Client:
         if self._trees != moved:
             self._trees = moved
             self._driven = parts(self.engine, self._twin.model, self._built.joints, moved)
-        self._twin.edited = False
+        self._changed = False
 
     def _settings(self) -> Iterator[tuple[Setting, tuple[dict[str, Any], Any]]]:
         """List what live bodies have: arguments of functions, and what else their effect is of."""

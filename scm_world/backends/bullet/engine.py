@@ -64,22 +64,21 @@ def _disconnect(engine: Any, handle: int) -> None:
 
 @contextmanager
 def silence() -> Iterator[None]:
-    """Send what is written to the file descriptors of stdout and stderr nowhere."""
-    _flush()
+    """Discard what is written to the file descriptors of stdout and stderr."""
     saved: dict[int, int] = {}
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
+    _flush()
+    with open(os.devnull, "w") as nowhere:
         for stream in (1, 2):
             with suppress(OSError):  # a daemon may have closed it
                 saved[stream] = os.dup(stream)
-                os.dup2(nowhere, stream)
+                os.dup2(nowhere.fileno(), stream)
+    try:
         yield
     finally:
         _flush()
         for stream, copy in saved.items():
             os.dup2(copy, stream)
             os.close(copy)
-        os.close(nowhere)
 
 
 def _flush() -> None:

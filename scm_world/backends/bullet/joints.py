@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from typing import Any, final
 
@@ -14,7 +13,7 @@ from scm_world._types import Floats, Integers
 from scm_world.backends.bullet.build import BALL, FREE, UNTURNED, Handle, composed, plain, rotated
 
 
-class Part(ABC):
+class _Joints:
     """Joints that the engine is asked and told of together.
 
     Args:
@@ -27,21 +26,9 @@ class Part(ABC):
         self._engine, joints = engine, list(places)
         self._starts = np.stack([mj.jnt_qposadr[joints], mj.jnt_dofadr[joints]], axis=1)
 
-    @abstractmethod
-    def put(self, data: mujoco.MjData) -> None:
-        """Give the engine the state that MuJoCo has."""
-
-    @abstractmethod
-    def take(self, data: mujoco.MjData) -> None:
-        """Give MuJoCo the state that the engine has."""
-
-    @abstractmethod
-    def drive(self, data: mujoco.MjData, forces: Floats) -> None:
-        """Apply generalized forces in the next step. MuJoCo has bodies where they are before it."""
-
 
 @final
-class Scalars(Part):
+class Scalars(_Joints):
     """Hinges and slides."""
 
     def __init__(self, engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle]) -> None:
@@ -58,7 +45,7 @@ class Scalars(Part):
         self._shifted = bool(self._references.any())
 
     def put(self, data: mujoco.MjData) -> None:
-        """Give the engine the state that MuJoCo has."""
+        """Set the state in the engine to that of MuJoCo."""
         values = (data.qpos[self._positions] - self._references).tolist()
         speeds = data.qvel[self._velocities].tolist()
         tell = self._engine.resetJointState
@@ -66,7 +53,7 @@ class Scalars(Part):
             tell(*place, value, speed)
 
     def take(self, data: mujoco.MjData) -> None:
-        """Give MuJoCo the state that the engine has."""
+        """Set the state of MuJoCo to that in the engine."""
         rows = [row for body, links in self._links for row in self._ask(body, links)]
         data.qpos[self._positions] = [row[0] for row in rows]
         if self._shifted:
@@ -74,7 +61,7 @@ class Scalars(Part):
         data.qvel[self._velocities] = [row[1] for row in rows]
 
     def drive(self, data: mujoco.MjData, forces: Floats) -> None:
-        """Apply forces along the joints."""
+        """Apply forces along the joints in the next step; MuJoCo has the positions before it."""
         given = forces[self._velocities].tolist()
         for multibody, links in self._links:
             own, given = given[: len(links)], given[len(links) :]
@@ -89,7 +76,7 @@ def _run(numbers: Integers) -> Any:
 
 
 @final
-class Ball(Part):
+class Ball(_Joints):
     """A ball joint. The engine has it about the principal axes of the body."""
 
     def __init__(self, engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle]) -> None:
@@ -103,13 +90,13 @@ class Ball(Part):
         self._back = np.array([1.0, -1.0, -1.0, -1.0]) * self._axes
 
     def put(self, data: mujoco.MjData) -> None:
-        """Give the engine the state that MuJoCo has."""
+        """Set the state in the engine to that of MuJoCo."""
         turn = composed(composed(self._back, data.qpos[self._turn]), self._axes)
         spin = rotated(self._back, data.qvel[self._spin]).tolist()
         self._engine.resetJointStateMultiDof(*self._place, plain(turn), spin)
 
     def take(self, data: mujoco.MjData) -> None:
-        """Give MuJoCo the state that the engine has."""
+        """Set the state of MuJoCo to that in the engine."""
         (x, y, z, w), spin, *_ = self._engine.getJointStateMultiDof(*self._place)
         turn = composed(composed(self._axes, np.array([w, x, y, z])), self._back)
         data.qpos[self._turn] = turn
@@ -122,7 +109,7 @@ class Ball(Part):
 
 
 @final
-class Free(Part):
+class Free(_Joints):
     """Free bodies. The engine has the motion of their centers, and turns of their principal axes.
 
     Their coordinates in MuJoCo are positions of their frames.
@@ -136,7 +123,7 @@ class Free(Part):
         self._pose, self._velocity = engine.getBasePositionAndOrientation, engine.getBaseVelocity
 
     def put(self, data: mujoco.MjData) -> None:
-        """Give the engine the state that MuJoCo has."""
+        """Set the state in the engine to that of MuJoCo."""
         rows = np.empty((len(self._multibodies), 13))
         _to_centers(data.qpos, data.qvel, self._starts, self._centers, self._axes, rows)
         for body, row in zip(self._multibodies, rows.tolist(), strict=True):
@@ -144,7 +131,7 @@ class Free(Part):
             self._engine.resetBaseVelocity(body, row[7:10], row[10:])
 
     def take(self, data: mujoco.MjData) -> None:
-        """Give MuJoCo the state that the engine has, with quaternions whose w >= 0.
+        """Set the state of MuJoCo to that in the engine, with quaternions whose w >= 0.
 
         The engine keeps a matrix: which of two quaternions it makes of it has no meaning.
         """
@@ -166,12 +153,15 @@ class Free(Part):
             engine.applyExternalTorque(multibody, -1, torque, world)
 
 
+Part = Scalars | Ball | Free
+
+
 def parts(
     engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle], trees: Collection[int]
 ) -> list[Part]:
     """List what can move in some kinematic trees, as few parts as there can be."""
     tree_of, found = mj.body_treeid[mj.jnt_bodyid].tolist(), list[Part]()
-    together: dict[type[Part], dict[int, Handle]] = {}
+    together: dict[type[Scalars | Free], dict[int, Handle]] = {}
     for joint, place in sorted(places.items()):
         kind = int(mj.jnt_type[joint])
         if tree_of[joint] not in trees:
@@ -249,7 +239,7 @@ def _from_centers(
     positions: Floats,
     velocities: Floats,
 ) -> None:
-    """Do the opposite of ``_to_centers``, with quaternions whose w is not negative."""
+    """Compute the opposite of ``_to_centers``, with quaternions whose w is not negative."""
     back = np.array([-1.0, -1.0, -1.0, 1.0])
     for i in range(len(rows)):
         q, v = starts[i, 0], starts[i, 1]

@@ -38,6 +38,7 @@ class Payload:
     Attributes:
         structure: Of the scene.
         parameters: All of them, as they were applied.
+        revision: Theirs; see ``Realization``.
         numbers: ``mjSTATE_INTEGRATION``.
         memory: What the realization keeps.
         touches: The contacts of the last physics step.
@@ -46,6 +47,7 @@ class Payload:
 
     structure: Structure
     parameters: Parameters
+    revision: object
     numbers: Floats
     memory: Any
     touches: Touches | None
@@ -158,7 +160,7 @@ class MujocoBackend(Backend):
         now = self._now
         touches = self._touches if now.replay is not None else self._last_touches()
         replay = now.replay if touches is None else None
-        state = now.numbers(), now.memory()
+        state = now.revision, now.numbers(), now.memory()
         payload = Payload(now.structure, dict(now.kept), *state, touches, replay)
         return EngineSnapshot.of(self, payload)
 
@@ -170,9 +172,9 @@ class MujocoBackend(Backend):
         """
         payload: Payload = snapshot.opened(self)
         now: Realization | None = vars(self).get("_now")
-        if now is None or now.applied is not payload.parameters:
+        if now is None or now.revision is not payload.revision:
             now = self._realized(payload.structure, payload.parameters)
-            now.applied = payload.parameters
+            now.revision = payload.revision
         now.recall(payload.numbers, payload.memory)
         now.replay = payload.replay
         self._now, self.slot, self._touches = now, None, payload.touches
@@ -182,18 +184,15 @@ class MujocoBackend(Backend):
         """The compiled model, with parameters and state of the scene when it is not in a slot."""
         return self._now
 
-    def move_to(self, slot: Slot) -> bool:
-        """Copy the state to a slot; tell whether the model has changed since the last time."""
-        now = self._now
-        edited = now.edited
+    def move_to(self, slot: Slot) -> Realization:
+        """Copy the state to a slot; return the model with the parameters of the scene."""
         if self.slot != slot:
             self._return()
-            slot[0].take(slot[1], now)
-            self.slot, edited = slot, True
-        now.forget()
+            slot[0].take(slot[1], self._now)
+            self.slot = slot
+        self._now.forget()
         self._touches = None
-        now.edited = False
-        return edited
+        return self._now
 
     def _return(self) -> None:
         """Take the state back from where it is stepped."""

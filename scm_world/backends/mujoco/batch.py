@@ -50,6 +50,7 @@ class Simulations:
         # Scenes that are as the first one was share a copy of its model: it stays in the cache.
         self.usual = scene.fingerprint(), copy.copy(scene.model)
         self.models: list[mujoco.MjModel] = [self.usual[1]] * n
+        self.seen: list[Any] = [None] * n  # the model and revision of each scene
         self.read = scene.rows(self.batch)
         self._width = len(scene.command)
         self._commands = self.batch.bind("ctrl")
@@ -126,10 +127,11 @@ class MujocoBatch(EngineBatch):
             slot = group, _ = self._slot(index)
             key = id(group)
             groups.setdefault(key, (group, []))[1].append(index)
-            if self._backends[index].move_to(slot):
-                scene, (fingerprint, model) = self._backends[index].realization, group.usual
-                alike = scene.fingerprint() == fingerprint
-                group.models[index] = model if alike else scene.model
+            scene = self._backends[index].move_to(slot)
+            if group.seen[index] != (scene.model, scene.revision):
+                group.seen[index] = scene.model, scene.revision
+                alike = scene.fingerprint() == group.usual[0]
+                group.models[index] = group.usual[1] if alike else scene.model
                 changed.add(key)
         problems = []
         everyone = len(groups) == 1 and len(which) == len(self._backends)

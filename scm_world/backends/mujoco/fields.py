@@ -55,7 +55,6 @@ class Element:
     Attributes:
         mj: The model, which is only read.
         trees: Its trees.
-        fluid: Whether a medium acts, or may be made to act.
         kind: See ``ROWS``.
         i: Its number among those of its kind.
         name: Its name.
@@ -63,7 +62,6 @@ class Element:
 
     mj: mujoco.MjModel
     trees: Couplings
-    fluid: bool
     kind: str
     i: int
     name: str
@@ -130,13 +128,6 @@ class Element:
         start = int(self["dofadr"])
         count = {FREE: 6, BALL: 3}.get(int(self["type"]), 1)
         return start if count == 1 else slice(start, start + count)
-
-    @property
-    def rolls(self) -> bool:
-        """Whether a tendon runs around shapes."""
-        start = int(self["adr"])
-        path = self.mj.wrap_type[start : start + int(self["num"])].tolist()
-        return int(_WRAP.mjWRAP_SPHERE) in path or int(_WRAP.mjWRAP_CYLINDER) in path
 
     @property
     def servo(self) -> str:
@@ -572,7 +563,8 @@ _TENDON = (
     Row("frictionloss", "{F}", "Dry friction along the tendon.",
         "tendon_frictionloss", constant=True, low=0.0, usual=_stretched, flags=_FRICTION),
     Row("armature", "{I}", "Inertia that the tendon adds.", "tendon_armature",
-        constant=True, low=0.0, usual=_nonzero, acts=lambda e: not e.rolls,
+        constant=True, low=0.0, usual=_nonzero,
+        acts=lambda e: not e.trees.links["tendon"][e.i].geoms,
         reason="is not possible: the tendon runs around shapes"),
     Row("springlength", "{L}", "Lengths between which the spring is at rest.",
         "tendon_lengthspring", constant=True, usual=lambda e, v: bool(e["stiffness"]),
@@ -649,11 +641,11 @@ _OPTION = (
     Row("timestep", "s", "Physics step; a control step has a fixed number of them.",
         _number("timestep"), low=SMALLEST),
     Row("wind", "m/s", "Velocity of the medium.", "opt.wind", lambda e: (),
-        acts=lambda e: e.fluid, reason="acts on nothing: density and viscosity are zero"),
+        acts=lambda e: e.trees.fluid, reason="acts on nothing: density and viscosity are zero"),
     Row("density", "kg/m^3", "The density of the medium.", _number("density"), low=0.0,
-        usual=lambda e, v: e.fluid),
+        usual=lambda e, v: e.trees.fluid),
     Row("viscosity", "Pa s", "The viscosity of the medium.", _number("viscosity"), low=0.0,
-        usual=lambda e, v: e.fluid),
+        usual=lambda e, v: e.trees.fluid),
     Row("impratio", "1", "Stiffness of friction in relation to that of contact.",
         _number("impratio"), low=SMALLEST, usual=False,
         effect=lambda e: e.trees.touching(e.trees.every)),
@@ -667,9 +659,7 @@ ROWS: dict[str, tuple[Row, ...]] = {
 """The parameters of each kind of elements, in the order in which they are listed."""
 
 
-def table(
-    mj: mujoco.MjModel, data: mujoco.MjData, trees: Couplings, *, fluid: bool = False
-) -> list[Parameter]:
+def table(mj: mujoco.MjModel, data: mujoco.MjData, trees: Couplings) -> list[Parameter]:
     """List the parameters of a compiled model, each with its own name, also those that are refused.
 
     Where two elements have the same name and attribute, the usual one keeps the plain name; if
@@ -680,15 +670,13 @@ def table(
         mj: The model.
         data: The state in which episodes begin.
         trees: Of the model.
-        fluid: Whether a medium may be made to act although it does not now.
     """
-    fluid = fluid or mj.opt.density > 0.0 or mj.opt.viscosity > 0.0
-    names, trees = element_names(mj), Couplings(mj, fluid) if fluid else trees
+    names = element_names(mj)
     found: dict[str, list[tuple[str, Parameter]]] = {}
     order = []
     for kind, rows in ROWS.items():
         for i, name in enumerate(names.get(kind, ("",))):
-            element = Element(mj, trees, fluid, kind, i, name)
+            element = Element(mj, trees, kind, i, name)
             for row in rows if (kind, i) != ("body", 0) else ():  # the world has none
                 if row.exists(element):
                     order.append((kind, _parameter(row, element, data)))

@@ -53,13 +53,10 @@ CALLBACKS = {
     for name in ("control", "passive", "act_dyn", "act_gain", "act_bias", "contactfilter")
 }
 """What gives the callbacks of a user that act on the physics."""
-_control, _passive, _act_dyn, _act_gain, _act_bias, _filter = CALLBACKS.values()
 
 
 def callbacks() -> list[str]:
     """List why no model can have the callbacks that are in use; usually there are none."""
-    if not (_control() or _passive() or _act_dyn() or _act_gain() or _act_bias() or _filter()):
-        return []
     return [
         f"the callback mjcb_{name} is in use: what it acts on is unknown; call "
         f"mujoco.set_mjcb_{name}(None)"
@@ -150,7 +147,9 @@ def read_model(
         mj, changed = realized(sealed)
     _check(mj, where)
     start = _start(mj, keyframe)
-    trees = Couplings(mj)
+    patterns = None if expose is None else [expose] if isinstance(expose, str) else list(expose)
+    medium = [p for p in patterns or () if p != "*" and fnmatch.filter(MEDIUM, p)]
+    trees = Couplings(mj, fluid=bool(medium))
     names = element_names(mj)
     elements = {row.name: row for row in _states(mj, names, trees, start, frame)}
     moving = _grouped(elements, states, [reported] if isinstance(reported, str) else [*reported])
@@ -160,13 +159,11 @@ def read_model(
         if [row.name for row in inputs] != [f"{name}.control" for name in controls]:
             first = [row.name.removesuffix(".control") for row in inputs]
             raise ModelError([f"controls={[*controls]}: the first actuators are {first}"])
-    patterns = None if expose is None else [expose] if isinstance(expose, str) else list(expose)
-    fluid = patterns is not None and any(fnmatch.filter(MEDIUM, p) for p in patterns if p != "*")
     if bindings is not None:
         rows = tuple(bindings(mj, start, trees))
         chosen = {row.name for row in rows}
     else:
-        rows = tuple(table(mj, start, trees, fluid=fluid))
+        rows = tuple(table(mj, start, trees))
         chosen = _exposed(rows, patterns)
     parameters = tuple(row for row in rows if row.name in chosen)
     wrong = reversed_ranges({row.key: row.default for row in parameters})
@@ -183,6 +180,15 @@ def read_model(
     keys += "" if part_of is None else f"\0{[*part_of.items()]}"
     keys += "" if (frame, len(inputs)) == ("body", mj.nu) else f"\0{frame} {len(inputs)}"
     owners = [names["body"][int(body)] for body in mj.geom_bodyid]
+    bodies = tuple(
+        BodyRow(
+            name,
+            trees.tree(body) if mj.body_treeid[body] >= 0 else -1,
+            tuple(names["geom"][geom] for geom in np.flatnonzero(mj.geom_bodyid == body)),
+            tuple(names["joint"][joint] for joint in np.flatnonzero(mj.jnt_bodyid == body)),
+        )
+        for body, name in enumerate(names["body"])
+    )
     return Model(
         name=name or own_name or "model",
         digest=hashlib.sha256(f"{sealed.digest}\0{keys}".encode()).hexdigest(),
@@ -200,7 +206,7 @@ def read_model(
         ),
         notes=(*replaced, *changed, *drift, *_notes(mj, keyframe, staged)),
         staged=staged,
-        bodies=tuple(_bodies(mj, names, trees)),
+        bodies=bodies,
         owners=(*((part_of or {}).get(name, name) for name in owners), *names["flex"]),
     )
 
@@ -211,16 +217,6 @@ def compiled(model: Model) -> mujoco.MjModel:
     It is compiled once in a process. Callers copy it before they change it.
     """
     return realized(model.source)[0]
-
-
-def _bodies(
-    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings
-) -> Iterator[BodyRow]:
-    """List the bodies."""
-    for body, name in enumerate(names["body"]):
-        shapes = tuple(names["geom"][geom] for geom in np.flatnonzero(mj.geom_bodyid == body))
-        joints = tuple(names["joint"][joint] for joint in np.flatnonzero(mj.jnt_bodyid == body))
-        yield BodyRow(name, trees.tree(body) if mj.body_treeid[body] >= 0 else -1, shapes, joints)
 
 
 def _check(mj: mujoco.MjModel, where: str) -> None:

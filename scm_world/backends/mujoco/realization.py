@@ -90,9 +90,8 @@ class Realization:
         model: With the present parameters.
         data: With the present state.
         kept: The parameters in force; at first, none has been written.
-        applied: The parameters of a snapshot, while they are those in force.
+        revision: What the parameters in force are told from others by; new with every change.
         command: Where it is written, shape (n_commands,).
-        edited: Whether the model has changed since someone last cleared this.
         lean: Whether ``mjSTATE_INTEGRATION`` is all that a scene has to keep.
         replay: ``mjSTATE_INTEGRATION`` before the last steps and how many these were, if they were
             taken elsewhere, so that their contacts are not in the data.
@@ -113,9 +112,7 @@ class Realization:
         self._bodies = structure.body_names
         self.owners = structure.owners
         self.kept: dict[ParameterKey, Floats] = {}
-        self.applied: Parameters | None = None
-        self._numbers: bytes | None = None  # of what is kept, if nothing was written since
-        self.edited = True
+        self.revision = object()
         self.replay: tuple[Floats, int] | None = None
         self.command = data.ctrl[: structure.n_commands]
         self._forces = data.qfrc_actuator
@@ -295,9 +292,7 @@ class Realization:
 
     def fingerprint(self) -> tuple[Any, ...]:
         """Return a digest of the model without its structure: models of one digest are alike."""
-        if self._numbers is None:
-            self._numbers = b"".join(value.tobytes() for value in self.kept.values())
-        return tuple(self.kept), self._numbers
+        return tuple(self.kept), b"".join(value.tobytes() for value in self.kept.values())
 
     def check(self, keys: Iterable[ParameterKey]) -> None:
         """Raise ``UnknownOption`` for the first parameter that there is not."""
@@ -333,12 +328,11 @@ class Realization:
                     continue
                 given = np.array(value, dtype=np.float64)
                 if present is None or given.tobytes() != present.tobytes():
-                    before[key], self.applied = present, None
+                    before[key], self.revision = present, object()
                     slots[key].write(given)
                 kept[key] = given
             if not before:
                 return
-            self.edited, self._numbers = True, None
             wrong = reversed_ranges({key: kept[key] for key in before})
             reason = REVERSED if wrong else self.followed(before)
             if reason:
@@ -347,7 +341,6 @@ class Realization:
                 values = [parameters[key] for key in wrong]
                 raise Infeasible(names, values[0] if len(values) == 1 else values, [reason])
         except BaseException:
-            self._numbers = None
             for key, old in before.items():
                 if old is not None:  # where there is none, the model is new and is given up
                     kept[key] = old

@@ -218,26 +218,18 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
 
 
 def _contents(path: Path) -> str:
-    """Read and decode a model file."""
-    advice = "give the path of an MJCF (.xml, .mjcf) or URDF (.urdf) file, or XML text"
-    try:
-        data = read_bytes(path)
-    except OSError as error:
-        raise UnreadableFile(str(path), (error.strerror or str(error)).lower(), advice) from error
-    text = _decoded(data)
-    if "\0" in text.rstrip("\0"):
-        raise UnreadableFile(str(path), "it is no text", advice)
-    return text
-
-
-def _decoded(data: bytes) -> str:
-    """Decode XML by its byte order mark, or by the encoding that it declares; else as UTF-8.
+    """Read a model file, and decode it by its byte order mark or declaration; else as UTF-8.
 
     Bytes without a meaning become U+FFFD, because they count in names alone.
 
     Source:
         *Extensible Markup Language (XML) 1.0*, appendix F.
     """
+    advice = "give the path of an MJCF (.xml, .mjcf) or URDF (.urdf) file, or XML text"
+    try:
+        data = read_bytes(path)
+    except OSError as error:
+        raise UnreadableFile(str(path), (error.strerror or str(error)).lower(), advice) from error
     declared = re.match(rb"\s*<\?xml[^>]*?\bencoding\s*=\s*[\"']([\w.:-]+)", data)
     encoding = declared[1].decode("ascii", "replace") if declared else "utf-8"
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -248,7 +240,10 @@ def _decoded(data: bytes) -> str:
         text = data.decode(encoding, "replace")
     except LookupError:  # MuJoCo reads it as UTF-8, too
         text = data.decode("utf-8-sig", "replace")
-    return text.replace("\r\n", "\n")
+    text = text.replace("\r\n", "\n").rstrip("\0")
+    if "\0" in text:
+        raise UnreadableFile(str(path), "it is no text", advice)
+    return text
 
 
 def _included(text: str, folder: Path) -> dict[str, bytes]:

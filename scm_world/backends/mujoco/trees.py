@@ -73,24 +73,27 @@ class Couplings:
 
     Args:
         mj: The model. It is only read.
-        fluid: Whether a medium acts, or may be made to act.
+        fluid: Whether a medium acts, or may be made to act; it acts in any case if it is dense.
 
     Attributes:
+        fluid: The same.
         roots: Number of the body at the root of each tree.
+        links: What joins trees, by kind and number.
     """
 
     def __init__(self, mj: mujoco.MjModel, fluid: bool = False) -> None:
-        self._mj, self._fluid = mj, fluid
+        self._mj = mj
+        self.fluid = fluid or mj.opt.density > 0.0 or mj.opt.viscosity > 0.0
         self._moves = np.asarray(mj.body_treeid) >= 0
         self.roots = sorted({int(root) for root in mj.body_rootid[self._moves]})
         number = {root: i for i, root in enumerate(self.roots)}
         self._tree = np.array([number.get(int(root), -1) for root in mj.body_rootid])
-        self._links: dict[str, list[Link]] = {}
+        self.links: dict[str, list[Link]] = {}
         for kind, count in (
             ("tendon", mj.ntendon), ("flex", mj.nflex), ("equality", mj.neq),
             ("actuator", mj.nactuator),
         ):  # fmt: skip
-            self._links[kind] = [getattr(self, f"_{kind}")(i) for i in range(count)]
+            self.links[kind] = [getattr(self, f"_{kind}")(i) for i in range(count)]
         self._coupled = _groups(len(self.roots), (link.trees for link in self._all_links()))
         self._known: dict[Trees, Effect] = {}
 
@@ -149,7 +152,7 @@ class Couplings:
         """Return the effect of the size or place of a shape: contact, tendons, a medium."""
         body = int(self._mj.geom_bodyid[geom])
         trees = NONE.union(*(link.trees for link in self._all_links() if geom in link.geoms))
-        if self._fluid and self._moves[body] and self._mj.geom_fluid[geom, 0] > 0.0:
+        if self.fluid and self._moves[body] and self._mj.geom_fluid[geom, 0] > 0.0:
             trees |= {self.tree(body)}
         always, contact = self.always(trees)
         return always, (contact | self._reached(self._touched(geom))) - always
@@ -169,13 +172,13 @@ class Couplings:
 
     def tendon(self, tendon: int) -> Effect:
         """Return the effect of a tendon: on what it reaches."""
-        return self.always(self._links["tendon"][tendon].trees)
+        return self.always(self.links["tendon"][tendon].trees)
 
     def equality(self, equality: int) -> Effect:
         """Return the effect of an equality constraint: on what it joins."""
         if disabled(self._mj, _OFF.mjDSBL_EQUALITY):
             return NOTHING
-        return self.always(self._links["equality"][equality].trees)
+        return self.always(self.links["equality"][equality].trees)
 
     def actuator(self, actuator: int) -> Effect:
         """Return the effect of an actuator: on what its transmission reaches."""
@@ -186,7 +189,7 @@ class Couplings:
             body = int(mj.actuator_trnid[actuator, 0])
             shapes = [g for g in range(mj.ngeom) if int(mj.geom_bodyid[g]) == body]
             return self.touching({tree for g in shapes for tree in self._touched(g)})
-        return self.always(self._links["actuator"][actuator].trees)
+        return self.always(self.links["actuator"][actuator].trees)
 
     def option(self, _: int) -> Effect:
         """Return the effect of an option of the whole model."""
@@ -211,18 +214,32 @@ class Couplings:
         return not any(disabled(self._mj, flag) for flag in off)
 
     @cached_property
-    def dynamic(self) -> NDArray[np.bool_]:
-        """Which shapes may touch by their masks, as MuJoCo filters them, shape (ngeom, ngeom)."""
-        mj = self._mj
-        if not self._contacts_on:
-            return np.zeros((mj.ngeom, mj.ngeom), dtype=np.bool_)
-        kind, affinity, body = mj.geom_contype, mj.geom_conaffinity, mj.geom_bodyid
+    def _masked(self) -> NDArray[np.bool_]:
+        """Which geoms, and flexes after them, may touch by their masks, as MuJoCo filters them."""
+        mj, n = self._mj, self._mj.ngeom
+        kind = np.concatenate([mj.geom_contype, mj.flex_contype])
+        affinity = np.concatenate([mj.geom_conaffinity, mj.flex_conaffinity])
         one = (kind[:, None] & affinity[None, :]) != 0
-        bodies = self._may_meet[np.ix_(body, body)]
-        found: NDArray[np.bool_] = (one | one.T) & bodies
-        for first, second in zip(mj.pair_geom1, mj.pair_geom2, strict=True):
-            found[first, second] = found[second, first] = False  # the pair has its own numbers
+        found: NDArray[np.bool_] = (one | one.T) & self._contacts_on
+        found[:n, :n] &= self._may_meet[np.ix_(mj.geom_bodyid, mj.geom_bodyid)]
         return found
+
+    def _with_pairs(self, found: NDArray[np.bool_], which: bool) -> NDArray[np.bool_]:
+        """Mark the shapes that have a declared pair."""
+        for first, second in zip(self._mj.pair_geom1, self._mj.pair_geom2, strict=True):
+            found[first, second] = found[second, first] = which
+        return found
+
+    @cached_property
+    def dynamic(self) -> NDArray[np.bool_]:
+        """Which shapes may touch with numbers of their own, without a pair, (ngeom, ngeom)."""
+        n = self._mj.ngeom
+        return self._with_pairs(self._masked[:n, :n].copy(), False)
+
+    @cached_property
+    def touches(self) -> NDArray[np.bool_]:
+        """Which shapes may touch, by their masks or because a pair says so, (ngeom, ngeom)."""
+        return self._with_pairs(self.dynamic.copy(), self._contacts_on)
 
     @cached_property
     def _may_meet(self) -> NDArray[np.bool_]:
@@ -242,55 +259,28 @@ class Couplings:
         return found
 
     @cached_property
-    def touches(self) -> NDArray[np.bool_]:
-        """Which shapes may touch, by their masks or because a pair says so."""
-        found: NDArray[np.bool_] = self.dynamic.copy()
-        if self._contacts_on:
-            for first, second in zip(self._mj.pair_geom1, self._mj.pair_geom2, strict=True):
-                found[first, second] = found[second, first] = True
-        return found
+    def _meets(self) -> tuple[NDArray[np.bool_], list[Trees]]:
+        """Which geoms, and flexes after them, may touch, and the trees of each of them."""
+        found, n = self._masked.copy(), self._mj.ngeom
+        found[:n, :n] = self.touches
+        geoms = [self._moving([body]) for body in self._mj.geom_bodyid.tolist()]
+        return found, [*geoms, *(flex.trees for flex in self.links["flex"])]
 
     def _touched(self, geom: int) -> Trees:
         """Return the trees that feel a shape: its own, or those that touch it if it is static."""
-        others = self._mj.geom_bodyid[np.flatnonzero(self.touches[geom])]
-        body = int(self._mj.geom_bodyid[geom])
-        meets = self._flexes_at(geom)
-        if not (len(others) or meets):
-            return NONE
-        if self._moves[body]:
-            return frozenset({self.tree(body)})
-        return self._moving(others.tolist()) | meets
-
-    def _flexes_at(self, geom: int) -> Trees:
-        """Return the trees of the flexes that may touch a shape."""
-        mj, found = self._mj, NONE
-        for flex in range(mj.nflex if self._contacts_on else 0):
-            one = mj.geom_contype[geom] & mj.flex_conaffinity[flex]
-            if one or mj.geom_conaffinity[geom] & mj.flex_contype[flex]:
-                found |= self._links["flex"][flex].trees
-        return found
+        meets, trees = self._meets
+        others = np.flatnonzero(meets[geom]).tolist()
+        return NONE if not others else trees[geom] or NONE.union(*(trees[i] for i in others))
 
     @cached_property
     def _islands(self) -> list[Trees]:
         """For each tree, all those that a chain of contacts and couplings may link to it."""
-        mj = self._mj
-        links: list[Iterable[int]] = [link.trees for link in self._all_links()]
-        tree = np.where(self._moves, self._tree, -1)[mj.geom_bodyid]
-        for first, second in np.argwhere(np.triu(self.touches)):
-            if tree[first] >= 0 and tree[second] >= 0 and tree[first] != tree[second]:
-                links.append((int(tree[first]), int(tree[second])))
-        for flex in range(mj.nflex if self._contacts_on else 0):
-            own = self._links["flex"][flex].trees
-            links += [
-                own | {int(tree[g])}
-                for g in range(mj.ngeom)
-                if tree[g] >= 0 and self._flexes_at(g) & own
-            ]
-            for other in range(flex):
-                one = mj.flex_contype[flex] & mj.flex_conaffinity[other]
-                if one or mj.flex_contype[other] & mj.flex_conaffinity[flex]:
-                    links.append(own | self._links["flex"][other].trees)
-        return _groups(len(self.roots), links)
+        meets, trees = self._meets
+        pairs = np.argwhere(np.triu(meets)).tolist()
+        contacts = {
+            trees[one] | trees[other] for one, other in pairs if trees[one] and trees[other]
+        }
+        return _groups(len(self.roots), [*(link.trees for link in self._all_links()), *contacts])
 
     def _reached(self, trees: Iterable[int]) -> Trees:
         return frozenset().union(*{self._islands[tree] for tree in trees})
@@ -298,7 +288,7 @@ class Couplings:
     # --- couplings -----------------------------------------------------------------------------
 
     def _all_links(self) -> Iterator[Link]:
-        return (link for links in self._links.values() for link in links)
+        return (link for links in self.links.values() for link in links)
 
     def _moving(self, bodies: Iterable[int]) -> Trees:
         """Return the trees of the bodies that can move."""
@@ -340,9 +330,9 @@ class Couplings:
             case _EQ.mjEQ_JOINT:
                 return self._link(joints=ends)
             case _EQ.mjEQ_TENDON:
-                return Link(NONE.union(*(self._links["tendon"][end].trees for end in ends)))
+                return Link(NONE.union(*(self.links["tendon"][end].trees for end in ends)))
             case _:
-                return self._links["flex"][ends[0]]
+                return self.links["flex"][ends[0]]
 
     def _actuator(self, actuator: int) -> Link:
         ends = [int(end) for end in self._mj.actuator_trnid[actuator] if end >= 0]
@@ -352,7 +342,7 @@ class Couplings:
             case _TRN.mjTRN_SO3 if len(ends) == 1:
                 return self._link(joints=ends)
             case _TRN.mjTRN_TENDON:
-                return Link(self._links["tendon"][ends[0]].trees)
+                return Link(self.links["tendon"][ends[0]].trees)
             case _TRN.mjTRN_SITE | _TRN.mjTRN_SLIDERCRANK | _TRN.mjTRN_SO3:
                 return self._link(sites=ends)
             case _:

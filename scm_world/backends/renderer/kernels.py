@@ -88,37 +88,63 @@ NO_COLORS = np.zeros((3, 0, 0), dtype=np.uint8)
 
 
 @njit(cache=True, error_model="numpy")
-def _rectangle(
-    shapes: Table, n: int, view: View, width: int, height: int
-) -> tuple[int, int, int, int]:
-    """Bound the pixels a shape can cover: first and last column plus one, the same for rows."""
-    if shapes.kinds[n] == PLANE and min(shapes.halves[n, 0], shapes.halves[n, 1]) <= 0.0:
-        return 0, width, 0, height
-    left, right, top, bottom = math.inf, -math.inf, math.inf, -math.inf
-    ahead = 0
-    for corner in range(8):
-        u, v, w = view.projection[0, 3], view.projection[1, 3], view.projection[2, 3]
+def projected(vertices: Floats, position: Floats, rotation: Floats, view: View) -> Floats:
+    """Compute the homogeneous pixels of points, shape (n, 3)."""
+    p, r, o = view.projection, rotation, position
+    matrix = np.empty((3, 4))
+    for i in range(3):
+        matrix[i, 3] = p[i, 0] * o[0] + p[i, 1] * o[1] + p[i, 2] * o[2] + p[i, 3]
+        for j in range(3):
+            matrix[i, j] = p[i, 0] * r[0, j] + p[i, 1] * r[1, j] + p[i, 2] * r[2, j]
+    pixels = np.empty((len(vertices), 3))
+    for n in range(len(pixels)):
+        x, y, z = vertices[n]
         for i in range(3):
-            x = shapes.positions[n, i]
-            for j in range(3):
-                sign = 1.0 if (corner >> j) & 1 else -1.0
-                x += sign * shapes.rotations[n, i, j] * shapes.halves[n, j]
-            u += view.projection[0, i] * x
-            v += view.projection[1, i] * x
-            w += view.projection[2, i] * x
-        if w > view.near:
+            pixels[n, i] = matrix[i, 0] * x + matrix[i, 1] * y + matrix[i, 2] * z + matrix[i, 3]
+    return pixels
+
+
+@njit(cache=True, error_model="numpy")
+def bounds(corners: Floats, near: float, shape: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Bound the pixels between corners: first and last column plus one, the same for rows.
+
+    Args:
+        corners: Homogeneous pixels, shape (k, 3).
+        near: Smallest depth that is seen. What is partly nearer can cover any pixel.
+        shape: Height and width of the picture.
+    """
+    height, width = shape
+    left, right, top, bottom, ahead = math.inf, -math.inf, math.inf, -math.inf, 0
+    for i in range(len(corners)):
+        if corners[i, 2] > near:
+            u, v = corners[i, 0] / corners[i, 2], corners[i, 1] / corners[i, 2]
+            left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
             ahead += 1
-            left, right = min(left, u / w), max(right, u / w)
-            top, bottom = min(top, v / w), max(bottom, v / w)
     if ahead == 0:
         return 0, 0, 0, 0
-    if ahead < 8:
+    if ahead < len(corners):
         return 0, width, 0, height
-    first, last = max(left, 0.0), min(right, width - 1.0)
-    upper, lower = max(top, 0.0), min(bottom, height - 1.0)
-    if first > last or upper > lower:
-        return 0, 0, 0, 0
-    return int(first), math.ceil(last) + 1, int(upper), math.ceil(lower) + 1
+    return (
+        math.ceil(max(left, 0.0)), int(min(right, width - 1.0)) + 1,
+        math.ceil(max(top, 0.0)), int(min(bottom, height - 1.0)) + 1,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def _rectangle(
+    shapes: Table, n: int, view: View, shape: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """Bound the pixels a shape can cover by the box around it; see ``bounds``."""
+    halves = shapes.halves[n]
+    if shapes.kinds[n] == PLANE and min(halves[0], halves[1]) <= 0.0:
+        return 0, shape[1], 0, shape[0]
+    corners = np.empty((8, 3))
+    for corner in range(8):
+        for k in range(3):
+            corners[corner, k] = halves[k] if (corner >> k) & 1 else -halves[k]
+    return bounds(
+        projected(corners, shapes.positions[n], shapes.rotations[n], view), view.near, shape
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -426,7 +452,7 @@ def _draw_one(
 ) -> None:
     """Draw one shape where it is nearer than what is there; see ``draw``."""
     depth, owners, rgb = canvas
-    left, right, top, bottom = _rectangle(shapes, n, view, depth.shape[1], depth.shape[0])
+    left, right, top, bottom = _rectangle(shapes, n, view, depth.shape)
     kind, halves, (scale, half) = shapes.kinds[n], shapes.halves[n], _scale(shapes, n)
     tint = shapes.colors[n]
     color = (255.0 * tint[0], 255.0 * tint[1], 255.0 * tint[2])

@@ -14,55 +14,12 @@ from scm_world.backends.renderer.kernels import (
     Triple,
     View,
     blend,
+    bounds,
     brightness,
+    projected,
     turned,
 )
 from scm_world.models.shapes import Mesh, Table
-
-
-@njit(cache=True, error_model="numpy")
-def _projected(mesh: Mesh, position: Floats, rotation: Floats, view: View) -> Floats:
-    """Compute the homogeneous pixels of the vertices, shape (n, 3)."""
-    p, r, o = view.projection, rotation, position
-    matrix = np.empty((3, 4))
-    for i in range(3):
-        matrix[i, 3] = p[i, 0] * o[0] + p[i, 1] * o[1] + p[i, 2] * o[2] + p[i, 3]
-        for j in range(3):
-            matrix[i, j] = p[i, 0] * r[0, j] + p[i, 1] * r[1, j] + p[i, 2] * r[2, j]
-    pixels = np.empty((len(mesh.vertices), 3))
-    for n in range(len(pixels)):
-        x, y, z = mesh.vertices[n]
-        for i in range(3):
-            pixels[n, i] = matrix[i, 0] * x + matrix[i, 1] * y + matrix[i, 2] * z + matrix[i, 3]
-    return pixels
-
-
-@njit(cache=True, error_model="numpy")
-def _include(box: Floats, u: float, v: float) -> None:
-    """Extend a box (least and greatest column, least and greatest row) by a pixel."""
-    box[0], box[1] = min(box[0], u), max(box[1], u)
-    box[2], box[3] = min(box[2], v), max(box[3], v)
-
-
-@njit(cache=True, error_model="numpy")
-def _rectangle(corners: Floats, near: float, box: Floats) -> None:
-    """Bound the pixels that a triangle can cover, of what is beyond ``near``.
-
-    Args:
-        corners: Homogeneous pixels, shape (3, 3).
-        near: Smallest depth that is seen.
-        box: Written, shape (4,): least and greatest column, least and greatest row.
-    """
-    box[0] = box[2] = math.inf
-    box[1] = box[3] = -math.inf
-    for i in range(3):
-        u, v, w = corners[i]
-        if w > near:
-            _include(box, u / w, v / w)
-        p, q, r = corners[(i + 1) % 3]
-        if (w > near) != (r > near):
-            share, w = (near - w) / (r - w), max(near, 1e-300)
-            _include(box, (u + share * (p - u)) / w, (v + share * (q - v)) / w)
 
 
 @njit(cache=True, error_model="numpy")
@@ -122,15 +79,13 @@ def draw_mesh(
     tint, rotation = shapes.colors[n], shapes.rotations[n]
     color = (255.0 * tint[0], 255.0 * tint[1], 255.0 * tint[2])
     lamp = turned(rotation, light)
-    pixels, near = _projected(mesh, shapes.positions[n], rotation, view), view.near
-    corners, edges, box = np.empty((3, 3)), np.empty((3, 3)), np.empty(4)
+    pixels, near = projected(mesh.vertices, shapes.positions[n], rotation, view), view.near
+    corners, edges = np.empty((3, 3)), np.empty((3, 3))
     for f in range(len(mesh.faces)):
         for i in range(3):
             for k in range(3):
                 corners[i, k] = pixels[mesh.faces[f, i], k]
-        _rectangle(corners, near, box)
-        left, right = math.ceil(max(box[0], 0.0)), int(min(box[1], depth.shape[1] - 1.0)) + 1
-        top, bottom = math.ceil(max(box[2], 0.0)), int(min(box[3], depth.shape[0] - 1.0)) + 1
+        left, right, top, bottom = bounds(corners, near, depth.shape)
         if left >= right or top >= bottom:
             continue
         volume = _edges(corners, edges)

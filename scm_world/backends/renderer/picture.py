@@ -7,7 +7,6 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -18,7 +17,6 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.backends.renderer.kernels import Colors
 from scm_world.backends.renderer.shapes import (
-    Parts,
     corners_of_what_moves,
     draw_parts,
     goal_shapes,
@@ -27,7 +25,7 @@ from scm_world.backends.renderer.shapes import (
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.models.camera import Camera, Views
 from scm_world.models.model import Model
-from scm_world.models.scene import Light, Scene
+from scm_world.models.scene import Scene
 from scm_world.models.shapes import Shapes
 
 if TYPE_CHECKING:
@@ -111,7 +109,7 @@ class RenderedImage:
     """A picture, and what is in it.
 
     Attributes:
-        rgb: Shape (h, w, 3), 0 to 255.
+        rgb: Shape (h, w, 3), 0 to 255; of shape (0, 0, 3) without colors.
         depth: Along the optical axis, shape (h, w) [m]; ``camera.far`` where there is nothing.
         segmentation: Which body a pixel shows, shape (h, w): an index into ``names``, or -1 where
             there is nothing. Goals are no bodies: they color pixels, but have neither depth nor
@@ -137,7 +135,12 @@ class RenderedImage:
 
 
 def render(
-    scene: Scene, camera: Camera, *, samples: int = 1, goals_only: bool = False
+    scene: Scene,
+    camera: Camera,
+    *,
+    samples: int = 1,
+    goals_only: bool = False,
+    colors: bool = True,
 ) -> RenderedImage:
     """Take a picture of a scene; ``picture`` can do with less.
 
@@ -150,7 +153,8 @@ def render(
         camera: Where from.
         samples: How many samples per pixel and axis the colors are averaged over; 2 or 3 make
             smooth edges. Depth and segmentation are those of the center of the pixel.
-        goals_only: Show the goals, and what ``goal_pixels`` shows with them.
+        goals_only: Show the goals, and what ``camera_pixels`` shows with them.
+        colors: Whether to color pixels: depth and segmentation alone take half as long.
 
     Raises:
         ValueError: ``samples`` is not positive, or the camera has no optical axis.
@@ -166,8 +170,10 @@ def render(
     if samples < 1:
         raise ValueError(f"samples: expected a positive number, got {samples}")
     parts = parted(background_of(scene) if goals_only else shapes_of(scene), shadows=True)
-    canvas = draw_parts(parts, camera, scene.light)
-    fine = canvas if samples == 1 else draw_parts(parts, camera, scene.light, samples)
+    canvas = draw_parts(parts, camera, scene.light, colors=colors)
+    fine = canvas
+    if colors and samples > 1:
+        fine = draw_parts(parts, camera, scene.light, samples)
     shown = _average(np.ascontiguousarray(fine.rgb.transpose(1, 2, 0)), samples)
     names = body_names(scene.structure)
     return RenderedImage(shown, canvas.depth, canvas.owners, names)
@@ -232,32 +238,23 @@ def scene_camera(
             raise UnknownOption("camera", camera, known)
         return replace(known[camera or views.overview.name], height=height, width=width)
     if camera in (None, AUTOMATIC):
-        return automatic_camera(scene, size=(height, width))
+        return automatic_camera(shapes_of(scene, goals=False), (height, width))
     seen = _visible(scene)
     if camera not in seen.cameras:
         raise UnknownOption("camera", camera, (AUTOMATIC, *seen.cameras))
     return seen.camera(str(camera), (height, width))
 
 
-def automatic_camera(*scenes: Scene, size: tuple[int, int] = (480, 640)) -> Camera:
-    """Place a camera so that it sees, in all of some scenes, everything that moves.
+def automatic_camera(shapes: Shapes, size: tuple[int, int] = USUAL_SIZE) -> Camera:
+    """Place a camera so that it sees everything that moves.
 
     It looks from the front, from the right and from above. Planes do not count; where nothing
     moves, it sees all there is.
 
     Args:
-        scenes: Of models: one or more.
+        shapes: Those of one scene or, joined, of several; see ``shapes_of``.
         size: Height and width of the picture [pixels].
-
-    Raises:
-        ModelError: The structure says nothing about shapes.
     """
-    found = [shapes_of(scene, goals=False) for scene in scenes]
-    return framing(reduce(Shapes.joined, found), size)
-
-
-def framing(shapes: Shapes, size: tuple[int, int]) -> Camera:
-    """Place a camera as ``automatic_camera`` does."""
     points = corners_of_what_moves(shapes)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
     height, width = size
@@ -282,24 +279,16 @@ def _looking(at: Floats, offset: Floats, size: tuple[int, int]) -> Camera:
     )
 
 
-def following_camera(camera: Camera, scene: Scene) -> Camera:
-    """Move a camera along with what moves in the scene of a model, for the next picture of a film.
+def following_camera(camera: Camera, shapes: Shapes) -> Camera:
+    """Move a camera along with what moves, for the next picture of a film.
 
     It keeps its direction, and stays where it is as long as the middle of what moves is near the
     middle of the picture.
 
     Args:
         camera: That of the last picture.
-        scene: What the next one shows.
-
-    Raises:
-        ModelError: The structure says nothing about shapes.
+        shapes: Those of the next one, without goals; see ``shapes_of``.
     """
-    return following(camera, shapes_of(scene, goals=False))
-
-
-def following(camera: Camera, shapes: Shapes) -> Camera:
-    """Move a camera as ``following_camera`` does."""
     points = corners_of_what_moves(shapes)
     eye, target = np.array(camera.eye), np.array(camera.target)
     away = (points.min(axis=0) + points.max(axis=0)) / 2.0 - target
@@ -370,105 +359,52 @@ ORIGINAL = Convention(flipped=True, channels_last=True, goal_obstacles=False)
 """That of CausalWorld 1.2. Together with ``ORIGINAL_CAMERAS`` pictures are upright and mirrored."""
 
 
-def resized(cameras: Sequence[Camera], height: int, width: int) -> tuple[Camera, ...]:
-    """Give the cameras another picture size [pixels]."""
-    return tuple(replace(camera, height=height, width=width) for camera in cameras)
-
-
-def now_pixels(
-    scene: Scene, cameras: Sequence[Camera], out: Colors, *, convention: Convention = PLAIN
+def camera_pixels(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    out: Colors,
+    *,
+    goals: bool = False,
+    convention: Convention = PLAIN,
 ) -> None:
-    """Draw what cameras see now: robot, blocks and obstacles, without goals and shadows.
+    """Draw what cameras see now, without goals and shadows, or what they should see.
 
-    Colors are those of ``render`` wherever no shadow falls.
+    Colors are those of ``render`` wherever no shadow falls. Pictures of the goals show them as
+    silhouettes, and nothing that moves, so they can be kept until an intervention; in the tasks of
+    the robot it is parked at the lower limits of its joints, and there are no blocks.
 
     Args:
-        scene: What to show.
+        scene: What to show; the state does not matter to the goals.
         cameras: Where from; all with pictures of one size.
         out: Where to write, uint8 of shape (n, 3, h, w), or (n, h, w, 3) with channels last.
-        convention: How pixels are laid out.
+        goals: Whether to show the goals.
+        convention: How pixels are laid out, and whether the goals' pictures show obstacles.
 
     Raises:
         ValueError: ``out`` has another shape or another dtype.
+
+    Source:
+        CausalWorld 1.2, ``envs/causalworld.py``: its goal world.
 
     Example:
         >>> from scm_world.tasks.trifinger.system import trifinger
         >>> from scm_world.tasks.trifinger.cameras import CAMERAS
         >>> out = np.empty((3, 3, 128, 128), dtype=np.uint8)
-        >>> now_pixels(trifinger(blocks=("tool_block",)).default_scene(), CAMERAS, out)
+        >>> camera_pixels(trifinger(blocks=("tool_block",)).default_scene(), CAMERAS, out)
         >>> out[0, :, 127, 64].tolist()  # the floor
         [74, 65, 60]
     """
-    parts = parted(shapes_of(scene, goals=False), shadows=False)
-    _draw_all(parts, scene.light, cameras, out, convention)
-
-
-def goal_pixels(
-    scene: Scene, cameras: Sequence[Camera], out: Colors, *, convention: Convention = PLAIN
-) -> None:
-    """Draw what cameras should see: the goals as silhouettes in the arena, without blocks.
-
-    They show nothing that moves, so they can be kept until an intervention; in the tasks of the
-    robot it is parked at the lower limits of its joints.
-
-    Args:
-        scene: Whose goals to show; the state does not matter.
-        cameras: See ``now_pixels``.
-        out: See ``now_pixels``.
-        convention: How pixels are laid out, and whether obstacles are shown.
-
-    Raises:
-        ValueError: See ``now_pixels``.
-
-    Source:
-        CausalWorld 1.2, ``envs/causalworld.py``: its goal world.
-    """
-    parts = parted(background_of(scene, obstacles=convention.goal_obstacles), shadows=False)
-    _draw_all(parts, scene.light, cameras, out, convention)
-
-
-def depth_and_segmentation(
-    scene: Scene, cameras: Sequence[Camera], *, convention: Convention = PLAIN
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Measure how far away what cameras see now is, and tell what it is.
-
-    Args:
-        scene: What to show; goals have neither depth nor number.
-        cameras: Where from; all with pictures of one size.
-        convention: Whether rows are flipped.
-
-    Returns:
-        Depth along the optical axis [m], ``camera.far`` where there is nothing, and numbers of
-        bodies (see ``body_names``), -1 where there is nothing; both of shape (n, h, w).
-
-    Raises:
-        ValueError: There are no cameras, or their sizes differ.
-    """
-    if len({(camera.height, camera.width) for camera in cameras}) != 1:
-        raise ValueError("cameras: there must be at least one, and all with pictures of one size")
-    parts = parted(shapes_of(scene, goals=False), shadows=False)
-    drawn = [draw_parts(parts, camera, scene.light, colors=False) for camera in cameras]
-    depths, owners = (
-        np.stack([getattr(one, name) for one in drawn]) for name in ("depth", "owners")
-    )
-    return _rows(depths, convention), _rows(owners, convention)
-
-
-def _rows(stack: NDArray[Any], convention: Convention) -> NDArray[Any]:
-    """Flip the rows of pictures (n, h, w) if the convention asks for it."""
-    return np.ascontiguousarray(stack[:, ::-1]) if convention.flipped else stack
-
-
-def _draw_all(
-    parts: Parts, light: Light, cameras: Sequence[Camera], out: Colors, convention: Convention
-) -> None:
-    """Draw a scene with all cameras in the layout that is asked for."""
     if out.dtype != np.uint8:
         raise ValueError(f"out: expected dtype uint8, got {out.dtype}")
     for shape in {convention.shape(camera) for camera in cameras} or {(0, 0, 0)}:
         if out.shape != (len(cameras), *shape):
             raise ValueError(f"out: expected shape {(len(cameras), *shape)}, got {out.shape}")
+    if goals:
+        shapes = background_of(scene, obstacles=convention.goal_obstacles)
+    else:
+        shapes = shapes_of(scene, goals=False)
+    parts = parted(shapes, shadows=False)
     for picture, camera in zip(out, cameras, strict=True):
-        rgb = draw_parts(parts, camera, light).rgb
+        rgb = draw_parts(parts, camera, scene.light).rgb
         rows = rgb[:, ::-1] if convention.flipped else rgb
         picture[:] = rows.transpose(1, 2, 0) if convention.channels_last else rows

@@ -190,9 +190,7 @@ class TriFingerTask(Task):
     @property
     def tools(self) -> tuple[str, ...]:
         """Names of the blocks that should be moved: one for each part."""
-        if self.block is not None:
-            return tuple(self.block.targets.values())
-        return tuple(f"tool_{name}" for name, _ in self.parts())
+        return tuple(f"tool_{name}" for name, _ in self.parts()) or tuple(self.targets.values())
 
     @property
     def targets(self) -> Mapping[str, str]:
@@ -402,14 +400,13 @@ class Building(TriFingerTask):
     """A goal family whose blocks are parts of a building, as many as variables say.
 
     Attributes:
-        piece: Says where a part comes from: a static method of whether blocks may begin in the air,
-            and of the constants of the part.
+        piece: Where the parts come from.
     """
 
     default_weights: ClassVar[Mapping[str, float]] = {FRACTION: 1.0}
     interleaved = True
     rest = hardware.RAISED  # the fingers begin out of the way
-    piece: ClassVar[Callable[..., building.Piece]]
+    piece: ClassVar[building.Piece]
 
     def entities(self) -> Iterable[Entity]:
         """List the blocks, and their places in the building."""

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Values
-from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction_kernel
+from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.tasks.trifinger import catalogue as numbers
@@ -47,7 +48,7 @@ def filled(numbers: Floats, tools: float) -> float:
     """
     rows, of = numbers.reshape(-1, BOX), int(tools)
     size, position, turn = rows[:, :3].copy(), rows[:, 3:6].copy(), rows[:, 6:].copy()
-    return overlap_fraction_kernel(
+    return overlap_fraction(
         size[:of], position[:of], turn[:of], size[of:], position[of:], turn[of:]
     )
 
@@ -95,9 +96,6 @@ def view_of(
 Part = tuple[str, dict[str, float]]
 """The name of a part of a building, and the constants that say which one it is."""
 
-Mechanism = tuple[tuple[str, ...], Function | None]
-"""Parents, and the function of them."""
-
 
 def blocks_mass(default: float) -> Variable:
     """Declare the mass that all blocks share, with the option ``tool_block_mass`` [kg]."""
@@ -105,58 +103,73 @@ def blocks_mass(default: float) -> Variable:
     return numbers.SHARED_MASSES.option(MASS, default, doc, "tool_block_mass")
 
 
+Causes = str | tuple[Any, ...]
+"""The name of a variable to copy, or ``(function, "parent", …)``: a function of their values.
+
+Keyword-only arguments of the function get the constants of the part, and ``airborne``: 1 where
+blocks may begin in the air, as in the predecessor.
+"""
+
+
 @final
 @dataclass(frozen=True)
 class Piece:
-    """Where a block of a building, and its place, come from; they have no spaces of their own.
+    """Where the parts of a building come from; they have no spaces of their own.
 
     Attributes:
-        size: Edge lengths of both.
+        size: Edge lengths of a block and of its place.
         place: Center of the place in the building.
-        start: Where the block begins: further causes than its size and orientation, and the
-            function of all of them. When one of them changes, the block is put there again.
-        turn: Quaternion of the place; it is upright if there is none.
+        start: Where the block begins: a function of its size, its orientation and of the values of
+            further parents. When one of them changes, the block is put there again.
+        turn: Quaternion of the place; it is upright if None.
     """
 
-    size: Mechanism
-    place: Mechanism
-    start: Mechanism
-    turn: Mechanism = ((), None)
+    size: Causes
+    place: Causes
+    start: tuple[Any, ...]
+    turn: Causes | None = None
+
+
+def _bound(causes: Causes | None, constants: Mapping[str, float]) -> dict[str, Any]:
+    """Return parents and mechanism."""
+    if causes is None or isinstance(causes, str):
+        return {"parents": () if causes is None else (causes,), "mechanism": None}
+    function, *parents = causes
+    taken = inspect.signature(function).parameters.values()
+    names = [one.name for one in taken if one.kind is one.KEYWORD_ONLY]
+    own = {name: constants[name] for name in names if name in constants}
+    return {"parents": tuple(parents), "mechanism": Function(function, constants=own)}
 
 
 @lru_cache(maxsize=512)  # they are immutable, and most structures of a family have them
 def bodies(
-    piece: Callable[..., Piece], name: str, which: tuple[tuple[str, float], ...], airborne: bool
+    piece: Piece, name: str, which: tuple[tuple[str, float], ...], airborne: bool
 ) -> tuple[ToolBlock, GoalBlock]:
     """Describe a block of a building, and its place.
 
     Args:
-        piece: Says where they come from.
+        piece: Where they come from.
         name: Of the two, without what tells them apart.
         which: The constants that say which one it is.
-        airborne: Whether its spaces reach into the air, as in the predecessor.
+        airborne: Whether blocks may begin in the air, as in the predecessor.
     """
-    made, tool, goal = piece(airborne, **dict(which)), f"tool_{name}", f"goal_{name}"
-    sizes = [
-        numbers.PART_SIZES.declare(f"{body}.size", None, "Full edge lengths.", *made.size)
-        for body in (tool, goal)
-    ]
-    a, b = numbers.places(numbers.half_height(f"{tool}.size"), airborne=airborne)
+    constants = {**dict(which), "airborne": float(airborne)}
+    size, place, start, turn = (_bound(one, constants) for one in vars(piece).values())
+    (tool, mine), (goal, its) = (
+        (body, numbers.PART_SIZES.declare(f"{body}.size", None, "Full edge lengths.", **size))
+        for body in (f"tool_{name}", f"goal_{name}")
+    )
     block = ToolBlock(
         tool,
-        size=sizes[0],
+        size=mine,
         mass=block_mass(f"{tool}.mass", MASS),
-        spawn=made.start[1],
-        spawn_from=made.start[0],
+        spawn=start["mechanism"],
+        spawn_from=start["parents"],
         spawn_again=True,
-        a=a,
-        b=b,
+        spaces=numbers.places(numbers.half_height(mine.name), airborne=airborne),
     )
-    pose = (
-        goal_position(goal, parents=made.place[0], mechanism=made.place[1]),
-        goal_orientation(goal, parents=made.turn[0], mechanism=made.turn[1]),
-    )
-    return block, GoalBlock(goal, size=sizes[1], pose=pose, yaw=False)
+    pose = goal_position(goal, **place), goal_orientation(goal, **turn)
+    return block, GoalBlock(goal, size=its, pose=pose, yaw=False)
 
 
 def boxes_apart(tips: Floats, *values: Floats) -> Floats:

@@ -14,12 +14,6 @@ def _above_table(eye: Vector) -> Vector:
     return eye[0], eye[1], eye[2] - TABLE_OFFSET
 
 
-def _original(name: str, eye: Vector, orientation: tuple[float, float, float, float]) -> Camera:
-    """Make a camera as CausalWorld does, whose mistakes are those of ``ORIGINAL_CAMERAS``."""
-    down, forward = down_and_forward(orientation)
-    return Camera(name, _above_table(eye), _above_table(forward), down)
-
-
 _PUBLISHED: tuple[tuple[str, Vector, tuple[float, float, float, float]], ...] = (
     ("60", (0.2496, 0.2458, 0.58), (0.3760, 0.8690, -0.2918, -0.1354)),
     ("120", (0.0047, -0.2834, 0.58), (0.9655, -0.0098, -0.0065, -0.2603)),
@@ -28,7 +22,7 @@ _PUBLISHED: tuple[tuple[str, Vector, tuple[float, float, float, float]], ...] = 
 
 
 def published_poses() -> dict[str, tuple[Floats, Floats]]:
-    """Give the poses of ``CAMERAS`` as ``camera_from`` takes them.
+    """Return the poses of ``CAMERAS`` as ``camera_from`` takes them.
 
     Returns:
         By name: the position, z from the table top, shape (3,) [m], and the unit quaternion
@@ -52,7 +46,11 @@ Source:
     CausalWorld 1.2, ``envs/robot/camera.py``: positions, orientations, 52°, 128 x 128.
 """
 
-ORIGINAL_CAMERAS = tuple(_original(*row) for row in _PUBLISHED)
+ORIGINAL_CAMERAS = tuple(
+    Camera(name, _above_table(eye), _above_table(forward), down)
+    for name, eye, orientation in _PUBLISHED
+    for down, forward in (down_and_forward(orientation),)
+)
 """The same cameras as CausalWorld 1.2 realises them.
 
 It takes the direction of the optical axis for a point to look at, so that its views are off by

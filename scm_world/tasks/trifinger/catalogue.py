@@ -79,7 +79,8 @@ class Range:
 
 
 # --- places and their spaces ---------------------------------------------------------------------
-POSITION_BOUNDS = Box((-0.24, -0.24, 0.0), (0.24, 0.24, 0.5))  # [m]
+POSITION_ENDS = ((-0.24, -0.24, 0.0), (0.24, 0.24, 0.5))  # [m]
+POSITION_BOUNDS = Box(*POSITION_ENDS)
 QUATERNION_BOUNDS = Rotations()
 RADIUS_A = (0.0, 0.11)  # [m]
 RADIUS_B = (0.11, 0.15)  # [m]

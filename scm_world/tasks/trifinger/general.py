@@ -52,16 +52,6 @@ def start(size: Floats, orientation: Floats, *, index: float) -> Floats:
     return np.array([STEP * x, STEP * y, lowest_point(size, orientation)])
 
 
-def piece(airborne: bool, **which: float) -> Piece:
-    """Describe where a block, and its place in the pile, come from."""
-    return Piece(
-        size=((SIZE,), Function(cube)),
-        place=((PILE,), Function(piles.part_of, constants=which)),
-        turn=((PILE,), Function(piles.turn_of, constants=which)),
-        start=((), Function(start, constants=which)),
-    )
-
-
 @final
 class General(Building):
     """Blocks on the floor, and the places where such blocks came to lie that were dropped.
@@ -85,7 +75,12 @@ class General(Building):
     decided_by = (COUNT,)
     goal_causes = (COUNT, MASS, SIZE, PLACES, TURNS)
     interleaved = False
-    piece = staticmethod(piece)
+    piece = Piece(
+        size=(cube, SIZE),
+        place=(piles.part_of, PILE),
+        start=(start,),
+        turn=(piles.turn_of, PILE),
+    )
 
     def __init__(
         self,
@@ -131,22 +126,22 @@ class General(Building):
 
 def _drops() -> Iterable[Variable]:
     """Declare what the predecessor takes from a global generator."""
-    region, turns = _repeated(Box(*numbers.DROP_REGION)), Box(0.0, 2.0 * math.pi)
-    bounds, shape = _repeated(numbers.POSITION_BOUNDS), (piles.MOST, 3)
-    yield numbers.Range(bounds, region, region, "m", shape).declare(
+    region, anywhere = (
+        Box(*(tuple(end) * piles.MOST for end in ends))
+        for ends in (numbers.DROP_REGION, numbers.POSITION_ENDS)
+    )
+    bounds, turns, shape = (
+        Box(-2.0 * math.pi, 2.0 * math.pi),
+        Box(0.0, 2.0 * math.pi),
+        (piles.MOST, 3),
+    )
+    yield numbers.Range(anywhere, region, region, "m", shape).declare(
         PLACES,
         tuple(x for i in range(piles.MOST) for x in DROPS[i % len(DROPS)]),
         "Where the center of each block is let go, or above it if something is there.",
     )
-    bounds = Box(-2.0 * math.pi, 2.0 * math.pi)
     yield numbers.Range(bounds, turns, turns, "rad", shape).declare(
         TURNS,
         (0.0,) * (3 * piles.MOST),
         "How each block is turned when it is let go, as a rotation vector.",
     )
-
-
-def _repeated(box: Box) -> Box:
-    """Return the bounds of points in a row, from those of one."""
-    low, high = box.bounds((3,), {})
-    return Box(tuple(low.tolist()) * piles.MOST, tuple(high.tolist()) * piles.MOST)

@@ -8,12 +8,14 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import Floats
-from scm_world.geometry.filling import overlap_kernel
+from scm_world.geometry.filling import overlap_fraction
 from scm_world.geometry.rotations import angle_between
 
 CARRIED = 0.15  # [m] how high a block should be lifted over a wall
 PLACED = 0.02  # [m] how near the first block of a tower must be to its goal
 ABOVE = 0.005  # [m] how near, seen from above, two blocks of a tower must be
+
+AXIS = np.zeros(2)  # [m] of the arena, seen from above
 
 
 @njit(cache=True)
@@ -59,9 +61,15 @@ def filled(
     goal_orientation: Floats,
 ) -> float:
     """Compute the fraction of one goal that one block fills, in [0, 1]."""
-    shared = overlap_kernel(size, position, orientation, goal_size, goal_position, goal_orientation)
-    fraction: float = shared / (goal_size[0] * goal_size[1] * goal_size[2])
-    return min(1.0, fraction)
+    fraction: float = overlap_fraction(
+        size.reshape(1, 3),
+        position.reshape(1, 3),
+        orientation.reshape(1, 4),
+        goal_size.reshape(1, 3),
+        goal_position.reshape(1, 3),
+        goal_orientation.reshape(1, 4),
+    )
+    return fraction
 
 
 @njit(cache=True)
@@ -96,21 +104,15 @@ def height_progress(block: Floats, block_before: Floats, goal: Floats) -> float:
 
 
 @njit(cache=True)
-def eccentricity(block: Floats) -> float:
-    """Compute the distance of the block from the axis of the arena [m]."""
-    return math.sqrt(block[0] ** 2 + block[1] ** 2)
-
-
-@njit(cache=True)
 def minus_eccentricity(block: Floats) -> float:
     """Compute minus the distance of the block from the axis of the arena [m]."""
-    return -eccentricity(block)
+    return -horizontal_distance(block, AXIS)
 
 
 @njit(cache=True)
 def centering_progress(block: Floats, block_before: Floats) -> float:
     """Compute how much nearer the block came to the axis of the arena [m]."""
-    return eccentricity(block_before) - eccentricity(block)
+    return horizontal_progress(block, block_before, AXIS)
 
 
 @njit(cache=True)

@@ -126,14 +126,10 @@ def _clip(value: float, joint: int) -> float:
 
 @njit(cache=True)
 def _branch(x: float, y: float, z: float, side: float, bend: float) -> tuple[float, float, float]:
-    """Solve one finger on one of its four branches, without regard to the bounds.
+    """Solve one finger, without regard to the bounds, for a target in the frame of its base [m].
 
-    Args:
-        x: Target in the frame of the finger's base [m], with ``y`` and ``z``.
-        y: See above.
-        z: See above.
-        side: -1 where the leg points down in its plane, 1 where it points up.
-        bend: The sign of the last joint.
+    ``side`` is -1 where the leg points down in its plane and 1 where it points up; ``bend`` is the
+    sign of the last joint.
     """
     across = math.hypot(y, z)
     down = side * math.sqrt(max(across - _LATERAL, 0.0)) * math.sqrt(across + _LATERAL)

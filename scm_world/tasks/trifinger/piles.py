@@ -35,22 +35,13 @@ def pile(
     floor_friction: Value,
     *frictions: Value,
 ) -> Floats:
-    """Drop blocks one after another, and see where they lie 0.8 s after the last.
+    """Drop blocks one after another, and find where they lie 0.8 s after the last.
 
     Simulate on MuJoCo for every backend of the world: one seed gives one goal everywhere.
-    There is no robot in reach; what is no argument here has its default. A block that would
+    There is no robot in reach; what is not an argument here has its default. A block that would
     begin in the floor or in another block begins above it. Blocks that leave the arena (gravity
-    may point anywhere) are put at its border.
-
-    Args:
-        count: How many blocks, shape (...).
-        size: Edge length, shape (...) [m].
-        mass: Of each block, shape (...) [kg].
-        positions: Where they are let go, shape (..., MOST, 3) [m].
-        orientations: Rotation vectors, shape (..., MOST, 3) [rad].
-        gravity: Shape (..., 3) [m/s²].
-        floor_friction: Shape (...).
-        frictions: Of the blocks that there are, shape (...) each; more are not dropped.
+    may point anywhere) are put at its border. Orientations are rotation vectors [rad]; not more
+    blocks are dropped than there are frictions.
 
     Returns:
         Position [m] and quaternion (x, y, z, w) of each block, shape (..., MOST, 7); zero and

@@ -53,7 +53,7 @@ class Sweep(OpenLoopPolicy):
         self._joints = np.array([inverse(t, height, rest).joint_positions for t in self._way])
 
     def ahead(self, world: Any, first: int, count: int) -> Floats:
-        """Give the actions of some control steps."""
+        """Return the actions of some control steps."""
         if world.action_mode == "joint_torques":
             raise ActionError("a sweep needs positions as actions, not", world.action_mode)
         rows = self._way if "effector" in world.action_mode else self._joints

@@ -46,7 +46,7 @@ def nearness(error: Value, reached: Value, far: Value) -> float:
 
 @njit(cache=True)
 def within(error: Value, reached: Value) -> int:
-    """Tell whether the error is small enough, as 0 or 1."""
+    """Return whether the error is small enough, as 0 or 1."""
     return int(scalar(error) < scalar(reached))
 
 

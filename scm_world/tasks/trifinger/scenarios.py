@@ -54,16 +54,8 @@ def touched(
 ) -> tuple[dict[str, Value], Floats, float]:
     """Stand the first block somewhere, with all three fingertips about to touch it.
 
-    Args:
-        world: Where.
-        rng: Random numbers of the probe.
-        middle: x and y of its center [m].
-        bottom: Height of its lower face [m].
-        heights: Between which parts of its height it is touched.
-        yaw: How far it may be turned [rad].
-
-    Returns:
-        States to set, the direction in which each finger stands [rad], and their height [m].
+    The block is turned by up to ``yaw`` [rad], and touched between two parts of its height.
+    Return the states to set, the direction in which each finger stands [rad], and their height [m].
     """
     name, size = world.composition.blocks[0], sizes(world)[0]
     angles = facing(rng)
@@ -177,7 +169,7 @@ def on_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
 
 
 def block_in_air(world: Any, rng: ProbeGenerator) -> Setting:
-    """Let the first block fall and tumble."""
+    """Drop the first block, tumbling."""
     name = world.composition.blocks[0]
     states = {
         f"{name}.cartesian_position": np.array([*rng.uniform(-0.03, 0.03, 2), 0.06]),
@@ -224,7 +216,7 @@ def tower(world: Any, rng: ProbeGenerator) -> Setting:
 
 
 def block_at_wall(world: Any, rng: ProbeGenerator) -> Setting:
-    """Let the blocks slide along the wall, on one another."""
+    """Slide the blocks along the wall, on one another."""
     size = sizes(world)[0]
     angle = rng.uniform(-np.pi, np.pi)
     out, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
@@ -297,7 +289,7 @@ def obstacle_ahead(world: Any, rng: ProbeGenerator) -> Setting:
 
 
 def _newcomer(world: Any) -> tuple[Floats, float] | None:
-    """Find where a further block or obstacle would be: its middle and its top [m]."""
+    """Return where a further block or obstacle would be: its middle and its top [m]."""
     before = world.snapshot()
     for request in world.task.nearby(world.values()):
         try:

@@ -28,15 +28,9 @@ Quaternion = tuple[float, float, float, float]
 
 
 def hull_on_the_floor(polar: Floats, corners: Floats, orientation: Floats) -> Floats:
-    """Put a hull on the floor at a radius and an angle.
+    """Put a hull on the floor at a radius [m] and an angle [rad]; see ``turned_on_the_floor``.
 
-    Args:
-        polar: Radius [m] and angle [rad], shape (..., 2).
-        corners: Shape (..., n, 3) [m].
-        orientation: Quaternion (x, y, z, w), shape (..., 4).
-
-    Returns:
-        The center of mass, shape (..., 3) [m].
+    ``corners`` are those of the hull, shape (..., n, 3) [m].
     """
     upwards = rotation_matrix(orientation)[..., 2, :]
     return on_the_floor(polar, -np.einsum("...ni,...i->...n", corners, upwards).min(axis=-1))
@@ -61,15 +55,9 @@ def hull_filled(
     goal_position: Floats,
     goal_orientation: Floats,
 ) -> float:
-    """Compute the fraction of a hull that another one fills, in [0, 1].
+    """Compute the fraction of a goal that a block fills, in [0, 1].
 
-    Args:
-        corners: Of the block, shape (n, 3) [m].
-        position: Its center of mass, shape (3,) [m].
-        orientation: Its quaternion (x, y, z, w).
-        goal_corners: Of the goal, shape (m, 3) [m].
-        goal_position: Shape (3,) [m].
-        goal_orientation: Quaternion.
+    Both are hulls: corners, shape (n, 3) [m], center of mass [m] and quaternion.
     """
     block, goal = _hull(corners.tobytes()), _hull(goal_corners.tobytes())
     shared = hull_overlap(block, position, orientation, goal, goal_position, goal_orientation)
@@ -79,8 +67,7 @@ def hull_filled(
 def hull_aligned(*poses: Floats) -> float:
     """Compute the predecessor's overlap of two hulls: that of the axis-aligned boxes around them.
 
-    Args:
-        poses: As in ``hull_filled``.
+    The poses are those of ``hull_filled``.
     """
     boxes: list[Floats] = []
     for corners, position, orientation in (poses[:3], poses[3:]):

@@ -79,6 +79,7 @@ class OneBlock:
             raise ModelError(
                 [f"shape must be a Hull: load_hull(path) or hull_of(points); {self.shape!r}"]
             )
+        self._corners = () if self.shape is None else (np.array(self.shape.vertices),)
         mass = self.common.pop("tool_block_mass", numbers.BLOCK_MASS)
         self._mass = checked("tool_block_mass", mass, numbers.BLOCK_MASSES.bounds)
         self._turns = {name: self._turn(f"{name}_orientation") for name in (TOOL, GOAL)}
@@ -100,8 +101,8 @@ class OneBlock:
 
     def below(self, name: str) -> float:
         """Compute how far block or goal reaches below its center as it begins [m]."""
-        corners = () if self.shape is None else (np.array(self.shape.vertices),)
-        return lowest_point(np.array(numbers.BLOCK_SIZE), np.array(self._turns[name]), *corners)
+        size, turn = np.array(numbers.BLOCK_SIZE), np.array(self._turns[name])
+        return lowest_point(size, turn, *self._corners)
 
     def level(self, name: str) -> Bound:
         """Return the height of the center of block or goal on the floor, as a bound of a space."""
@@ -156,15 +157,13 @@ class OneBlock:
             causes: The further ones.
         """
         corners = () if self.shape is None else (f"{TOOL}.vertices",)
-        a, b = spaces or numbers.places(self.level(TOOL), airborne=False)
         return ToolBlock(
             TOOL,
             size=self._size(TOOL),
             mass=block_mass(f"{TOOL}.mass", default=self._mass),
             spawn=start or Function(stand, constants={"place": self.place}),
             spawn_from=(*corners, *causes),
-            a=a,
-            b=b,
+            spaces=spaces or numbers.places(self.level(TOOL), airborne=False),
             hull=self.shape,
             orientation=self._turns[TOOL],
         )
@@ -182,7 +181,6 @@ class OneBlock:
             spaces: A and B of its cylindrical position; those on the floor if None.
             inverse: Cartesian position where a cylindrical one is set.
         """
-        a, b = spaces or numbers.places(self.level(GOAL), airborne=False)
         rest, box = self._turns[GOAL], self.shape is None
         pose = (*place, goal_orientation(GOAL, default=rest))
         if not box:
@@ -198,8 +196,7 @@ class OneBlock:
             GOAL,
             size=self._size(GOAL),
             pose=pose,
-            a=a,
-            b=b,
+            spaces=spaces or numbers.places(self.level(GOAL), airborne=False),
             yaw=box,
             hull=self.shape,
             inverse=inverse,

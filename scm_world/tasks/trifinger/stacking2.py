@@ -61,15 +61,8 @@ def floor_of_tower(center: Floats, size: Floats, orientation: Floats, *, side: f
 def beside(size: Floats, orientation: Floats, *, place: Floats, other: Floats) -> Floats:
     """Stand a block on the floor, at least ``GAP`` away from another one of the same size.
 
-    Args:
-        size: Edge lengths, shape (3,) [m].
-        orientation: Quaternion (x, y, z, w).
-        place: x, y and the height of the lowest point where it stands if there is room, shape
-            (3,) [m]. Else it is farther away in the same direction.
-        other: Those of the other block, shape (3,) [m].
-
-    Returns:
-        The center, shape (3,) [m].
+    It stands at ``place`` (x, y and the height of its lowest point) if there is room, else farther
+    away from ``other`` in the same direction. Return its center, shape (3,) [m].
     """
     offset, room = place[:2] - other[:2], size[:2] + GAP
     apart = np.abs(offset) > 1e-9
@@ -81,12 +74,12 @@ def beside(size: Floats, orientation: Floats, *, place: Floats, other: Floats) -
 def goal_tower(place: tuple[float, float], orientation: Quaternion) -> Entity:
     """Describe the place of a tower of two blocks: its default radius and angle, and quaternion."""
     causes = (f"{TOWER}.polar", SIZE, f"{TOWER}.orientation")
-    a, b = numbers.places(Affine(parent=SIZE, index=2), airborne=False)
+    spaces = numbers.places(Affine(parent=SIZE, index=2), airborne=False)
     variables = (
         polar(TOWER, place),
         goal_position(TOWER, parents=causes, mechanism=Function(tower_center)),
         goal_orientation(TOWER, default=orientation),
-        *coordinates(TOWER, a=a, b=b),
+        *coordinates(TOWER, spaces=spaces),
     )
     return Entity(TOWER, variables)
 
@@ -188,13 +181,11 @@ class Stacking2(TriFingerTask):
     def _tool(self, index: int, start: Function) -> Entity:
         name, size = TOOLS[index], block_size(f"{TOOLS[index]}.size", SIZE, spaces=False)
         low, airborne = numbers.half_height(size.name), self.conventions.published_spaces
-        a, b = numbers.places(low, airborne=airborne)
         return ToolBlock(
             name,
             size=size,
             mass=block_mass(f"{name}.mass", default=self._mass),
             spawn=start,
-            a=a,
-            b=b,
+            spaces=numbers.places(low, airborne=airborne),
             orientation=self._turns[index],
         )

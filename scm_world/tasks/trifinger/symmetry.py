@@ -24,27 +24,21 @@ VECTORS = ("gravity", "light_direction")
 """What turns like a position, apart from parts of bodies."""
 
 FINGERS = tuple(f"robot_finger_{name}_" for name in hardware.FINGERS)
-_BEFORE = np.array([1, 2, 0])
-"""Which finger stands, before the scene is turned by a third, where each one stands afterwards."""
 
 
 def swapped(joints: Floats, thirds: int) -> Floats:
-    """Give what belongs to joints, shape (9,), after the scene is turned by thirds of a turn."""
+    """Return what belongs to joints, shape (9,), after the scene is turned by thirds of a turn.
+
+    The numbers of a finger go to the one that stands there afterwards: the one before it.
+    """
     fingers = np.asarray(joints, dtype=float).reshape(N_FINGERS, -1)
-    for _ in range(thirds):
-        fingers = fingers[_BEFORE]
-    return fingers.ravel()
+    return np.roll(fingers, -thirds, axis=0).ravel()
 
 
 def turned(values: Mapping[str, Value], names: Iterable[str], thirds: int) -> dict[str, Any]:
-    """Give the values of a scene that is turned about the vertical by thirds of a turn.
+    """Return the values of a scene that is turned about the vertical by thirds of a turn.
 
     What belongs to a finger goes to the one that stands there afterwards; cameras are turned, too.
-
-    Args:
-        values: Of these variables, and of the same of other fingers.
-        names: Of the variables that are wanted.
-        thirds: How many.
 
     Raises:
         UnknownOption: It is not known how a variable turns.
@@ -58,7 +52,7 @@ def turned(values: Mapping[str, Value], names: Iterable[str], thirds: int) -> di
         body, _, part = name.rpartition(".")
         finger = next((i for i, own in enumerate(FINGERS) if body.startswith(own)), None)
         if finger is not None:
-            before = FINGERS[int(swapped(np.arange(3.0), thirds)[finger])]
+            before = FINGERS[(finger + thirds) % N_FINGERS]
             return np.asarray(values[name.replace(FINGERS[finger], before)], dtype=float)
         value = np.asarray(values[name], dtype=float)
         if name in JOINTS:

@@ -14,7 +14,6 @@ from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.base import Building
 from scm_world.tasks.trifinger.building import MASS, Part, Piece, blocks_mass
 from scm_world.tasks.trifinger.entities.blocks import lowest_point
-from scm_world.variables import Function
 
 DIMS = "tower_dims"
 NUMBER = "number_of_blocks_in_tower"
@@ -66,15 +65,6 @@ def start(
     return np.array([i * step[0] - first[0], j * step[1] - first[1], height])
 
 
-def piece(airborne: bool, **which: float) -> Piece:
-    """Describe where a block of a tower, and its place in it, come from."""
-    return Piece(
-        size=((DIMS, NUMBER), Function(part)),
-        place=((DIMS, NUMBER, CENTER), Function(place, constants=which)),
-        start=((NUMBER,), Function(start, constants=which)),
-    )
-
-
 @final
 class Towers(Building):
     """A cuboid on the floor, cut into equal blocks.
@@ -96,7 +86,9 @@ class Towers(Building):
     name = "towers"
     decided_by = (NUMBER,)
     goal_causes = (NUMBER, MASS, DIMS, CENTER)
-    piece = staticmethod(piece)
+    piece = Piece(
+        size=(part, DIMS, NUMBER), place=(place, DIMS, NUMBER, CENTER), start=(start, NUMBER)
+    )
 
     def __init__(
         self,

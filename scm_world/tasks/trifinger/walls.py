@@ -35,16 +35,6 @@ RANDOM = 1  # the category of ``wall_pattern``
 LOW = 0.25  # [m] what is lower fits under the raised fingers
 
 
-def piece(airborne: bool, **which: float) -> Piece:
-    """Describe where a block of a wall, and its place in it, come from."""
-    first = Function(layouts.start, constants={**which, "airborne": float(airborne)})
-    return Piece(
-        size=((LAYOUT, SIZE), Function(layouts.brick_size, constants=which)),
-        place=((LAYOUT, SIZE), Function(layouts.brick_place, constants=which)),
-        start=((LAYOUT, SIZE, PATTERN), first),
-    )
-
-
 class StackedBlocks(Building):
     """A wall, regular or random; each block has its place in it.
 
@@ -70,7 +60,11 @@ class StackedBlocks(Building):
     name = "stacked_blocks"
     decided_by: ClassVar[tuple[str, ...]] = (LAYOUT,)
     goal_causes = (LEVELS, MASS, SIZE, WIDTH, NOISE)
-    piece = staticmethod(piece)
+    piece = Piece(
+        size=(layouts.brick_size, LAYOUT, SIZE),
+        place=(layouts.brick_place, LAYOUT, SIZE),
+        start=(layouts.start, LAYOUT, SIZE, PATTERN),
+    )
     levels: ClassVar[numbers.Range] = numbers.STACK_LEVELS
 
     def __init__(
@@ -112,26 +106,35 @@ class StackedBlocks(Building):
         )
 
     def arrange(self, values: Values) -> Any:
-        """Count the blocks of each level.
+        """Count the blocks of each level, and the obstacles if the family has some.
 
         Raises:
-            InterventionError: There are none.
+            InterventionError: There are no blocks.
         """
         counts = layouts.counts(values[LAYOUT])
         if not counts:
             message = f"do({LAYOUT}): a wall has at least one block; give one a width above zero"
             raise InterventionError(message, variable=LAYOUT)
-        return counts
+        return (counts, int(values[COUNT])) if COUNT in self.decided_by else counts
 
     @property
-    def counts(self) -> tuple[int, ...]:
-        """How many blocks each level has."""
-        found: tuple[int, ...] = self.arranged
-        return found
+    def built(self) -> tuple[tuple[int, ...], int]:
+        """How many blocks each level has, and how many obstacles there are."""
+        return self.arranged if COUNT in self.decided_by else (self.arranged, 0)
+
+    @property
+    def obstacles(self) -> tuple[str, ...]:
+        """The small boxes, if the family has some."""
+        return obstacle_names(self.built[1])
+
+    def entities(self) -> Iterable[Entity]:
+        """List the blocks, their places in the wall, and small boxes."""
+        yield from super().entities()
+        yield from scattered(self.built[1])
 
     def parts(self) -> Iterable[Part]:
         """List the blocks, level by level."""
-        for level, count in enumerate(self.counts):
+        for level, count in enumerate(self.built[0]):
             for num in range(count):
                 yield f"level_{level}_num_{num}", {"level": float(level), "num": float(num)}
 
@@ -142,7 +145,7 @@ class StackedBlocks(Building):
             place = layouts.brick_place(values[LAYOUT], values[SIZE], **which)
             found[f"tool_{name}.cartesian_position"] = place
             found[f"tool_{name}.orientation"] = np.array(numbers.IDENTITY)
-        if len(self.counts) * float(values[SIZE]) > LOW:
+        if len(self.built[0]) * float(values[SIZE]) > LOW:
             found["joint_positions"] = np.array(hardware.ASIDE)
         return found
 
@@ -181,7 +184,7 @@ def _noise() -> Iterable[Variable]:
 class CreativeStackedBlocks(StackedBlocks):
     """A wall, regular or random; the blocks of the first and last level have their places.
 
-    What is between the two, the robot has to make up. Small boxes may be in the way. The other
+    The robot has to make up the levels between the two. Small boxes may be in the way. The other
     variables are those of ``StackedBlocks``.
 
     Args:
@@ -216,28 +219,8 @@ class CreativeStackedBlocks(StackedBlocks):
         )
         self.roots += (*scattering(number_of_obstacles),)
 
-    def arrange(self, values: Values) -> tuple[tuple[int, ...], int]:
-        """Count the blocks of each level, and the obstacles."""
-        return super().arrange(values), int(values[COUNT])
-
-    @property
-    def counts(self) -> tuple[int, ...]:
-        """How many blocks each level has."""
-        found: tuple[int, ...] = self.arranged[0]
-        return found
-
     @property
     def targets(self) -> dict[str, str]:
         """The goals of the first level and of the last."""
-        ends = (0, len(self.counts) - 1)
+        ends = (0, len(self.built[0]) - 1)
         return {f"goal_{p}": f"tool_{p}" for p, which in self.parts() if which["level"] in ends}
-
-    @property
-    def obstacles(self) -> tuple[str, ...]:
-        """The small boxes."""
-        return obstacle_names(self.arranged[1])
-
-    def entities(self) -> Iterable[Entity]:
-        """The wall, and small boxes."""
-        yield from super().entities()
-        yield from scattered(self.arranged[1])

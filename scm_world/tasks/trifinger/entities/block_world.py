@@ -14,13 +14,41 @@ from scm_world.tasks.base import Timing
 from scm_world.tasks.composition import Composition, Entity
 from scm_world.tasks.model import causes_of
 from scm_world.tasks.trifinger.conventions import TriFingerConventions
-from scm_world.tasks.trifinger.entities.robot import RobotCommands
+from scm_world.tasks.trifinger.entities.robot import RobotCommands, acted_on
 from scm_world.tasks.trifinger.entities.stage import cameras_of, light_of
 from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
 from scm_world.tasks.trifinger.hardware import FINGERS, LINK_NAMES, PRESET_NAMES, preset
 from scm_world.variables import Variable
 from scm_world.variables.kinds import Coupled
 from scm_world.variables.reserved import PRESET
+
+PARAMETERS = {
+    "gravity": ("world", "gravity"),
+    "floor_friction": ("floor", "friction"),
+    "stage_friction": ("stage", "friction"),
+    "floor_color": ("floor", "color"),
+    "stage_color": ("stage", "color"),
+    "restitution": ("world", "restitution"),
+    "spinning_friction": ("world", "spinning_friction"),
+    "robot_height": ("robot", "height"),
+    "finger_friction": ("robot", "friction"),
+    "joint_damping": ("robot", "joint_damping"),
+    "position_gains": ("controller", "position_gains"),
+    "velocity_gains": ("controller", "velocity_gains"),
+    "safety_damping": ("controller", "safety_damping"),
+    "torque_limit": ("controller", "torque_limit"),
+}
+"""Variables that are parameters of the model, as far as it has them, under other names."""
+
+QUANTITIES = {
+    "mass": "mass",
+    "size": "size",
+    "friction": "friction",
+    "color": "color",
+    "cartesian_position": "position",
+    "orientation": "orientation",
+}
+"""Quantities of bodies that are parameters, as far as the model has them, and its names of them."""
 
 if TYPE_CHECKING:
     from scm_world.tasks.trifinger.system import TriFinger
@@ -119,10 +147,10 @@ class BlockWorld(Composition):
         effects |= {
             row.name: (row.always, row.contact) for row in system.states if not row.reported
         }
-        for entity in self.entities:
-            for name, acted_on in entity.actions.items():
-                reached = frozenset().union(*(trees[state] for state in acted_on))
-                effects[name] = reached, every - reached
+        commands = acted_on(self._timing.action_mode, self._timing.resolution)
+        for name, states in commands.items():
+            reached = frozenset().union(*(trees[state] for state in states))
+            effects[name] = reached, every - reached
         nowhere: frozenset[int] = frozenset()
         effects |= {PRESET: (every, nowhere), **dict.fromkeys(self._deciding, (nowhere, every))}
         causes = causes_of(effects, set(trees.values()))
@@ -137,7 +165,18 @@ class BlockWorld(Composition):
 
     def parameters(self) -> dict[str, ParameterKey]:
         """Return which variable sets which physical parameter."""
-        return {k: v for entity in self.entities for k, v in entity.parameters.items()}
+        known, found = {row.key for row in self.system.parameters}, dict[str, ParameterKey]()
+        for entity in self.entities:
+            names = dict.fromkeys(variable.name for variable in entity.variables)
+            found |= {name: key for name, key in PARAMETERS.items() if name in names}
+            split = [name.rpartition(".") for name in names]
+            found |= {
+                f"{body}.{ours}": (body, its)
+                for ours, its in QUANTITIES.items()
+                for body, _, quantity in split
+                if quantity == ours
+            }
+        return {name: key for name, key in found.items() if key in known}
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         """List goals that lie in an obstacle."""

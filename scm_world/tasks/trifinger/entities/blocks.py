@@ -20,6 +20,7 @@ TYPES = {"block": (1, 2), "obstacle": (10, 10), "goal": (20, 23), "sphere": (21,
 """The published ids of kinds of objects: of boxes, and of those with another shape."""
 
 ZERO = (0.0, 0.0, 0.0)
+Spaces = tuple[Box | None, Box | None]
 
 
 def lowest_point(size: Floats, orientation: Floats, *corners: Floats) -> float:
@@ -87,8 +88,7 @@ _FROM_VECTOR = Function(from_rotation_vector)
 def coordinates(
     entity: str,
     *,
-    a: Box | None = None,
-    b: Box | None = None,
+    spaces: Spaces = (None, None),
     yaw: bool = True,
     inverse: Callable[[Floats], Floats] = from_cylindrical,
 ) -> Iterable[Variable]:
@@ -96,12 +96,11 @@ def coordinates(
 
     Args:
         entity: Prefix.
-        a: Space A of the cylindrical position.
-        b: Space B of it.
+        spaces: A and B of the cylindrical position.
         yaw: Whether A and B of the rotation vector are the turns about z, or there are none.
         inverse: Cartesian position where a cylindrical one is set.
     """
-    yield numbers.Range(None, a, b, "m, rad, m", (3,)).declare(
+    yield numbers.Range(None, *spaces, "m, rad, m", (3,)).declare(
         f"{entity}.cylindrical_position",
         None,
         "Position as radius, angle and height; setting it sets the Cartesian position.",
@@ -132,8 +131,7 @@ class ToolBlock(Entity):
         spawn_from: Further causes of the place at the start; the corners of a hull come first.
         spawn_again: Whether a size that is set does so too; else the block then keeps its lowest
             point.
-        a: Space A of the cylindrical position.
-        b: Space B of it.
+        spaces: A and B of the cylindrical position.
         hull: Its shape, if it is not a box. The size is then a constant.
         orientation: How it begins turned: quaternion (x, y, z, w).
     """
@@ -147,8 +145,7 @@ class ToolBlock(Entity):
         spawn: Function | None = None,
         spawn_from: tuple[str, ...] = (),
         spawn_again: bool = False,
-        a: Box | None = None,
-        b: Box | None = None,
+        spaces: Spaces = (None, None),
         hull: Hull | None = None,
         orientation: tuple[float, float, float, float] = numbers.IDENTITY,
     ) -> None:
@@ -184,15 +181,8 @@ class ToolBlock(Entity):
         slide = moving("linear_velocity", numbers.LINEAR_VELOCITIES, ZERO, doc)
         doc = "Angular velocity in the world frame."
         spin = moving("angular_velocity", numbers.ANGULAR_VELOCITIES, ZERO, doc)
-        own = (kind, size, mass, friction, paint, *coordinates(name, a=a, b=b))
-        set_by = ("mass", "friction", "color") if hull else ("mass", "size", "friction", "color")
-        super().__init__(
-            name,
-            (*own, place, turn, slide, spin),
-            {f"{name}.{quantity}": (name, quantity) for quantity in set_by},
-            kind="block",
-            hull=hull,
-        )
+        own = (kind, size, mass, friction, paint, *coordinates(name, spaces=spaces))
+        super().__init__(name, (*own, place, turn, slide, spin), kind="block", hull=hull)
 
 
 def block_size(

@@ -13,7 +13,7 @@ from scm_world.geometry import from_cylindrical, rotation_matrix
 from scm_world.geometry.hulls import Hull
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger.entities.blocks import ZERO, coordinates, looks
+from scm_world.tasks.trifinger.entities.blocks import ZERO, Spaces, coordinates, looks
 from scm_world.variables import Box, Function, Variable
 
 
@@ -25,15 +25,9 @@ def on_the_floor(polar: Floats, height: Floats) -> Floats:
 
 
 def turned_on_the_floor(polar: Floats, size: Floats, orientation: Floats) -> Floats:
-    """Put a turned box on the floor at a radius and an angle: its lowest point touches it.
+    """Put a turned box on the floor: compute its center, shape (..., 3) [m].
 
-    Args:
-        polar: Radius [m] and angle [rad], shape (..., 2).
-        size: Edge lengths, shape (..., 3) [m].
-        orientation: Quaternion (x, y, z, w), shape (..., 4).
-
-    Returns:
-        The center, shape (..., 3) [m].
+    It is at a radius [m] and an angle [rad], shape (..., 2), and its lowest point is on the floor.
     """
     height = (np.abs(rotation_matrix(orientation)[..., 2, :]) * size).sum(axis=-1)
     return on_the_floor(polar, height / 2.0)
@@ -81,8 +75,7 @@ class GoalBlock(Entity):
         size: The declaration of ``<name>.size`` [m].
         pose: Those of ``<name>.cartesian_position`` and ``<name>.orientation``, and of causes
             that belong to this goal alone.
-        a: Space A of the cylindrical position.
-        b: Space B of it.
+        spaces: A and B of the cylindrical position.
         yaw: Whether turns about z are in the spaces of the rotation vector.
         hull: Its shape, if it is not a box.
         inverse: Cartesian position where a cylindrical one is set.
@@ -94,14 +87,13 @@ class GoalBlock(Entity):
         *,
         size: Variable,
         pose: Iterable[Variable],
-        a: Box | None = None,
-        b: Box | None = None,
+        spaces: Spaces = (None, None),
         yaw: bool = True,
         hull: Hull | None = None,
         inverse: Callable[[Floats], Floats] = from_cylindrical,
     ) -> None:
         kind, paint = looks(name, "goal", numbers.GOAL_COLOR, hull)
-        others = coordinates(name, a=a, b=b, yaw=yaw, inverse=inverse)
+        others = coordinates(name, spaces=spaces, yaw=yaw, inverse=inverse)
         super().__init__(name, (kind, size, *pose, paint, *others), kind="goal", hull=hull)
 
 
@@ -116,6 +108,6 @@ def goal_sphere(
     )
     kind, paint = looks(name, "sphere", tint)
     pose = goal_position(name, default=position), goal_orientation(name)
-    a, b = numbers.places(numbers.half_height(size.name), airborne=True)
-    own = (kind, size, *pose, paint, *coordinates(name, a=a, b=b))
+    spaces = numbers.places(numbers.half_height(size.name), airborne=True)
+    own = (kind, size, *pose, paint, *coordinates(name, spaces=spaces))
     return Entity(name, own, kind="goal", shape="sphere")

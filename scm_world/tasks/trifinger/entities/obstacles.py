@@ -14,15 +14,6 @@ from scm_world.tasks.trifinger.entities.goals import goal_orientation, goal_posi
 from scm_world.tasks.trifinger.hardware import ARENA_HALF_WIDTH, ARENA_HEIGHT
 from scm_world.variables import Box, Function, Integers, Variable
 
-QUANTITIES = {
-    "size": "size",
-    "friction": "friction",
-    "color": "color",
-    "cartesian_position": "position",
-    "orientation": "orientation",
-}
-"""The quantities of an obstacle, and what the scene calls them. All of them are parameters."""
-
 
 def obstacle(name: str, *, size: Variable, position: Variable) -> Entity:
     """Describe a box that nothing moves. Its pose is a parameter: it holds until the reset.
@@ -39,8 +30,7 @@ def obstacle(name: str, *, size: Variable, position: Variable) -> Entity:
         "Friction of its surface; a contact has the product of two frictions.",
     )
     own = (kind, size, position, goal_orientation(name), friction, paint)
-    parameters = {f"{name}.{ours}": (name, its) for ours, its in QUANTITIES.items()}
-    return Entity(name, (*own, *coordinates(name, yaw=False)), parameters, kind="obstacle")
+    return Entity(name, (*own, *coordinates(name, yaw=False)), kind="obstacle")
 
 
 COUNT = "number_of_obstacles"
@@ -73,7 +63,7 @@ def scattering(default: int) -> Iterable[Variable]:
     x, y = radius * np.cos(_ANGLE * index), radius * np.sin(_ANGLE * index)
     inside, top = ARENA_HALF_WIDTH - 0.005, ARENA_HEIGHT - 0.005
     space = Box((-inside, -inside, 0.005) * MOST, (inside, inside, top) * MOST)
-    bounds = Box((-0.24, -0.24, 0.0) * MOST, (0.24, 0.24, 0.5) * MOST)
+    bounds = Box(*(end * MOST for end in numbers.POSITION_ENDS))
     yield numbers.Range(bounds, space, space, "m", (MOST, 3)).declare(
         PLACES,
         tuple(np.stack([x, y, height], axis=-1).ravel().tolist()),

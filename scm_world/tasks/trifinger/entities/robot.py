@@ -38,7 +38,13 @@ ACTIONS = {
 
 _SPEC = ControllerSpec()
 
-CONTROLLER = (
+HIDDEN = (
+    numbers.FRICTION.declare(
+        "finger_friction",
+        numbers.FINGER_FRICTION,
+        "Friction of all links; a contact has the product of two frictions.",
+    ),
+    numbers.JOINT_DAMPING.declare("joint_damping", 0.0, "Passive damping of every joint."),
     numbers.POSITION_GAINS.declare(
         "position_gains", _SPEC.kp, "Proportional gain of the three joints of a finger."
     ),
@@ -55,10 +61,13 @@ CONTROLLER = (
         _SPEC.limit,
         "Largest torque of a joint. Torques that are commanded end at 0.36 N m for any value.",
     ),
+    numbers.NOISE.declare(
+        ACTUATOR_NOISE,
+        0.0,
+        "Standard deviation of a command, as a fraction of half the range of an action.",
+    ),
 )
-"""The joint controller."""
-SERVO = ("position_gains", "velocity_gains")
-"""Those of it that have no effect where torques are commanded."""
+"""What the predecessor keeps to itself: friction, damping, the joint controller, and noise."""
 
 MOVES = (
     (numbers.JOINTS, "Angles of the joints of {}."),
@@ -121,9 +130,6 @@ class RobotCommands(Commands):
         return action
 
 
-OF_LINKS = ("mass", "color")
-
-
 def robot(
     action_mode: str,
     start: tuple[float, ...] = hardware.REST,
@@ -134,14 +140,10 @@ def robot(
     Args:
         action_mode: One of ``ACTIONS``.
         start: Joint positions at the start, shape (9,) [rad].
-        resolution: One of ``RESOLUTIONS``. What is finer than ``"vector"`` is put together again
+        resolution: One of ``RESOLUTIONS``. Variables finer than ``"vector"`` are put together again
             in bundles under the names of the whole robot.
     """
-    unit, range_ = ACTIONS[action_mode]
-    by_tips = action_mode == "end_effector_positions"
-    groups = joints_of(resolution)
-    # A tip is a point: its three coordinates are those of no single joint.
-    acting = joints_of("finger") if by_tips and resolution == "joint" else groups
+    (unit, range_), groups = ACTIONS[action_mode], joints_of(resolution)
     actions = [
         Action(
             name=joints.action,
@@ -150,7 +152,7 @@ def robot(
             bounds=joints.cut(range_),
             doc=f"What the policy commands of {joints.of}: {action_mode}.",
         )
-        for joints in acting
+        for joints in _acting(action_mode, resolution)
     ]
     states = [_moving(quantity, joints, start) for quantity in range(3) for joints in groups]
     variables: list[Variable] = list(actions)
@@ -170,34 +172,35 @@ def robot(
         doc = f"Mass of the link; its inertia scales with it.{still}"
         variables.append(numbers.LINK_MASSES.declare(f"{link}.mass", mass, doc))
         variables.append(numbers.color(f"{link}.color", hardware.LINK_COLORS[finger]))
-    variables += [*_hidden(), *_tips(groups)]
+    variables += [*HIDDEN, *_tips(groups)]
     if len(groups) > 1:
         for index, (name, (kind, doc)) in enumerate(zip(QUANTITIES, MOVES, strict=True)):
             parts = states[index * len(groups) : (index + 1) * len(groups)]
             spaces = {"bounds": kind.bounds, "a": kind.a, "b": kind.b}
             variables.append(bundle(name, parts, doc=doc.format("all fingers"), **spaces))
-    acted_on = {
+    return Entity("robot", (*variables, *states))
+
+
+def acted_on(action_mode: str, resolution: str) -> dict[str, tuple[str, ...]]:
+    """Map what acts through commands to the states of the joints that it acts on in every step."""
+    groups, by_tips = joints_of(resolution), action_mode == "end_effector_positions"
+    found = {
         joints.action: tuple(
             name
             for other in groups
             if not set(other.fingers).isdisjoint(joints.fingers)
             for name in other.names
         )
-        for joints in acting
+        for joints in _acting(action_mode, resolution)
     }
-    always = ("robot_height", ACTUATOR_NOISE) if by_tips else (ACTUATOR_NOISE,)
-    acted_on |= dict.fromkeys(always, tuple(name for joints in groups for name in joints.names))
-    torques = action_mode == "joint_torques"
-    parameters = {
-        "robot_height": ("robot", "height"),
-        "finger_friction": ("robot", "friction"),
-        "joint_damping": ("robot", "joint_damping"),
-        **{
-            v.name: ("controller", v.name) for v in CONTROLLER if not torques or v.name not in SERVO
-        },
-        **{f"{link}.{what}": (link, what) for link in hardware.LINK_NAMES for what in OF_LINKS},
-    }
-    return Entity("robot", (*variables, *states), parameters, acted_on)
+    others = ("robot_height", ACTUATOR_NOISE) if by_tips else (ACTUATOR_NOISE,)
+    return found | dict.fromkeys(others, tuple(name for joints in groups for name in joints.names))
+
+
+def _acting(action_mode: str, resolution: str) -> tuple[JointGroup, ...]:
+    """List the joints of each action. A tip is a point: its coordinates are of no single joint."""
+    whole = action_mode == "end_effector_positions" and resolution == "joint"
+    return joints_of("finger" if whole else resolution)
 
 
 def _moving(quantity: int, joints: JointGroup, start: tuple[float, ...]) -> Measured:
@@ -216,22 +219,6 @@ def _moving(quantity: int, joints: JointGroup, start: tuple[float, ...]) -> Meas
         doc.format(joints.of),
         settable_state=quantity < 2,
         **spaces,
-    )
-
-
-def _hidden() -> Iterable[Variable]:
-    """Declare what the predecessor keeps to itself: friction, damping, control and noise."""
-    yield numbers.FRICTION.declare(
-        "finger_friction",
-        numbers.FINGER_FRICTION,
-        "Friction of all links; a contact has the product of two frictions.",
-    )
-    yield numbers.JOINT_DAMPING.declare("joint_damping", 0.0, "Passive damping of every joint.")
-    yield from CONTROLLER
-    yield numbers.NOISE.declare(
-        ACTUATOR_NOISE,
-        0.0,
-        "Standard deviation of a command, as a fraction of half the range of an action.",
     )
 
 

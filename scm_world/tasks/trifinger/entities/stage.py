@@ -15,16 +15,6 @@ from scm_world.tasks.trifinger.hardware import PRESET_NAMES
 from scm_world.variables import Box, Variable
 from scm_world.variables.reserved import PRESET, SENSOR_NOISE
 
-PARAMETERS = {
-    "gravity": ("world", "gravity"),
-    "floor_friction": ("floor", "friction"),
-    "stage_friction": ("stage", "friction"),
-    "floor_color": ("floor", "color"),
-    "stage_color": ("stage", "color"),
-    "restitution": ("world", "restitution"),
-    "spinning_friction": ("world", "spinning_friction"),
-}
-
 
 def stage(preset: str) -> Entity:
     """Describe what the robot and the blocks stand in, with the settings that a preset names."""
@@ -64,7 +54,7 @@ def stage(preset: str) -> Entity:
             "Standard deviation of every observed number, as a fraction of half its range.",
         ),
     )
-    return Entity("stage", variables, PARAMETERS)
+    return Entity("stage", variables)
 
 
 _DEFAULT = Light()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, final
 
@@ -122,23 +122,6 @@ def turns(block: Cuboid, goal: Cuboid) -> tuple[float, ...]:
         if (across if quarter % 2 else straight) <= min(straight, across) + ALIKE
     ]
     return tuple(sorted(fitting, key=abs))
-
-
-def solids(bodies: Iterable[tuple[Cuboid, float]]) -> tuple[Floats, Floats, Floats]:
-    """Gather half edges, centers and axes of boxes: shapes (n, 3), (n, 3) and (n, 3, 3).
-
-    Args:
-        bodies: Each with a length by which its sides are moved outwards [m].
-    """
-    listed = list(bodies)
-    halves = [body.half + grow for body, grow in listed]
-    centers = [body.place for body, _ in listed]
-    axes = [turn_about_z(body.yaw) for body, _ in listed]
-    return (
-        np.array(halves).reshape(-1, 3),
-        np.array(centers).reshape(-1, 3),
-        np.array(axes).reshape(-1, 3, 3),
-    )
 
 
 LEAST_FRICTION = 0.05

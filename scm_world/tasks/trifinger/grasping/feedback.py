@@ -344,9 +344,10 @@ class Program:
             reach: How much of it is looked at, as seen from above [m].
         """
         height, ahead = 0.0, way[:2] / max(math.hypot(way[0], way[1]), 1e-9)
+        walls = [self._sight.body(wall) for wall in self._sight.walls]
         for far in np.linspace(0.0, reach, SAMPLES):
             on = body.at(body.place + np.array([*far * ahead, 0.0]), body.yaw)
-            for wall in map(self._sight.body, self._sight.walls):
+            for wall in walls:
                 if on.depth_in(wall, margin=CLEARANCE, flat=True) > 0.0:
                     height = max(height, wall.top + float(body.half[2]) + CLEARANCE)
         return height

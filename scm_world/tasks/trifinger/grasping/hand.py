@@ -29,14 +29,12 @@ BALLS = 17
 
 NUDGE = 1e-6  # [rad] by which joints are moved to find out how points of the fingers move
 
-Solids = tuple[Floats, Floats, Floats]
-"""Half edges, centers and axes of boxes: shapes (n, 3), (n, 3) and (n, 3, 3)."""
-
 _LOW, _HIGH = np.array(hardware.JOINT_LOW), np.array(hardware.JOINT_HIGH)
 _LEG, _TIP = hardware.LEG_LENGTH, -hardware.LATERAL_OFFSET
 _SHOULDER, _KNEE = (hardware.JOINT_ORIGINS[joint][1] for joint in (1, 2))
 _RADII = (TIP_RADIUS, hardware.COLLISION["middle"].radius)
-_MIDDLE = _SHOULDER + hardware.COLLISION["middle"].start[1]  # [m] beside the first axis
+_BESIDE = (_TIP, _SHOULDER + hardware.COLLISION["middle"].start[1])
+"""Of lower and middle legs: the radius, and how far they lie along the second axis [m]."""
 _CENTERS = [hardware.INERTIAL[link].center for link in (2, 3)]
 _MASSES = (
     (_SHOULDER + _CENTERS[0][1], -_CENTERS[0][2] / _LEG, 0.0),
@@ -67,15 +65,13 @@ def deepest_kernel(
     """
     legs, deepest = np.empty((2 * N_FINGERS, BALLS, 3)), -math.inf
     for leg in range(2 * N_FINGERS):
-        finger, radius = leg // 2, _RADII[leg % 2]
-        angles = joints[3 * finger : 3 * finger + 3]
-        for i in range(BALLS):
-            share, ball = i / (BALLS - 1), legs[leg, i]
-            if leg % 2 == 0:
-                place = point_kernel(finger, angles, height, _TIP, 1.0, 1.0 - share)
-            else:
-                place = point_kernel(finger, angles, height, _MIDDLE, share, 0.0)
-            ball[0], ball[1], ball[2] = place
+        finger, part = leg // 2, leg % 2
+        angles, radius = joints[3 * finger : 3 * finger + 3], _RADII[part]
+        first = point_kernel(finger, angles, height, _BESIDE[part], 1.0 - part, 1.0 - part)
+        knee = point_kernel(finger, angles, height, _BESIDE[part], 1.0, 0.0)
+        for i, ball in enumerate(legs[leg]):
+            for k in range(3):
+                ball[k] = first[k] + (knee[k] - first[k]) * i / (BALLS - 1)
             for box in range(len(halves)):
                 outside, inside = 0.0, -math.inf
                 for axis in range(3):
@@ -131,9 +127,9 @@ def poses(
         tips: Shape (n, 9) [m].
         near: Joint positions to stay close to, shape (n, 9) [rad].
         height: Of the robot [m].
-        halves: Half edges of boxes that they may run into; so too what follows; see ``Solids``.
-        centers: See above.
-        turns: See above.
+        halves: Half edges of m boxes that they may run into, shape (m, 3) [m].
+        centers: Of the boxes, shape (m, 3) [m].
+        turns: Axes of the boxes as columns, shape (m, 3, 3).
 
     Returns:
         Joints, shape (n, 9) [rad]; whether all fingertips are reached, shape (n,); and the

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import ArrayLike, Floats
-from scm_world.tasks.trifinger.grasping.bodies import Cuboid, solids, turn_about_z
+from scm_world.tasks.trifinger.grasping.bodies import Cuboid, turn_about_z
 from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand, poses
 
 LEVELS = (0.15, 0.4, 0.0)
@@ -276,12 +276,18 @@ class Planner:
     def _poses(
         self, tips: Floats, near: Floats | None = None, *more: tuple[Cuboid, float]
     ) -> tuple[Floats, NDArray[np.bool_], Floats]:
-        """Find joints for fingertips, and how deep fingers then lie in anything; see ``poses``."""
+        """Find joints for fingertips, and how deep fingers then lie in anything; see ``poses``.
+
+        Each of ``more`` is another box, and by how much its sides are moved outwards [m].
+        """
         rows = np.ascontiguousarray(tips).reshape(-1, 9)
         begin = np.tile(self._joints, (len(rows), 1)) if near is None else near
-        clear = ((other, CLEAR) for other in self._others)
+        boxes = [*((other, CLEAR) for other in self._others), *more]
+        halves = np.array([body.half + grow for body, grow in boxes]).reshape(-1, 3)
+        centers = np.array([body.place for body, _ in boxes]).reshape(-1, 3)
+        axes = np.array([turn_about_z(body.yaw) for body, _ in boxes]).reshape(-1, 3, 3)
         found: tuple[Floats, NDArray[np.bool_], Floats] = poses(
-            rows, begin, self._hand.height, *solids((*clear, *more))
+            rows, begin, self._hand.height, halves, centers, axes
         )
         return found
 
