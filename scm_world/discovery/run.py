@@ -235,7 +235,7 @@ def _shown(
 
 
 def _terms(world: Simulation, seed: int) -> dict[str, Any]:
-    backend, usual = world.backend, world.resolution == world.task.resolutions[0]
+    backend, usual = world.backend, world.resolution == world.task.choices["resolution"][0]
     return {
         **({} if usual else {"resolution": world.resolution}),
         "task": world.task.name,

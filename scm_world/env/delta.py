@@ -30,7 +30,8 @@ def checked_mode(mode: Any, task: Task | StructureCache) -> str:
     Raises:
         UnknownOption: The task has no such mode, neither by itself nor after ``"delta_"``.
     """
-    modes = (task.task if isinstance(task, StructureCache) else task).action_modes
+    given = task.task if isinstance(task, StructureCache) else task
+    modes: tuple[str, ...] = given.choices["action_mode"]
     allowed = (*modes, *(PREFIX + one for one in modes))
     if mode is None:
         return modes[0]

@@ -250,11 +250,11 @@ class Timing:
     """How a world is commanded and how time is cut.
 
     Attributes:
-        action_mode: One of the task's ``action_modes``.
-        preset: One of the task's ``presets``.
+        action_mode: One of the task's ``choices``, like the preset and the resolution.
+        preset: Numerical settings.
         control_period: Length of a control step [s].
         steps: Length of an episode in control steps.
-        resolution: One of the task's ``resolutions``.
+        resolution: How finely variables are cut.
     """
 
     action_mode: str
@@ -274,11 +274,10 @@ class Task(ABC):
 
     Attributes:
         name: Name of the task.
-        action_modes: How the system can be commanded; the first is the default.
-        presets: Numerical settings to choose from; the first is the default.
-        resolutions: How finely its variables can be cut; the first is the default.
+        choices: For each of ``action_mode`` (how the system is commanded), ``preset`` (numerical
+            settings), ``resolution`` (how finely its variables are cut) and ``conventions`` the
+            values, of which the first is the default; conventions by their names.
         conventions: The conventions that hold.
-        choices: All conventions that the task knows, by name.
         time_unit: The unit of ``frame_skip`` [s].
         frame_skip: Default length of a control step.
         seconds: Length of an episode [s].
@@ -303,13 +302,13 @@ class Task(ABC):
     is_named: bool
 
     name: str
-    action_modes: tuple[str, ...]
-    presets: tuple[str, ...]
-    resolutions: tuple[str, ...] = ("declared",)
     conventions: Conventions = Conventions()
-    choices: ClassVar[Mapping[str, Conventions]] = {
-        "scm_world": conventions,
-        "causal_world": Conventions("causal_world", True, True, True),
+    choices: ClassVar[dict[str, Any]] = {
+        "resolution": ("declared",),
+        "conventions": {
+            "scm_world": conventions,
+            "causal_world": Conventions("causal_world", True, True, True),
+        },
     }
     time_unit: float
     frame_skip: int

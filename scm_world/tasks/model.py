@@ -177,8 +177,7 @@ class ModelTask(DeclaredTask):
         UnknownOption: An argument or a name does not exist.
     """
 
-    action_modes = ("controls",)
-    presets = ("model",)
+    choices = Task.choices | {"action_mode": ("controls",), "preset": ("model",)}
     generated_graph = True
     checks_functions = True
 

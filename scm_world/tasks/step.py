@@ -93,8 +93,7 @@ class StepTask(DeclaredTask):
         UnknownOption: An argument does not exist.
     """
 
-    action_modes = ("actions",)
-    presets = ("default",)
+    choices = DeclaredTask.choices | {"action_mode": ("actions",), "preset": ("default",)}
     backend = "step"
     frame_skip = 1
 

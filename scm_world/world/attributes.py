@@ -54,7 +54,8 @@ class WorldAttributes:
             "conventions": self.conventions.name,
             "variables_space": world.variables_space,
         }
-        if self.resolution != self.task.resolutions[0]:  # logs and files of before have none
+        usual = self.task.choices["resolution"][0]
+        if self.resolution != usual:  # logs and files of before have none
             options["resolution"] = self.resolution
         return _copied, (type(self), self.structures.task, options, snapshot)
 
@@ -153,7 +154,8 @@ class WorldAttributes:
     def _settings(self) -> tuple[Any, ...]:
         numbers = (self.frame_skip, self.max_episode_length)
         options = (self.options.preset, self.action_mode, self.conventions.name)
-        finer = () if self.resolution == self.task.resolutions[0] else (self.resolution,)
+        usual = self.task.choices["resolution"][0]
+        finer = () if self.resolution == usual else (self.resolution,)
         return (self.task.name, *options, *numbers, *finer)
 
     def __fingerprint__(self) -> dict[str, Any]:

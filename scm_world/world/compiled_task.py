@@ -135,23 +135,21 @@ class Options:
         Raises:
             UnknownOption: One of the names does not exist, or a number is none.
         """
-        given = task.frame_skip if frame_skip is None else frame_skip
-        skip = whole_number("frame_skip", given, least=1)
+        usual = task.frame_skip
+        skip = whole_number("frame_skip", usual if frame_skip is None else frame_skip, least=1)
         if max_episode_length is not None:
             whole_number("max_episode_length", max_episode_length, least=1)
-        mode = task.action_modes[0] if action_mode is None else action_mode
-        if mode not in task.action_modes:
-            raise UnknownOption("action_mode", mode, task.action_modes)
-        name = task.presets[0] if preset is None else preset
-        if name not in task.presets:
-            raise UnknownOption("preset", name, task.presets)
-        fine = task.resolutions[0] if resolution is None else resolution
-        if fine not in task.resolutions:
-            raise UnknownOption("resolution", fine, task.resolutions)
-        if conventions_name not in task.choices:
-            raise UnknownOption("conventions", conventions_name, task.choices)
-        kept = task.choices[conventions_name]
-        return cls(name, mode, fine, skip, task.time_unit, max_episode_length, kept)
+        asked: dict[str, Any] = {}
+        given = {"action_mode": action_mode, "preset": preset, "resolution": resolution}
+        for option, value in {**given, "conventions": conventions_name}.items():
+            allowed = task.choices[option]
+            asked[option] = next(iter(allowed)) if value is None else value
+            if asked[option] not in allowed:
+                raise UnknownOption(option, value, allowed)
+        asked["conventions"] = task.choices["conventions"][conventions_name]
+        return cls(
+            **asked, frame_skip=skip, time_unit=task.time_unit, given_length=max_episode_length
+        )
 
     @property
     def control_period(self) -> float:

@@ -17,7 +17,6 @@ from scm_world.graph import SCM
 from scm_world.tasks.base import (
     OVERLAP,
     TIME,
-    Conventions,
     Goal,
     Observation,
     Observed,
@@ -120,14 +119,16 @@ class TriFingerTask(Task):
         terminated: Ends an episode before its time, if given; see ``Common``.
     """
 
-    action_modes = tuple(ACTIONS)
-    presets = tuple(PRESETS)
-    resolutions = RESOLUTIONS
+    choices: ClassVar[dict[str, Any]] = {
+        "action_mode": tuple(ACTIONS),
+        "preset": tuple(PRESETS),
+        "resolution": RESOLUTIONS,
+        "conventions": CONVENTIONS,
+    }
     time_unit = TIMESTEP
     frame_skip = 10
     n_actions = hardware.N_JOINTS
     conventions: TriFingerConventions = CONVENTIONS["scm_world"]
-    choices: ClassVar[Mapping[str, Conventions]] = CONVENTIONS
 
     interleaved: ClassVar[bool] = False
     block: Any = None
