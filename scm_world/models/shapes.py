@@ -84,7 +84,7 @@ class Shape(NamedTuple):
     tiles: Tiles | None = None
 
 
-class Table(NamedTuple):
+class ShapeTable(NamedTuple):
     """The numbers of shapes, one row each; see ``Shape``.
 
     Attributes:
@@ -114,7 +114,7 @@ class Shapes(NamedTuple):
         tiles: Checkerboards on planes, by row.
     """
 
-    table: Table
+    table: ShapeTable
     moves: NDArray[np.bool_]
     meshes: Mapping[int, Mesh]
     tiles: Mapping[int, Tiles]
@@ -123,7 +123,7 @@ class Shapes(NamedTuple):
     def of(cls, shapes: Sequence[Shape]) -> Shapes:
         """Collect shapes."""
         n = len(shapes)
-        table = Table(
+        table = ShapeTable(
             np.array([KINDS.index(shape.kind) for shape in shapes], dtype=np.int64),
             np.array([shape.halves for shape in shapes], dtype=np.float64).reshape(n, 3),
             np.array([shape.position for shape in shapes], dtype=np.float64).reshape(n, 3),
@@ -158,7 +158,7 @@ class Shapes(NamedTuple):
         n = len(self.moves)
         columns = zip(self.table, others.table, strict=True)
         return Shapes(
-            Table(*(np.concatenate(pair) for pair in columns)),
+            ShapeTable(*(np.concatenate(pair) for pair in columns)),
             np.concatenate([self.moves, others.moves]),
             {**self.meshes, **{n + i: mesh for i, mesh in others.meshes.items()}},
             {**self.tiles, **{n + i: tiles for i, tiles in others.tiles.items()}},

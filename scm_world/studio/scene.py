@@ -25,7 +25,7 @@ MOST_SCENES = 64  # lists of shapes that are remembered, so that the page need n
 
 
 @final
-class Shapes:
+class SentShapes:
     """Numbers for lists of shapes and for meshes, so that each is sent once."""
 
     def __init__(self) -> None:

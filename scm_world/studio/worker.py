@@ -35,7 +35,7 @@ from scm_world.studio.reading import (
     plain,
     told,
 )
-from scm_world.studio.scene import Shapes, frame, touching
+from scm_world.studio.scene import SentShapes, frame, touching
 from scm_world.variables import Draw, Natural, Scale, Shift
 from scm_world.variables.spaces import problems_of
 from scm_world.world import Simulation
@@ -135,7 +135,7 @@ class Session:
     def __init__(self, spec: Spec, pipe: Connection) -> None:
         self._spec, self._pipe = spec, pipe
         self.world = spec.make()
-        self._shapes = Shapes()
+        self._shapes = SentShapes()
         self._playing, self._speed, self._next = False, 1.0, 0.0
         self._looking: int | None = None
         self._watched: tuple[str, ...] = ()
@@ -525,7 +525,7 @@ class Session:
     @validate_call
     def greet(self) -> None:
         """Send everything once more, to a page that has come back."""
-        self._shapes, self._sent_rows, self._new_lines = Shapes(), [0, 0], True
+        self._shapes, self._sent_rows, self._new_lines = SentShapes(), [0, 0], True
         self._hello()
 
     # --- jobs -----------------------------------------------------------------------------------
@@ -586,7 +586,7 @@ class Session:
 
     def _recording(self) -> dict[str, Any]:
         """Collect graph, shapes, frames and series of all instants."""
-        shapes, scenes, frames, rows = Shapes(), [], [], []
+        shapes, scenes, frames, rows = SentShapes(), [], [], []
         for number, lane in enumerate(self._lanes):
             for step in range(lane.live.steps + 1):
                 shape, poses, message = shapes.place(self._scene(number, step))

@@ -12,7 +12,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, Capabilities, ContactPoint, EngineSnapshot
-from scm_world.backends.bullet.client import Client, Instant, Saved, alike
+from scm_world.backends.bullet.client import Client, Instant, SavedState, alike
 from scm_world.backends.bullet.engine import load
 from scm_world.backends.bullet.honoured import check, rebuilt, settle, supports
 from scm_world.errors import EngineFailure, Infeasible, ModelError, UnknownOption
@@ -73,7 +73,7 @@ class Record:
     last: Instant
     now: Instant
     light: bool
-    saved: Saved | None = None
+    saved: SavedState | None = None
 
     def past(self) -> History:
         """Copy the history as far as it belongs to this record."""
@@ -115,7 +115,7 @@ class BulletBackend(Backend):
         self._engine, self.version = load()
         self._base: Client | None = None  # holds the world of the last step, once it is needed
         self._spare: Client | None = None  # holds the canonical world, if there is one
-        self._saved: Saved | None = None  # stands for the state of the base
+        self._saved: SavedState | None = None  # stands for the state of the base
 
     def __getattr__(self, name: str) -> Any:
         if name == "structure":

@@ -62,7 +62,7 @@ LINK = (
 
 @final
 @dataclass
-class Unit:
+class EngineBody:
     """A multibody, or a body that cannot move. Equal ones need not be made again.
 
     Attributes:
@@ -120,7 +120,7 @@ class Built:
 
     def __init__(self, engine: Any) -> None:
         self._engine = engine
-        self._units: list[Unit] = []
+        self._units: list[EngineBody] = []
         self.bodies: dict[int, Handle] = {}
         self.joints: dict[int, Handle] = {}
         self.geoms: dict[int, Handle] = {}
@@ -163,7 +163,7 @@ class Built:
         )
         return set(gone)
 
-    def _create(self, unit: Unit, damping: float) -> None:
+    def _create(self, unit: EngineBody, damping: float) -> None:
         """Make a unit, without what the engine does by itself: motors, sleep, a highest speed."""
         engine, base, rows = self._engine, dict(unit.base), [list(row) for row in unit.rows]
         for (shape, _), link in zip(unit.shapes, unit.links[2], strict=True):
@@ -218,7 +218,7 @@ class Built:
                 engine.changeDynamics(made, link, collisionMargin=max(HULL_MARGIN, margin))
 
 
-def _describe(unit: Unit, mj: mujoco.MjModel, data: mujoco.MjData, paired: set[int]) -> None:
+def _describe(unit: EngineBody, mj: mujoco.MjModel, data: mujoco.MjData, paired: set[int]) -> None:
     """Fill in what a unit is made of."""
     carrier: dict[int, int] = {}  # the link whose frame moves with a body
     origin: dict[int, Floats | None] = {}  # of that frame, in the frame of the body
@@ -310,13 +310,13 @@ def _shape(mj: mujoco.MjModel, geom: int, origin: Floats | None) -> dict[str, An
     return found
 
 
-def _units(mj: mujoco.MjModel, touching: list[int]) -> Iterator[Unit]:
+def _units(mj: mujoco.MjModel, touching: list[int]) -> Iterator[EngineBody]:
     """List what becomes a unit: what hangs on the world; shapes that cannot move; free bodies.
 
     They meet in this order. Kinematic trees that hang on the world share a multibody, as far as
     there is room: the engine is asked and told of all of them at once, and solves each by itself.
     """
-    free, hanging, room = list[Unit](), Unit([], [], []), MOST_LINKS
+    free, hanging, room = list[EngineBody](), EngineBody([], [], []), MOST_LINKS
     for tree in range(mj.ntree):
         unit = unit_of(mj, tree, touching)
         if mj.jnt_type[unit.joints[0]] == FREE:
@@ -324,26 +324,26 @@ def _units(mj: mujoco.MjModel, touching: list[int]) -> Iterator[Unit]:
             continue
         if links(mj, unit) > room:
             yield hanging
-            hanging, room = Unit([], [], []), MOST_LINKS
+            hanging, room = EngineBody([], [], []), MOST_LINKS
         room -= links(mj, unit)
         hanging.bodies += unit.bodies
         hanging.joints += unit.joints
         hanging.geoms += unit.geoms
     yield from ([hanging] if hanging.bodies else [])
     still = mj.body_treeid[mj.geom_bodyid] < 0
-    yield from (Unit([], [], [geom]) for geom in touching if still[geom])
+    yield from (EngineBody([], [], [geom]) for geom in touching if still[geom])
     yield from free
 
 
-def unit_of(mj: mujoco.MjModel, tree: int, touching: list[int]) -> Unit:
+def unit_of(mj: mujoco.MjModel, tree: int, touching: list[int]) -> EngineBody:
     """List what a kinematic tree consists of."""
     bodies = np.flatnonzero(mj.body_treeid == tree).tolist()
     joints = [joint for body in bodies for joint in joints_of(mj, body)]
     own = mj.body_treeid[mj.geom_bodyid] == tree
-    return Unit(bodies, joints, [geom for geom in touching if own[geom]])
+    return EngineBody(bodies, joints, [geom for geom in touching if own[geom]])
 
 
-def links(mj: mujoco.MjModel, unit: Unit) -> int:
+def links(mj: mujoco.MjModel, unit: EngineBody) -> int:
     """Count the links that a tree needs."""
     free = mj.jnt_type[unit.joints[0]] == FREE
     jointless = sum(not joints_of(mj, body) for body in unit.bodies)

@@ -17,7 +17,7 @@ from scm_world.backends.base import ContactPoint
 from scm_world.backends.bullet.build import BALL, FREE, Built, custom, solid
 from scm_world.backends.bullet.engine import Connection
 from scm_world.backends.bullet.honoured import realized, rebuilt, rotations
-from scm_world.backends.bullet.joints import Part, parts
+from scm_world.backends.bullet.joints import JointSet, parts
 from scm_world.backends.mujoco import reading
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.backends.mujoco.trees import Couplings, disabled
@@ -129,7 +129,7 @@ def _pulled(mj: mujoco.MjModel) -> Integers:
 
 
 @final
-class Saved:
+class SavedState:
     """Stands for a state that a client keeps; the client forgets it when nobody holds this."""
 
 
@@ -156,7 +156,9 @@ class Client:
         self._told: dict[Setting, Any] = {}  # what the engine was told of live bodies
         self._inside: Parameters | None = None  # parameters that were built into the bodies
         self._ruled: set[tuple[int, int, int, int]] = set()  # pairs of links with a rule
-        self._saved: list[tuple[weakref.ref[Saved], int, Floats]] = []  # number and activations
+        self._saved: list[
+            tuple[weakref.ref[SavedState], int, Floats]
+        ] = []  # number and activations
         self._built = Built(engine)
         engine.setPhysicsEngineParameter(
             numSolverIterations=SOLVER_ITERATIONS, deterministicOverlappingPairs=1
@@ -204,7 +206,7 @@ class Client:
             self._told = {what: v for what, v in self._told.items() if gone.isdisjoint(what[1][:1])}
             self._connect()
             self._parts = parts(self.engine, mj, self._built.joints, range(mj.ntree))
-            self._trees, self._driven = set[int](), list[Part]()
+            self._trees, self._driven = set[int](), list[JointSet]()
             self._inside, self._changed = parameters, True
         self._tell_all()
 
@@ -410,15 +412,15 @@ class Client:
 
     # --- saved states ----------------------------------------------------------------------------
 
-    def save(self) -> Saved:
+    def save(self) -> SavedState:
         """Keep the engine's own state in this process as long as what is returned is held."""
         self._forget()
-        saved = Saved()
+        saved = SavedState()
         number, activations = self.engine.saveState(), self._twin.data.act.copy()
         self._saved.append((weakref.ref(saved), number, activations))
         return saved
 
-    def load(self, saved: Saved) -> bool:
+    def load(self, saved: SavedState) -> bool:
         """Go back to a state if it is kept here. Parameters are not part of it."""
         for reference, number, activations in self._saved:
             if reference() is saved:

@@ -153,14 +153,14 @@ class Free(_Joints):
             engine.applyExternalTorque(multibody, -1, torque, world)
 
 
-Part = Scalars | Ball | Free
+JointSet = Scalars | Ball | Free
 
 
 def parts(
     engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle], trees: Collection[int]
-) -> list[Part]:
+) -> list[JointSet]:
     """List what can move in some kinematic trees, as few parts as there can be."""
-    tree_of, found = mj.body_treeid[mj.jnt_bodyid].tolist(), list[Part]()
+    tree_of, found = mj.body_treeid[mj.jnt_bodyid].tolist(), list[JointSet]()
     together: dict[type[Scalars | Free], dict[int, Handle]] = {}
     for joint, place in sorted(places.items()):
         kind = int(mj.jnt_type[joint])

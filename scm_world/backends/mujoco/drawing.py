@@ -31,7 +31,7 @@ from scm_world.models.shapes import (
     Mesh,
     Shape,
     Shapes,
-    Table,
+    ShapeTable,
     Tiles,
     mesh_of,
 )
@@ -121,7 +121,7 @@ class VisibleModel:
             elif texture is not None:
                 colors[row, :3] *= texture.mean(axis=0)
         places = data.geom_xpos[rows], data.geom_xmat[rows].reshape(-1, 3, 3)
-        table = Table(kinds, halves, *places, colors, self._bodies)
+        table = ShapeTable(kinds, halves, *places, colors, self._bodies)
         found = Shapes(table, self._moves[self._bodies], self._meshes, tiles)
         return found.joined(Shapes.of(list(self._others()))) if self._more else found
 

@@ -211,7 +211,7 @@ def control_unit(mj: mujoco.MjModel, actuator: int) -> str:
 
 @final
 @dataclass(frozen=True)
-class Row:
+class Field:
     """A parameter that every element of a kind has. What depends on the element is a function.
 
     Attributes:
@@ -254,7 +254,7 @@ class Row:
     effect: Callable[[Element], Effect] | None = None
 
 
-def _parameter(row: Row, e: Element, data: mujoco.MjData) -> Parameter:
+def _parameter(row: Field, e: Element, data: mujoco.MjData) -> Parameter:
     """Return the parameter of an element with its value in the model, and in the data."""
 
     def of(value: Any, *arguments: Any) -> Any:
@@ -335,16 +335,16 @@ def _gains(*places: tuple[str, int, int]) -> Callable[[Element], Finder]:
     return lambda e: partial(gain, e.i, places)
 
 
-def _pose(kind: str, what: str) -> tuple[Row, Row]:
+def _pose(kind: str, what: str) -> tuple[Field, Field]:
     """List where a shape or a site is."""
     where = f"of the {what} in the frame of its body."
     return (
-        Row("position", "m", f"Place {where}", f"{kind}_pos", constant=True, usual=False),
-        Row("orientation", "1", f"Orientation {where}", f"{kind}_quat", usual=False, **_TURN),
+        Field("position", "m", f"Place {where}", f"{kind}_pos", constant=True, usual=False),
+        Field("orientation", "1", f"Orientation {where}", f"{kind}_quat", usual=False, **_TURN),
     )  # fmt: skip
 
 
-def _solver(prefix: str, suffix: str = "", **rest: Any) -> tuple[Row, Row]:
+def _solver(prefix: str, suffix: str = "", **rest: Any) -> tuple[Field, Field]:
     """List how stiff and how hard a constraint is."""
     rest["usual"] = False
 
@@ -357,9 +357,9 @@ def _solver(prefix: str, suffix: str = "", **rest: Any) -> tuple[Row, Row]:
         return -math.inf if (v < 0.0).any() else (_positive(v[0]), _positive(v[1]))
 
     return (
-        Row(f"solref{suffix}", "1", doc, f"{prefix}_solref", low=low,
+        Field(f"solref{suffix}", "1", doc, f"{prefix}_solref", low=low,
             high=lambda v: 0.0 if (v < 0.0).any() else math.inf, **rest),
-        Row(f"solimp{suffix}", "1",
+        Field(f"solimp{suffix}", "1",
             "Smallest and largest impedance, width of the transition, its midpoint and power.",
             f"{prefix}_solimp", low=(0.0, 0.0, 0.0, 0.0, 1.0),
             high=(1.0, 1.0, math.inf, 1.0, math.inf), **rest),
@@ -406,30 +406,30 @@ def _columns(count: int) -> Any:
 
 
 _BODY = (
-    Row("mass", "kg", "Mass of the body; its inertia stays as it is.", "body_mass", constant=True,
+    Field("mass", "kg", "Mass of the body; its inertia stays as it is.", "body_mass", constant=True,
         low=_positive, usual=lambda e, v: e.moves, acts=lambda e: e.heavy, reason=_WEIGHTLESS),
-    Row("inertia", "kg m^2", "Principal moments of inertia of the body.", "body_inertia",
+    Field("inertia", "kg m^2", "Principal moments of inertia of the body.", "body_inertia",
         constant=True, low=_positive, nature="inertia", usual=lambda e, v: e.moves,
         acts=lambda e: e.heavy and e["inertia"].all() and e.turns,
         reason="acts on nothing: the body never turns, or has no inertia"),
-    Row("center_of_mass", "m", "Center of mass in the frame of the body.", "body_ipos",
+    Field("center_of_mass", "m", "Center of mass in the frame of the body.", "body_ipos",
         constant=True, usual=False, acts=lambda e: e.heavy and not e.is_simple,
         reason=f"{_SIMPLE}, unless it has no mass"),
-    Row("gravcomp", "1", "Share of the weight of the body that is held up.", "body_gravcomp",
+    Field("gravcomp", "1", "Share of the weight of the body that is held up.", "body_gravcomp",
         constant=True, usual=lambda e, v: e.moves and v != 0.0, acts=lambda e: e.heavy,
         flags=_GRAVITY, reason=_WEIGHTLESS),
-    Row("position", "m", "Place of a body that is moved from outside.",
+    Field("position", "m", "Place of a body that is moved from outside.",
         "data.mocap_pos", lambda e: e["mocapid"],
         exists=lambda e: e["mocapid"] >= 0, effect=lambda e: e.trees.frame(e.i)),
-    Row("orientation", "1", "Orientation of a body that is moved from outside.",
+    Field("orientation", "1", "Orientation of a body that is moved from outside.",
         "data.mocap_quat", lambda e: e["mocapid"], exists=lambda e: e["mocapid"] >= 0,
         effect=lambda e: e.trees.frame(e.i), **{**_TURN, "constant": False}),
-    Row("position", "m", "", exists=lambda e: e["mocapid"] < 0 and e.is_free, usual=False,
+    Field("position", "m", "", exists=lambda e: e["mocapid"] < 0 and e.is_free, usual=False,
         reason="is a state: set {}.cartesian_position"),
-    Row("position", "m", "Place of the frame of the body in its parent.", "body_pos",
+    Field("position", "m", "Place of the frame of the body in its parent.", "body_pos",
         constant=True, usual=False, exists=lambda e: e["mocapid"] < 0 and not e.is_free,
         effect=lambda e: e.trees.frame(e.i)),
-    Row("orientation", "1", "Orientation of the body in its parent.", "body_quat",
+    Field("orientation", "1", "Orientation of the body in its parent.", "body_quat",
         usual=False, exists=lambda e: e["mocapid"] < 0 and not e.is_free,
         effect=lambda e: e.trees.frame(e.i), **_TURN),
 )  # fmt: skip
@@ -460,33 +460,33 @@ _LIMITED: dict[str, Any] = {
     "reason": _UNLIMITED,
 }
 _JOINT = (
-    Row("damping", "{F} s/{L}", "Force against the motion, for each unit of velocity.",
+    Field("damping", "{F} s/{L}", "Force against the motion, for each unit of velocity.",
         "dof_damping", lambda e: e.dofs, low=0.0, usual=_resisted, flags=_DAMPER,
         acts=_alike("dof_damping"), reason=_UNEVEN),
-    Row("armature", "{I}", "Inertia that the joint itself adds.", "dof_armature",
+    Field("armature", "{I}", "Inertia that the joint itself adds.", "dof_armature",
         lambda e: e.dofs, constant=True, low=0.0, usual=_resisted, acts=_alike("dof_armature"),
         reason=_UNEVEN),
-    Row("frictionloss", "{F}", "Dry friction: the force that motion has to overcome.",
+    Field("frictionloss", "{F}", "Dry friction: the force that motion has to overcome.",
         "dof_frictionloss", lambda e: e.dofs, low=0.0, usual=_resisted,
         flags=_FRICTION + _CONSTRAINT, acts=_alike("dof_frictionloss"), reason=_UNEVEN),
-    Row("stiffness", "{F}/{L}", "Stiffness of a spring that pulls to springref.",
+    Field("stiffness", "{F}/{L}", "Stiffness of a spring that pulls to springref.",
         "jnt_stiffness", low=0.0, usual=_resisted, flags=_SPRING),
-    Row("springref", "{L}", "Position in which the spring is at rest.",
+    Field("springref", "{L}", "Position in which the spring is at rest.",
         "qpos_spring", lambda e: int(e["qposadr"]), constant=True, exists=_scalar, flags=_SPRING,
         usual=lambda e, v: bool(e["stiffness"])),
-    Row("ref", "{L}", "Position of the joint in the pose of the file.", "qpos0",
+    Field("ref", "{L}", "Position of the joint in the pose of the file.", "qpos0",
         lambda e: int(e["qposadr"]), constant=True, exists=_scalar, usual=False),
-    Row("range", "{L}", "Lower and upper limit of the joint.", "jnt_range", **_LIMITED),
-    Row("margin", "{L}", "Distance from the limits at which they begin to act.", "jnt_margin",
+    Field("range", "{L}", "Lower and upper limit of the joint.", "jnt_range", **_LIMITED),
+    Field("margin", "{L}", "Distance from the limits at which they begin to act.", "jnt_margin",
         low=0.0, **_LIMITED),
     *_solver("jnt", "limit", **_LIMITED),
-    Row("actuatorfrcrange", "{F}", "Range of the force of all its actuators.",
+    Field("actuatorfrcrange", "{F}", "Range of the force of all its actuators.",
         "jnt_actfrcrange", exists=_scalar, usual=False, acts=lambda e: e["actfrclimited"],
         reason=_UNLIMITED),
-    Row("axis", "1", "Unit vector of the axis in the frame of the body.",
+    Field("axis", "1", "Unit vector of the axis in the frame of the body.",
         "jnt_axis", form=direction, low=-1.0, high=1.0, exists=_scalar,
         usual=False, acts=lambda e: not e.is_simple, reason=_SIMPLE),
-    Row("anchor", "m", "Point of the body through which the axis goes.", "jnt_pos",
+    Field("anchor", "m", "Point of the body through which the axis goes.", "jnt_pos",
         constant=True, exists=_scalar, usual=False,
         acts=lambda e: e["type"] != SLIDE and not e.is_simple,
         reason=f"acts on nothing if the joint slides; otherwise it {_SIMPLE}"),
@@ -509,43 +509,43 @@ _TOUCHES: dict[str, Any] = {
     "effect": lambda e: e.trees.contact_of(e.i),
 }
 _SHAPE = (
-    Row("friction", "1", "Coefficient of sliding friction; a contact has the larger of two.",
+    Field("friction", "1", "Coefficient of sliding friction; a contact has the larger of two.",
         "geom_friction", lambda e: (e.i, 0), **_rubs(3)),
-    Row("torsional_friction", "m", "Coefficient of friction against turning on a spot.",
+    Field("torsional_friction", "m", "Coefficient of friction against turning on a spot.",
         "geom_friction", lambda e: (e.i, 1), **_rubs(4)),
-    Row("rolling_friction", "m", "Coefficient of friction against rolling.",
+    Field("rolling_friction", "m", "Coefficient of friction against rolling.",
         "geom_friction", lambda e: (e.i, 2), **_rubs(6)),
-    Row("margin", "m", "How far around it contacts act.", "geom_margin", constant=True,
+    Field("margin", "m", "How far around it contacts act.", "geom_margin", constant=True,
         low=_not_negative, usual=_nonzero, **_TOUCHES),
-    Row("gap", "m", "How much further contacts are found without acting.", "geom_gap",
+    Field("gap", "m", "How much further contacts are found without acting.", "geom_gap",
         constant=True, low=0.0, usual=False, **_TOUCHES),
-    Row("adhesion", "N", "Force with which its contacts hold on.", "geom_adhesion",
+    Field("adhesion", "N", "Force with which its contacts hold on.", "geom_adhesion",
         constant=True, low=0.0, usual=_nonzero, **_TOUCHES),
-    Row("surfacevel", "1", "Velocity of its surface in its frame: linear [m/s], angular [rad/s].",
+    Field("surfacevel", "1", "Velocity of its surface in its frame: linear [m/s], angular [rad/s].",
         "geom_surfacevel", constant=True, usual=_nonzero, **_TOUCHES),
-    Row("solmix", "1", "Weight of this shape when the solref of a contact is mixed.",
+    Field("solmix", "1", "Weight of this shape when the solref of a contact is mixed.",
         "geom_solmix", low=0.0, usual=False, **_TOUCHES),
     *_solver("geom", **_TOUCHES),
-    Row("size", "m", lambda e: f"{_SIZES[int(e['type'])][1]} of the {_word(e)}; "
+    Field("size", "m", lambda e: f"{_SIZES[int(e['type'])][1]} of the {_word(e)}; "
         "mass and inertia stay as they are.", "geom_size",
         lambda e: (e.i, _columns(_SIZES[int(e["type"])][0])), constant=True, low=_positive,
         exists=_sized, usual=lambda e, v: any(e.trees.geom(e.i)),
         visual=lambda e: not any(e.trees.geom(e.i))),
-    Row("size", "m", "", exists=lambda e: not _sized(e),
+    Field("size", "m", "", exists=lambda e: not _sized(e),
         reason="belongs to a shape that only another file can change"),
-    Row("color", "1", "Red, green, blue and opacity of the shape.",
+    Field("color", "1", "Red, green, blue and opacity of the shape.",
         lambda e: partial(color, e.i, int(e["matid"])),
         low=0.0, high=1.0, usual=lambda e, v: e["group"] < _SHOWN, visual=True,
         effect=lambda e: NOTHING),
     *_pose("geom", "shape"),
-    *(Row(name, "1", "", reason=_WHOLE) for name in ("contype", "conaffinity", "condim", "type")),
+    *(Field(name, "1", "", reason=_WHOLE) for name in ("contype", "conaffinity", "condim", "type")),
 )  # fmt: skip
 _PAIR = (
-    Row("friction", "1", "Friction of the pair: sliding (2), torsional [m] and rolling [m] (2).",
+    Field("friction", "1", "Friction of the pair: sliding (2), torsional [m] and rolling [m] (2).",
         "pair_friction", low=0.0, flags=_CONTACT),
-    Row("margin", "m", "The margin of contacts of the pair.", "pair_margin", constant=True,
+    Field("margin", "m", "The margin of contacts of the pair.", "pair_margin", constant=True,
         low=_not_negative, usual=False, flags=_CONTACT),
-    Row("gap", "m", "The gap of contacts of the pair.", "pair_gap", constant=True,
+    Field("gap", "m", "The gap of contacts of the pair.", "pair_gap", constant=True,
         low=_not_negative, usual=False, flags=_CONTACT),
     *_solver("pair", flags=_CONTACT),
 )  # fmt: skip
@@ -556,28 +556,28 @@ def _stretched(e: Element, _: Floats) -> bool:
 
 
 _TENDON = (
-    Row("stiffness", "{F}/{L}", "Stiffness of the tendon as a spring.",
+    Field("stiffness", "{F}/{L}", "Stiffness of the tendon as a spring.",
         "tendon_stiffness", constant=True, low=0.0, usual=_stretched, flags=_SPRING),
-    Row("damping", "{F} s/{L}", "Force against changes of length, for each unit of speed.",
+    Field("damping", "{F} s/{L}", "Force against changes of length, for each unit of speed.",
         "tendon_damping", constant=True, low=0.0, usual=_stretched, flags=_DAMPER),
-    Row("frictionloss", "{F}", "Dry friction along the tendon.",
+    Field("frictionloss", "{F}", "Dry friction along the tendon.",
         "tendon_frictionloss", constant=True, low=0.0, usual=_stretched, flags=_FRICTION),
-    Row("armature", "{I}", "Inertia that the tendon adds.", "tendon_armature",
+    Field("armature", "{I}", "Inertia that the tendon adds.", "tendon_armature",
         constant=True, low=0.0, usual=_nonzero,
         acts=lambda e: not e.trees.links["tendon"][e.i].geoms,
         reason="is not possible: the tendon runs around shapes"),
-    Row("springlength", "{L}", "Lengths between which the spring is at rest.",
+    Field("springlength", "{L}", "Lengths between which the spring is at rest.",
         "tendon_lengthspring", constant=True, usual=lambda e, v: bool(e["stiffness"]),
         flags=_SPRING),
-    Row("range", "{L}", "Shortest and longest length of the tendon.",
+    Field("range", "{L}", "Shortest and longest length of the tendon.",
         "tendon_range", usual=False, acts=lambda e: e["limited"], reason=_UNLIMITED),
 )  # fmt: skip
 _CONSTRAINED = (
-    Row("active", "1", "Whether the constraint is in force: 1, or 0.",
+    Field("active", "1", "Whether the constraint is in force: 1, or 0.",
         "eq_active0 data.eq_active",
         low=0.0, high=1.0, nature="switch", flags=_EQUALITY + _CONSTRAINT),
     *_solver("eq"),
-    Row("polycoef", "1", "Coefficients of the polynomial that gives one from the other.",
+    Field("polycoef", "1", "Coefficients of the polynomial that gives one from the other.",
         "eq_data", lambda e: (e.i, slice(5)), constant=True, usual=False,
         exists=lambda e: e.is_("type", mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtEq.mjEQ_TENDON)),
 )  # fmt: skip
@@ -589,44 +589,44 @@ _SERVO: dict[str, Any] = {"low": 0.0, **_DRIVES}
 _AFFINE, _FIXED, _UNBIASED = _BIAS.mjBIAS_AFFINE, _GAIN.mjGAIN_FIXED, _BIAS.mjBIAS_NONE
 _ABOUT = "Force of the servo for each unit of"
 _ACTUATOR = (
-    Row("gear", "1", "Factor from the force of the actuator to that on what it moves.",
+    Field("gear", "1", "Factor from the force of the actuator to that on what it moves.",
         "actuator_gear", lambda e: (int(e["outadr"]), _columns(e.gears)), constant=True,
         exists=lambda e: e.gears > 0, **_DRIVES),
-    Row("kp", "{F}/{L}", f"{_ABOUT} distance.",
+    Field("kp", "{F}/{L}", f"{_ABOUT} distance.",
         _gains(("gainprm", 0, 1), ("biasprm", 1, -1)),
         exists=lambda e: e.servo == "position", **_SERVO),
-    Row("kv", "{F} s/{L}", f"{_ABOUT} velocity.", _gains(("biasprm", 2, -1)),
+    Field("kv", "{F} s/{L}", f"{_ABOUT} velocity.", _gains(("biasprm", 2, -1)),
         exists=lambda e: e.servo == "position", **_SERVO),
-    Row("kv", "{F} s/{L}", f"{_ABOUT} velocity.",
+    Field("kv", "{F} s/{L}", f"{_ABOUT} velocity.",
         _gains(("gainprm", 0, 1), ("biasprm", 2, -1)),
         exists=lambda e: e.servo == "velocity", **_SERVO),
-    Row("kv", "1", f"{_ABOUT} velocity and control.", _gains(("gainprm", 2, -1)),
+    Field("kv", "1", f"{_ABOUT} velocity and control.", _gains(("gainprm", 2, -1)),
         exists=lambda e: e.servo == "damper", **_SERVO),
-    Row("gain", "1", "Force for each unit of control.", "actuator_gainprm", lambda e: (e.i, 0),
+    Field("gain", "1", "Force for each unit of control.", "actuator_gainprm", lambda e: (e.i, 0),
         usual=False, exists=lambda e: not e.servo and e.is_("gaintype", _FIXED), **_DRIVES),
-    Row("gainprm", "1", "Parameters of its gain, as MuJoCo numbers them.", "actuator_gainprm",
+    Field("gainprm", "1", "Parameters of its gain, as MuJoCo numbers them.", "actuator_gainprm",
         usual=False, exists=lambda e: not e.servo and not e.is_("gaintype", _FIXED), **_DRIVES),
-    Row("bias", "1", "Force without control: constant, for each unit of length, of velocity.",
+    Field("bias", "1", "Force without control: constant, for each unit of length, of velocity.",
         "actuator_biasprm", lambda e: (e.i, slice(3)), usual=_nonzero,
         exists=lambda e: not e.servo and e.is_("biastype", _AFFINE), **_DRIVES),
-    Row("biasprm", "1", "Parameters of its bias, as MuJoCo numbers them.", "actuator_biasprm",
+    Field("biasprm", "1", "Parameters of its bias, as MuJoCo numbers them.", "actuator_biasprm",
         usual=False, exists=lambda e: not e.servo and not e.is_("biastype", _AFFINE, _UNBIASED),
         **_DRIVES),
-    Row("timeconst", "s", "Time that the activation takes to follow the control.",
+    Field("timeconst", "s", "Time that the activation takes to follow the control.",
         "actuator_dynprm", lambda e: (e.i, _columns(e.times)), low=_positive,
         exists=lambda e: e.times > 0, **_DRIVES),
-    Row("ctrlrange", lambda e: control_unit(e.mj, e.i), "Range to which its control is clipped.",
+    Field("ctrlrange", lambda e: control_unit(e.mj, e.i), "Range to which its control is clipped.",
         "actuator_ctrlrange", lambda e: int(e["ctrladr"]), usual=False,
         exists=lambda e: e["ctrlnum"] == 1, acts=lambda e: (
             any(e.trees.actuator(e.i)) and e.mj.actuator_ctrllimited[e["ctrladr"]]),
         reason="is not in force: it is not limited, or the actuator is off"),
-    Row("forcerange", "{F}", "Range to which its force is clipped.",
+    Field("forcerange", "{F}", "Range to which its force is clipped.",
         "actuator_forcerange", usual=False,
         acts=lambda e: any(e.trees.actuator(e.i)) and e["forcelimited"],
         reason="is not in force: it is not limited, or the actuator is off"),
-    Row("damping", "1", "The damping that the actuator adds to what it moves.",
+    Field("damping", "1", "The damping that the actuator adds to what it moves.",
         "actuator_damping", constant=True, usual=_nonzero, **_SERVO),
-    Row("armature", "1", "The armature that the actuator adds to what it moves.",
+    Field("armature", "1", "The armature that the actuator adds to what it moves.",
         "actuator_armature", constant=True, usual=_nonzero, **_SERVO),
 )  # fmt: skip
 
@@ -636,23 +636,23 @@ def _number(name: str) -> Callable[[Element], Finder]:
 
 
 _OPTION = (
-    Row("gravity", "m/s^2", "Acceleration that acts on every mass.",
+    Field("gravity", "m/s^2", "Acceleration that acts on every mass.",
         "opt.gravity", lambda e: (), flags=_GRAVITY),
-    Row("timestep", "s", "Physics step; a control step has a fixed number of them.",
+    Field("timestep", "s", "Physics step; a control step has a fixed number of them.",
         _number("timestep"), low=SMALLEST),
-    Row("wind", "m/s", "Velocity of the medium.", "opt.wind", lambda e: (),
+    Field("wind", "m/s", "Velocity of the medium.", "opt.wind", lambda e: (),
         acts=lambda e: e.trees.fluid, reason="acts on nothing: density and viscosity are zero"),
-    Row("density", "kg/m^3", "The density of the medium.", _number("density"), low=0.0,
+    Field("density", "kg/m^3", "The density of the medium.", _number("density"), low=0.0,
         usual=lambda e, v: e.trees.fluid),
-    Row("viscosity", "Pa s", "The viscosity of the medium.", _number("viscosity"), low=0.0,
+    Field("viscosity", "Pa s", "The viscosity of the medium.", _number("viscosity"), low=0.0,
         usual=lambda e, v: e.trees.fluid),
-    Row("impratio", "1", "Stiffness of friction in relation to that of contact.",
+    Field("impratio", "1", "Stiffness of friction in relation to that of contact.",
         _number("impratio"), low=SMALLEST, usual=False,
         effect=lambda e: e.trees.touching(e.trees.every)),
 )  # fmt: skip
 
 
-ROWS: dict[str, tuple[Row, ...]] = {
+ROWS: dict[str, tuple[Field, ...]] = {
     "body": _BODY, "joint": _JOINT, "geom": _SHAPE, "pair": _PAIR, "site": _pose("site", "site"),
     "tendon": _TENDON, "equality": _CONSTRAINED, "actuator": _ACTUATOR, "option": _OPTION,
 }  # fmt: skip

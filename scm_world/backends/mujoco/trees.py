@@ -49,7 +49,7 @@ def works(mj: mujoco.MjModel, actuator: int) -> bool:
     return not (off or disabled(mj, _OFF.mjDSBL_ACTUATION))
 
 
-class Link(NamedTuple):
+class TreeLink(NamedTuple):
     """Something that joins trees for good: a tendon, a constraint, an actuator or a flex.
 
     Attributes:
@@ -88,7 +88,7 @@ class Couplings:
         self.roots = sorted({int(root) for root in mj.body_rootid[self._moves]})
         number = {root: i for i, root in enumerate(self.roots)}
         self._tree = np.array([number.get(int(root), -1) for root in mj.body_rootid])
-        self.links: dict[str, list[Link]] = {}
+        self.links: dict[str, list[TreeLink]] = {}
         for kind, count in (
             ("tendon", mj.ntendon), ("flex", mj.nflex), ("equality", mj.neq),
             ("actuator", mj.nactuator),
@@ -287,7 +287,7 @@ class Couplings:
 
     # --- couplings -----------------------------------------------------------------------------
 
-    def _all_links(self) -> Iterator[Link]:
+    def _all_links(self) -> Iterator[TreeLink]:
         return (link for links in self.links.values() for link in links)
 
     def _moving(self, bodies: Iterable[int]) -> Trees:
@@ -302,16 +302,16 @@ class Couplings:
         geoms: Iterable[int] = (),
         bodies: Iterable[int] = (),
         beside: Iterable[int] = (),
-    ) -> Link:
+    ) -> TreeLink:
         """Return what joins some elements; the places of sites beside it count, too."""
         mj, places = self._mj, {*sites, *beside}
         geoms, bodies = frozenset(geoms), {*bodies, *(int(mj.site_bodyid[s]) for s in sites)}
         bodies |= {int(mj.geom_bodyid[geom]) for geom in geoms}
         trees = self._moving({*bodies, *(int(mj.jnt_bodyid[joint]) for joint in joints)})
         bodies |= {int(mj.site_bodyid[site]) for site in beside}
-        return Link(trees, frozenset(places), geoms, frozenset(bodies))
+        return TreeLink(trees, frozenset(places), geoms, frozenset(bodies))
 
-    def _tendon(self, tendon: int) -> Link:
+    def _tendon(self, tendon: int) -> TreeLink:
         mj, first = self._mj, int(self._mj.tendon_adr[tendon])
         way = range(first, first + int(mj.tendon_num[tendon]))
         of = {kind: [i for i in way if mj.wrap_type[i] in kinds] for kind, kinds in _WAYS.items()}
@@ -319,7 +319,7 @@ class Couplings:
         sides = (int(mj.wrap_prm[i]) for i in of["geoms"])
         return self._link(**found, beside=[side for side in sides if side >= 0])
 
-    def _equality(self, equality: int) -> Link:
+    def _equality(self, equality: int) -> TreeLink:
         mj = self._mj
         ends = [int(e) for e in (mj.eq_obj1id[equality], mj.eq_obj2id[equality]) if e >= 0]
         match mujoco.mjtEq(int(mj.eq_type[equality])):
@@ -330,11 +330,11 @@ class Couplings:
             case _EQ.mjEQ_JOINT:
                 return self._link(joints=ends)
             case _EQ.mjEQ_TENDON:
-                return Link(NONE.union(*(self.links["tendon"][end].trees for end in ends)))
+                return TreeLink(NONE.union(*(self.links["tendon"][end].trees for end in ends)))
             case _:
                 return self.links["flex"][ends[0]]
 
-    def _actuator(self, actuator: int) -> Link:
+    def _actuator(self, actuator: int) -> TreeLink:
         ends = [int(end) for end in self._mj.actuator_trnid[actuator] if end >= 0]
         match mujoco.mjtTrn(int(self._mj.actuator_trntype[actuator])):
             case _TRN.mjTRN_JOINT | _TRN.mjTRN_JOINTINPARENT:
@@ -342,18 +342,18 @@ class Couplings:
             case _TRN.mjTRN_SO3 if len(ends) == 1:
                 return self._link(joints=ends)
             case _TRN.mjTRN_TENDON:
-                return Link(self.links["tendon"][ends[0]].trees)
+                return TreeLink(self.links["tendon"][ends[0]].trees)
             case _TRN.mjTRN_SITE | _TRN.mjTRN_SLIDERCRANK | _TRN.mjTRN_SO3:
                 return self._link(sites=ends)
             case _:
-                return Link()  # adhesion acts by contact
+                return TreeLink()  # adhesion acts by contact
 
-    def _flex(self, flex: int) -> Link:
+    def _flex(self, flex: int) -> TreeLink:
         mj = self._mj
         vertex, node = int(mj.flex_vertadr[flex]), int(mj.flex_nodeadr[flex])
         vertices = mj.flex_vertbodyid[vertex : vertex + int(mj.flex_vertnum[flex])]
         nodes = mj.flex_nodebodyid[node : node + int(mj.flex_nodenum[flex])]
-        return Link(self._moving(int(b) for b in (*vertices, *nodes) if b >= 0))
+        return TreeLink(self._moving(int(b) for b in (*vertices, *nodes) if b >= 0))
 
 
 def _groups(n: int, links: Iterable[Iterable[int]]) -> list[Trees]:

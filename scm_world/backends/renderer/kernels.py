@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.models.camera import Camera
-from scm_world.models.shapes import BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, Table
+from scm_world.models.shapes import BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, ShapeTable
 
 Depths = NDArray[np.float32]
 Owners = NDArray[np.int32]
@@ -132,7 +132,7 @@ def bounds(corners: Floats, near: float, shape: tuple[int, int]) -> tuple[int, i
 
 @njit(cache=True, error_model="numpy")
 def _rectangle(
-    shapes: Table, n: int, view: View, shape: tuple[int, int]
+    shapes: ShapeTable, n: int, view: View, shape: tuple[int, int]
 ) -> tuple[int, int, int, int]:
     """Bound the pixels a shape can cover by the box around it; see ``bounds``."""
     halves = shapes.halves[n]
@@ -262,7 +262,7 @@ def _opacity(kind: int, point: Triple) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _scale(shapes: Table, n: int) -> tuple[Floats, float]:
+def _scale(shapes: ShapeTable, n: int) -> tuple[Floats, float]:
     """Compute the unit of length in the frame of a shape, and half the length of what is round."""
     if shapes.kinds[n] == PLANE:
         return np.ones(3), 0.0
@@ -388,7 +388,7 @@ def _hit_plane(o: Triple, d: Triple, halves: Floats, near: float) -> Hit:
 
 @njit(cache=True, error_model="numpy")
 def _meet_row(
-    shapes: Table, n: int, measures: tuple[float, float], rays: Floats, v: int,
+    shapes: ShapeTable, n: int, measures: tuple[float, float], rays: Floats, v: int,
     span: tuple[int, int], hits: Floats,
 ) -> None:  # fmt: skip
     """Write where the rays of a row meet a shape, shape (w, 4); one loop per kind is faster."""
@@ -448,7 +448,13 @@ def blend(rgb: Colors, v: int, u: int, color: Triple, light: float, paint: float
 
 @njit(cache=True, error_model="numpy")
 def _draw_one(
-    shapes: Table, n: int, ground: Ground, view: View, light: Floats, alpha: float, canvas: Canvas
+    shapes: ShapeTable,
+    n: int,
+    ground: Ground,
+    view: View,
+    light: Floats,
+    alpha: float,
+    canvas: Canvas,
 ) -> None:
     """Draw one shape where it is nearer than what is there; see ``draw``."""
     depth, owners, rgb = canvas
@@ -492,7 +498,7 @@ def _draw_one(
 
 @njit(cache=True, error_model="numpy")
 def draw(
-    shapes: Table,
+    shapes: ShapeTable,
     which: Integers,
     ground: Ground,
     view: View,

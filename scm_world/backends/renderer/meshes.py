@@ -19,7 +19,7 @@ from scm_world.backends.renderer.kernels import (
     projected,
     turned,
 )
-from scm_world.models.shapes import Mesh, Table
+from scm_world.models.shapes import Mesh, ShapeTable
 
 
 @njit(cache=True, error_model="numpy")
@@ -52,7 +52,7 @@ def _edges(corners: Floats, edges: Floats) -> float:
 
 @njit(cache=True, error_model="numpy")
 def draw_mesh(
-    mesh: Mesh, shapes: Table, n: int, view: View, light: Floats, alpha: float, canvas: Canvas
+    mesh: Mesh, shapes: ShapeTable, n: int, view: View, light: Floats, alpha: float, canvas: Canvas
 ) -> None:
     """Draw triangles over what is there, where they are nearer. Both of their sides are seen.
 

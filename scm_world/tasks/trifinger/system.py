@@ -90,7 +90,7 @@ _ROLLING_FRICTION = 1e-4  # not in force: contacts have four dimensions
 
 
 @dataclass(frozen=True, kw_only=True)
-class Parts:
+class Assembly:
     """What there is, and how it is commanded.
 
     Attributes:
@@ -115,7 +115,7 @@ class Parts:
 
 @final
 @dataclass(frozen=True, eq=False)
-class TriFinger(Model, Parts):
+class TriFinger(Model, Assembly):
     """The robot with blocks and obstacles."""
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -132,7 +132,7 @@ class TriFinger(Model, Parts):
         return PhysicalState(self.layout)
 
 
-_PARTS = tuple(Parts.__dataclass_fields__)
+_PARTS = tuple(Assembly.__dataclass_fields__)
 START = "start"
 """The keyframe in which fingers and blocks are clear of one another."""
 COLUMNS, ROWS = 3, 2
@@ -153,7 +153,7 @@ def trifinger(
 ) -> TriFinger:
     """Return the model of the robot with some blocks and obstacles; it is made once in a process.
 
-    The arguments are those of ``Parts``. The parameters of the model are, with the friction of a
+    The arguments are those of ``Assembly``. The parameters of the model are, with the friction of a
     contact as the product of those of its two bodies:
 
     ======================  ==========================================
@@ -172,7 +172,7 @@ def trifinger(
                             [m], ``orientation`` (4,)
     ======================  ==========================================
     """
-    parts = Parts(
+    parts = Assembly(
         blocks=blocks,
         preset=preset,
         obstacles=obstacles,
@@ -190,7 +190,7 @@ def trifinger(
 
 
 @lru_cache(maxsize=64)
-def _read(parts: Parts) -> Model:
+def _read(parts: Assembly) -> Model:
     """Compile what there is, and describe it; ``published`` is the variant of the predecessor."""
     states: dict[str, list[str]] = {}
     for index, what in enumerate(("position", "velocity", "actuator_torque")):
@@ -217,7 +217,7 @@ MOTION = ("cartesian_position", "orientation", "linear_velocity", "angular_veloc
 _JOINT_NAMES = tuple(link_name(finger, index) for finger in FINGERS for index in (1, 2, 3))
 
 
-def _compiled(parts: Parts) -> mujoco.MjModel:
+def _compiled(parts: Assembly) -> mujoco.MjModel:
     """Compile what there is, with the default of every parameter, and with the start."""
     hulls = dict(parts.hulls)
     spec = mujoco.MjSpec()
@@ -281,7 +281,7 @@ def tip_name(finger: str) -> str:
     return f"robot_finger_{finger}_tip"
 
 
-def contact_pairs(parts: Parts) -> Iterator[tuple[str, str, bool]]:
+def contact_pairs(parts: Assembly) -> Iterator[tuple[str, str, bool]]:
     """List which shapes can touch, and whether they slide (True) or grip (False).
 
     Yields:
@@ -307,7 +307,7 @@ def contact_pairs(parts: Parts) -> Iterator[tuple[str, str, bool]]:
             yield f"{finger}/{mine}", f"{other}/{its}", False
 
 
-def _write_options(spec: mujoco.MjSpec, parts: Parts) -> None:
+def _write_options(spec: mujoco.MjSpec, parts: Assembly) -> None:
     """Write everything that concerns the whole simulation."""
     option = spec.option
     option.timestep = parts.preset.timestep
@@ -358,7 +358,7 @@ def _add_wall(world: mujoco.MjsBody) -> None:
         )
 
 
-def _add_robot(spec: mujoco.MjSpec, parts: Parts) -> None:
+def _add_robot(spec: mujoco.MjSpec, parts: Assembly) -> None:
     """Hang each finger from the world; then add nine servos or motors, and nine dampers.
 
     MuJoCo works in the frame of the center of mass of a kinematic tree. With a tree per finger,
@@ -452,7 +452,9 @@ Row = tuple[Parameter, object]
 """A parameter, and its default."""
 
 
-def _rows(mj: mujoco.MjModel, data: mujoco.MjData, trees: Couplings, parts: Parts) -> Iterator[Row]:
+def _rows(
+    mj: mujoco.MjModel, data: mujoco.MjData, trees: Couplings, parts: Assembly
+) -> Iterator[Row]:
     """List the parameters: what each is, where it is written, on which trees it acts, default."""
     fingers = [trees.tree(mj.body(link_name(finger, 1)).id) for finger in FINGERS]
     everything, touching = trees.always(trees.every), trees.touching(trees.every)
@@ -535,7 +537,7 @@ def _gravity(mj: mujoco.MjModel, _: Any) -> Slot:
     return place(mj.opt.gravity)
 
 
-def _spinning(mj: mujoco.MjModel, _: Any, *, parts: Parts) -> Slot:
+def _spinning(mj: mujoco.MjModel, _: Any, *, parts: Assembly) -> Slot:
     if parts.published:
         weights = spinning_weights(mj, parts.blocks, parts.obstacles)
     else:
