@@ -213,7 +213,9 @@ class Client:
     def _connect(self) -> None:
         """Set which shapes may touch, pair by pair."""
         geoms = self._built.geoms
-        wanted = {(*geoms[first], *geoms[second]) for first, second in self._touching}
+        # The engine has one rule for two links, in whichever order they are named.
+        pairs = (sorted((geoms[one], geoms[two])) for one, two in self._touching)
+        wanted = {(*first, *second) for first, second in pairs}
         self._ruled |= wanted  # this holds as long as the client
         for body, link, other, its in sorted(self._ruled):
             enabled = int((body, link, other, its) in wanted)
