@@ -10,7 +10,7 @@ from typing import Any
 from evaluation_policy import Mlp
 
 from scm_world.env import ScmWorldEnv
-from scm_world.evaluation.episodes import Arena, Fingerprint
+from scm_world.evaluation.episodes import EpisodeRunner, Fingerprint
 from scm_world.evaluation.players import as_player
 from scm_world.evaluation.protocols import Protocol, protocols_of
 from scm_world.world import WorldSnapshot
@@ -38,7 +38,7 @@ def shares(task: str, episodes: int) -> dict[str, float]:
         task: Name of a task.
         episodes: Of each protocol; one more is played before, which warms up.
     """
-    arena = Arena(ScmWorldEnv(task))
+    arena = EpisodeRunner(ScmWorldEnv(task))
     total: Counter[str] = Counter()
     for number in range(episodes + 1):
         for protocol in protocols_of(task):
@@ -51,7 +51,7 @@ def shares(task: str, episodes: int) -> dict[str, float]:
     return {**mean, "reset, interventions, the rest": rest}
 
 
-def split(arena: Arena, protocol: Protocol, episode: int) -> dict[str, float]:
+def split(arena: EpisodeRunner, protocol: Protocol, episode: int) -> dict[str, float]:
     """Play an episode, and then its parts alone, from the same beginning."""
     recorder, beginning = Recorder(), list[WorldSnapshot]()
 

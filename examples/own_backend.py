@@ -45,8 +45,8 @@ def main(episodes: str = "4", length: str = "250") -> None:
         from scm_world.testing.backend import BackendConformance
 
         suite = type("Suite", (BackendConformance,), {"make": lambda self: SlowMotors()})()
-        suite.test_equal_scenes_continue_alike(suite.busy())
-        print("equal scenes continue bit for bit alike")
+        suite.test_worlds_undo_exactly()
+        print("what is set and set back leaves no trace")
     how = {"backend": both, "env": {"max_episode_length": int(length)}}
     found = evaluate("feedback", "P0,P5", task="picking", n=int(episodes), **how)
     for protocol in found.protocols:

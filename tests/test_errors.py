@@ -173,9 +173,9 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
         {"path": "results", "reason": "No space left on device"},
     ),
     (
-        MissingExtra("moviepy", "video"),
-        "this needs the package 'moviepy'; install it with: pip install 'scm-world[video]'",
-        {"package": "moviepy", "extra": "video"},
+        MissingExtra("trimesh", "mesh"),
+        "this needs the package 'trimesh'; install it with: pip install 'scm-world[mesh]'",
+        {"package": "trimesh", "extra": "mesh"},
     ),
     (
         MissingEngine("bullet", "pip install pybullet", "no wheel"),

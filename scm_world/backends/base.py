@@ -235,7 +235,9 @@ class BackendWrapper(Backend, ABC):
         engine: The same.
     """
 
-    capabilities: ClassVar[Capabilities] = Capabilities()
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        remarks=lambda self, before: self.engine.capabilities.remarks(self.engine, before)
+    )
 
     def __init__(self, engine: Backend) -> None:
         self.engine = engine

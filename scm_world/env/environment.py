@@ -83,13 +83,13 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         task: Name of a registered task, or a task.
         task_options: Arguments of the constructor of a task that is given by its name.
         backend: ``"mujoco"``, ``"bullet"``, ``"step"`` or ``"fake"``; that of the task if None.
-        preset: One of the task's ``presets``; the first one if None.
+        preset: One of the task's ``choices["preset"]``; the first one if None.
         frame_skip: Length of a control step: of the robot's tasks in units of 4 ms, of a model in
             its physics steps; the task's own if None.
-        action_mode: One of the task's ``action_modes`` (of the robot's tasks
+        action_mode: One of the task's ``choices["action_mode"]`` (of the robot's tasks
             ``"joint_positions"``, ``"joint_torques"``, ``"end_effector_positions"``), or one of
             them after ``"delta_"``: they are relative, see ``delta.Delta``; the first one if None.
-        resolution: One of the task's ``resolutions``: how finely its variables are cut, see
+        resolution: One of the task's ``choices["resolution"]``: how fine its variables are, see
             ``World``; observations and actions do not depend on it. The first one if None.
         delta_scale: Share of half of the range that the largest relative action stands for.
         delta_origin: Joint positions are relative to the last ``"command"``, or ``"measured"``.

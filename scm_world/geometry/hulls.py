@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from itertools import pairwise, permutations, product
 from os import PathLike
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import ArrayLike, Floats, Integers
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.geometry.filling import remainder_kernel
 from scm_world.geometry.rotations import from_rotation_matrix, rotation_matrix
 
@@ -19,7 +19,6 @@ Vector = tuple[float, float, float]
 
 MOST_VERTICES = 256
 FORMATS = ("obj", "stl")
-LARGEST = 200_000_000  # bytes of a file
 THINNEST = 1e-6  # of the greatest extent: what is thinner has no volume
 ROUGHNESS = 3e-7  # of the greatest extent: what sticks out less is the rounding of a file
 SAME_NORMAL = 1e-5  # [rad] sides that differ by less are one side
@@ -64,6 +63,7 @@ def hull_of(points: ArrayLike) -> Hull:
 
     Raises:
         ModelError: The points are not finite, lie in one plane, or have too many corners.
+        MissingExtra: The extra ``mesh`` is not installed.
 
     Example:
         >>> from itertools import product
@@ -104,6 +104,7 @@ def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
     Raises:
         ModelError: The file has no volume, too many corners, or cannot be read.
         UnknownOption: The file has another format.
+        MissingExtra: The extra ``mesh`` is not installed.
     """
     file = Path(path)
     kind = file.suffix.lower().removeprefix(".")
@@ -112,29 +113,20 @@ def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
     if not (np.isfinite(scale) and scale > 0.0):
         raise ModelError([f"the scale of {file} must be positive and finite, got {scale}"])
     try:
+        import trimesh
+    except ImportError as error:
+        raise MissingExtra("trimesh", "mesh") from error
+    try:
         if not file.is_file():
             raise FileNotFoundError("it is no regular file, or not there")
-        if file.stat().st_size > LARGEST:
-            raise ValueError(f"it may have at most {LARGEST:,} bytes")
-        points = _corners(file.read_bytes(), kind)
-    except (OSError, ValueError) as error:
+        with file.open("rb") as stream:
+            mesh: Any = trimesh.load(stream, file_type=kind, force="mesh", process=False)
+    except (OSError, ValueError, IndexError, KeyError, MemoryError) as error:
         raise ModelError([f"{file} cannot be read as a mesh: {error}"]) from error
     try:
-        return hull_of(scale * points)
+        return hull_of(scale * np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3))
     except ModelError as error:
         raise ModelError([f"{file}: {problem}" for problem in error.problems]) from error
-
-
-def _corners(data: bytes, kind: str) -> Floats:
-    """Read the corners of a mesh, text or a binary STL, shape (n, 3)."""
-    if kind == "stl" and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
-        triangles = np.frombuffer(
-            data, [("n", "<f4", 3), ("v", "<f4", (3, 3)), ("_", "<u2")], -1, 84
-        )
-        return triangles["v"].reshape(-1, 3).astype(np.float64)
-    word, lines = (b"v" if kind == "obj" else b"vertex"), map(bytes.split, data.splitlines())
-    points = [[float(x) for x in line[1:4]] for line in lines if line[:1] == [word]]
-    return np.array(points, dtype=np.float64).reshape(-1, 3)
 
 
 def extents(hull: Hull) -> Floats:

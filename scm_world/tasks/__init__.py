@@ -69,6 +69,8 @@ def register(kind: Kind) -> Kind:
     def check(kind: type[Task]) -> Iterable[str]:
         if issubclass(kind, TriFingerTask) and not hasattr(kind, "default_weights"):
             yield f"{kind.__name__} has no default_weights; set them in the class"
+        if issubclass(kind, Building) and not hasattr(kind, "piece"):
+            yield f"{kind.__name__} has no piece; set it in the class"
         for parameter in inspect.signature(kind.__init__).parameters.values():
             if parameter.kind is parameter.KEYWORD_ONLY and parameter.default is parameter.empty:
                 yield f"{kind.__name__} has no default for {parameter.name!r}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from itertools import product
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from robot_scenes import box_hull
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from scm_world._types import Floats
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.geometry import rotation_matrix
 from scm_world.geometry.filling import overlap_fraction
 from scm_world.geometry.hulls import Hull, extents, hull_of, hull_overlap, load_hull
@@ -212,17 +213,11 @@ def test_files_that_are_no_meshes(tmp_path: Path) -> None:
         load_hull(flat, scale=-1.0)
 
 
-def test_binary_stl_is_read(tmp_path: Path) -> None:
-    """A binary STL has a header, a count, and 50 bytes for each triangle; a cut one is refused."""
-    triangles = TETRAHEDRON[[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]].astype("<f4")
-    data = bytes(80) + (4).to_bytes(4, "little")
-    data += b"".join(bytes(12) + triangle.tobytes() + bytes(2) for triangle in triangles)
-    file = tmp_path / "body.stl"
-    file.write_bytes(data)
-
-    assert load_hull(file).volume == pytest.approx(1.0)
-    file.write_bytes(data[:-1])
-    with pytest.raises(ModelError, match=r"body\.stl: .* no volume"):
+def test_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the package, the command that installs it is given."""
+    file = write_obj(tmp_path / "cube.obj", cube_corners())
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(MissingExtra, match="mesh"):
         load_hull(file)
 
 

@@ -12,7 +12,7 @@ import pytest
 from scm_world.graph import to_json
 from scm_world.queries import World
 from scm_world.studio.reading import Spec, lit_edges, marks
-from scm_world.studio.scene import Shapes
+from scm_world.studio.scene import SentShapes
 from scm_world.studio.worker import Session
 from scm_world.tasks.factories import load_factory
 from scm_world.variables import Box, Categories, Integers
@@ -214,7 +214,7 @@ def test_every_task_has_shapes() -> None:
     for task, goals in (("reaching", 3), ("pushing", 1), ("stacking2", 2)):
         with World(task, backend="fake") as world:
             world.reset(seed=0)
-            number, poses, message = Shapes().place(world.scene())
+            number, poses, message = SentShapes().place(world.scene())
             assert number == 0
             assert message is not None
             kinds = [shape["kind"] for shape in message["shapes"]]

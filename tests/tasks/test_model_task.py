@@ -6,14 +6,14 @@ import pickle
 import re
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
 import pytest
 
 from scm_world import Box, Derived, Exogenous, World
-from scm_world.backends import read_model
+from scm_world.backends import BackendWrapper, make_backend, read_model
 from scm_world.errors import (
     ActionError,
     EngineFailure,
@@ -387,10 +387,18 @@ def test_the_audit_says_where_a_friction_has_no_effect(
     assert (f"note: {expected}" in str(audit)) == bool(decide)
 
 
-def test_the_audit_of_bullet_says_that_a_friction_has_no_effect() -> None:
+class Inside(BackendWrapper):
+    """An engine in an engine."""
+
+    name: ClassVar[str] = "inside"
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_the_audit_of_bullet_says_that_a_friction_has_no_effect(wrapped: bool) -> None:
     """Nothing that the engine was given changes below the friction of the floor."""
     pytest.importorskip("pybullet")
-    world = World.from_mjcf(SLIPPERY.format(priority=0), backend="bullet")
+    backend = Inside(make_backend("bullet")) if wrapped else "bullet"
+    world = World.from_mjcf(SLIPPERY.format(priority=0), backend=backend)
     world.reset(seed=0)
     (remark,) = world.do({"cube.friction": 0.8}).remarks
     assert remark.startswith("cube.friction has no effect: the larger coefficient")

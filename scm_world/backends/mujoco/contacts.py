@@ -35,8 +35,8 @@ class Touches:
         return tuple(
             ContactPoint(
                 (self.owners[first], self.owners[second]),
-                row[:3],
-                row[3:6],
+                row[:3].copy(),
+                row[3:6].copy(),
                 -float(row[6]),
                 float(row[7]),
             )

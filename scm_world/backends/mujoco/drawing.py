@@ -74,7 +74,7 @@ class VisibleModel:
     """
 
     def __init__(self, structure: Any) -> None:
-        self._now = now = Realization(structure, {})
+        self._now = now = Realization(structure, structure.default_parameters())
         self._given: tuple[Any, bytes] = ((), b"")  # the parameters that were written last
         self.model, self.data = now.model, now.data
         model = now.model

@@ -399,6 +399,8 @@ def _kept(variable: Variable, names: set[str]) -> Variable | None:
 class Building(TriFingerTask):
     """A goal family whose blocks are parts of a building, as many as variables say.
 
+    ``roots`` has to hold ``blocks_mass(default)``: the mass of every part is a copy of it.
+
     Attributes:
         piece: Where the parts come from.
     """

@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Values
+from scm_world.errors import ModelError
 from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import rotation_matrix
@@ -94,7 +95,7 @@ def view_of(
 
 
 Part = tuple[str, dict[str, float]]
-"""The name of a part of a building, and the constants that say which one it is."""
+"""The name of a part of a building, and the numbers that say which one it is."""
 
 
 def blocks_mass(default: float) -> Variable:
@@ -128,6 +129,15 @@ class Piece:
     place: Causes
     start: tuple[Any, ...]
     turn: Causes | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is neither a name nor a function with its parents."""
+        for field, given in vars(self).items():
+            named = isinstance(given, str) and field != "start"
+            made = isinstance(given, tuple) and given and callable(given[0])
+            if not (named or made or (given is None and field == "turn")):
+                advice = "give the name of a variable, or (function, 'parent', …)"
+                raise ModelError([f"Piece.{field}={given!r}: {advice}"])
 
 
 def _bound(causes: Causes | None, constants: Mapping[str, float]) -> dict[str, Any]:

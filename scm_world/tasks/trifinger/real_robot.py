@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -150,12 +150,8 @@ def _parts(observations: Any) -> dict[str, Floats]:
     """Return the parts of observations, each of shape (n, k), in this package's frame."""
     nested = isinstance(observations, Sequence) and bool(observations)
     if nested and all(isinstance(row, Mapping) for row in observations):
-        rows = [np.concatenate(list(_flat(row))) for row in observations]
-        lengths = sorted({len(row) for row in rows})
-        if len(lengths) > 1:
-            given = f"dictionaries of {lengths} numbers"
-            raise UnknownOption("observations", given, ("a list of whole dictionaries",))
-        flat = np.array(rows)
+        goal = next(iter(observations[0].get("desired_goal", ())), "")
+        flat = _flattened(observations, _LAYOUTS.get(goal, _LAYOUTS["object_position"]))
     else:
         flat = np.asarray(observations)
     layouts = {layout[_LAST].stop: goal for goal, layout in _LAYOUTS.items()}
@@ -177,10 +173,16 @@ def _parts(observations: Any) -> dict[str, Floats]:
     return found
 
 
-def _flat(row: Mapping[str, Any]) -> Iterator[Floats]:
-    """List the arrays of nested dictionaries, by names in order, as Gymnasium does."""
-    for _, part in sorted(row.items()):
-        if isinstance(part, Mapping):
-            yield from _flat(part)
-        else:
-            yield np.ravel(part)
+def _flattened(rows: Sequence[Mapping[str, Any]], layout: Mapping[str, slice]) -> Floats:
+    """Return dictionaries as flat observations."""
+    flat = np.empty((len(rows), layout[_LAST].stop))
+    for name, where in layout.items():
+        first, _, second = name.partition(".")
+        for number, row in enumerate(rows):
+            part = row.get(first, {})
+            part = np.ravel(part.get(second, ()) if second else part)
+            if part.shape != (size := where.stop - where.start,):
+                given = f"{len(part)} numbers in observation {number}"
+                raise UnknownOption(name, given, (f"{size}, as flatten_obs=False gives",))
+            flat[number, where] = part
+    return flat

@@ -114,8 +114,22 @@ class Stacking2(TriFingerTask):
             (TIPS, WAS, *FIRST, *SECOND, LOWER),
         ),
         (250.0, "block_to_goal", kernels.placing_progress, (*FIRST, LOWER)),
-        (250.0, "block_to_height", kernels.lifting_progress, (FIRST[0], LOWER, *SECOND, UPPER)),
-        (125.0, "block_to_block", kernels.stacking_progress, (*FIRST, LOWER, *SECOND, UPPER)),
+        (
+            250.0,
+            "block_to_height",
+            kernels.lifting_progress,
+            (FIRST[0], LOWER, *SECOND, UPPER),
+            "How much nearer the second block came to the height of its goal, once the first one "
+            "is placed [m].",
+        ),
+        (
+            125.0,
+            "block_to_block",
+            kernels.stacking_progress,
+            (*FIRST, LOWER, *SECOND, UPPER),
+            "How much nearer the second block came to the first one, seen from above, once that is "
+            "placed and while it is higher than its goal [m].",
+        ),
         (0.005, *SMOOTHNESS),
         fraction=1.0,
     )
