@@ -30,7 +30,20 @@ class Sound(BackendWrapper):
         self.engine.apply(Difference(state=state))
 
 
-class Remembers(Sound):
+class Keeps(Sound):
+    """Snapshots hold a number. This alone is no fault."""
+
+    def snapshot(self) -> EngineSnapshot:
+        """Save the number, too."""
+        return EngineSnapshot.of(self, (self.engine.snapshot(), self.kept))
+
+    def restore(self, snapshot: EngineSnapshot) -> None:
+        """Restore the number, too."""
+        inside, self.kept = snapshot.opened(self)
+        self.engine.restore(inside)
+
+
+class Remembers(Keeps):
     """Building does not forget the steps before."""
 
     def step(self, command: Any, substeps: int) -> None:
@@ -38,15 +51,6 @@ class Remembers(Sound):
         self.kept += 1e-9
         super().step(command, substeps)
         self.push(self.kept)
-
-    def snapshot(self) -> EngineSnapshot:
-        """Save the number of steps, too."""
-        return EngineSnapshot.of(self, (self.engine.snapshot(), self.kept))
-
-    def restore(self, snapshot: EngineSnapshot) -> None:
-        """Restore the number of steps, too."""
-        inside, self.kept = snapshot.opened(self)
-        self.engine.restore(inside)
 
 
 class Forgets(Remembers):
@@ -114,7 +118,7 @@ class Couples(Sound):
         return {row.key for row in self.engine.structure.parameters}
 
 
-class Counts(Sound):
+class Counts(Keeps):
     """The number of changes matters, and not only their result."""
 
     def build(self, scene: Any) -> None:
@@ -131,15 +135,6 @@ class Counts(Sound):
         """Push by the number of changes."""
         super().step(command, substeps)
         self.push(self.kept)
-
-    def snapshot(self) -> EngineSnapshot:
-        """Save the number of changes, too."""
-        return EngineSnapshot.of(self, (self.engine.snapshot(), self.kept))
-
-    def restore(self, snapshot: EngineSnapshot) -> None:
-        """Restore the number of changes, too."""
-        inside, self.kept = snapshot.opened(self)
-        self.engine.restore(inside)
 
 
 class Nudges(Sound):

@@ -73,7 +73,7 @@ class EngineBody:
         links: The links of each body, of each joint and of each shape, in the order above; that of
             a body carries its mass, and that of a free joint is -1.
         base: Arguments of ``createMultiBody`` for the base.
-        rows: Those for each link, see ``LINK``. Masses are 1 or 0 until they are told.
+        rows: Those for each link, see ``LINK``. Masses are 1 or 0 until they are set.
         shapes: Of each shape, the arguments of ``createCollisionShape`` and its margin [m].
         gears: Of each coupling, two joints, an offset and a ratio.
         rest: What else cannot be changed while it is there.

@@ -146,14 +146,14 @@ class Client:
 
     Attributes:
         engine: Its functions for this client.
-        holds: What was brought about here, for whoever did it.
+        holds: The history or the instant that it is in; set by the caller.
     """
 
     def __init__(self, engine: Any) -> None:
         self.engine = engine = Connection(engine)
         self.holds: Any = None
         self._model: Model | None = None
-        self._told: dict[Setting, Any] = {}  # what the engine was told of live bodies
+        self._told: dict[Setting, Any] = {}  # settings of the engine that are in force
         self._inside: Parameters | None = None  # parameters that were built into the bodies
         self._ruled: set[tuple[int, int, int, int]] = set()  # pairs of links with a rule
         self._saved: list[
@@ -270,7 +270,7 @@ class Client:
         self._changed = False
 
     def _settings(self) -> Iterator[tuple[Setting, tuple[dict[str, Any], Any]]]:
-        """List what live bodies have: arguments of functions, and what else their effect is of."""
+        """List the settings of bodies: arguments, and what else their effect depends on."""
         mj, built = self._twin.model, self._built
         off = disabled(mj, _OFF.mjDSBL_GRAVITY)
         gravity = dict(zip(("gravX", "gravY", "gravZ"), mj.opt.gravity.tolist(), strict=True))

@@ -14,7 +14,7 @@ from scm_world.backends.bullet.build import BALL, FREE, UNTURNED, Handle, compos
 
 
 class _Joints:
-    """Joints that the engine is asked and told of together.
+    """Joints that are read and set in one call of the engine.
 
     Args:
         engine: The functions of a physics client.

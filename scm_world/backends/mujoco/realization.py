@@ -90,7 +90,7 @@ class Realization:
         model: With the present parameters.
         data: With the present state.
         kept: The parameters in force; at first, none has been written.
-        revision: What the parameters in force are told from others by; new with every change.
+        revision: An object that identifies the parameters in force; new with every change.
         command: Where it is written, shape (n_commands,).
         lean: Whether ``mjSTATE_INTEGRATION`` is all that a scene has to keep.
         replay: ``mjSTATE_INTEGRATION`` before the last steps and how many these were, if they were
