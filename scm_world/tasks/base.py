@@ -14,11 +14,19 @@ from scm_world._types import Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
 from scm_world.tasks.composition import Composition
-from scm_world.variables import Box, Draw, Integers, Noise, Variable
+from scm_world.variables import Box, Draw, Integers, Variable
 from scm_world.variables.kinds import SpaceName
 
 TIME = "time_left_for_task"
 OVERLAP = "published_overlap"
+
+Scenario = tuple[Callable[..., tuple[dict[str, Value], Any]], Callable[..., Floats], int | None]
+"""How a probe state is prepared, its action is chosen, and the control steps before experiments.
+
+``prepare(world, rng)`` returns values to set in a world that has just been reset, and something for
+``act(world, something, rng)``, which returns an action, shape (n_actions,). It may step the world;
+``rng`` is a ``ProbeGenerator`` of ``scm_world.queries``. The steps are drawn from 0 to 2 if None.
+"""
 
 Score = tuple[tuple[str, ...], Callable[..., Any]]
 """Names of variables, and a function of their values, shapes (..., *shape), with values (...)."""
@@ -149,99 +157,6 @@ def checked(
         many = f"{shape[0]} numbers in " if shape else "a number in "
         raise UnknownOption(option, value, (many + allowed.describe(shape, {}),))
     return value
-
-
-_DRAWS = 96
-
-
-@final
-class ProbeGenerator:
-    """The random numbers of one probe state.
-
-    They depend on seed, probe and attempt only, not on earlier draws.
-
-    Args:
-        noise: The seed's noise.
-        probe: Number of the probe state.
-        attempt: Counts up where a choice was not feasible.
-    """
-
-    def __init__(self, noise: Noise, probe: int, attempt: int = 0) -> None:
-        self._noise, self._probe, self._attempt = noise, probe, attempt
-        self._numbers = self.random("probe", _DRAWS)
-        self._used = 0
-
-    def uniform(self, low: float, high: float, n: int | None = None) -> Any:
-        """Draw one number, or an array of ``n``; at most 96 in all."""
-        count = 1 if n is None else n
-        drawn = self._numbers[self._used : self._used + count]
-        self._used += count
-        scaled = low + (high - low) * drawn
-        return float(scaled[0]) if n is None else scaled
-
-    def random(self, stream: str, n: int) -> Floats:
-        """Draw numbers in [0, 1) of a named stream, shape (n,)."""
-        drawn = self._noise.uniforms(stream, n=n, episode=self._probe, step=self._attempt)
-        found: Floats = drawn[0]
-        return found
-
-
-@final
-@dataclass(frozen=True)
-class Scenario:
-    """A kind of probe state.
-
-    Attributes:
-        name: Its name.
-        prepare: Chooses the values to set in a world that has just been reset. It may step the
-            world before. The second value it returns is passed to ``act``.
-        act: Returns an action, shape (n_actions,).
-        steps: Number of control steps before the experiments; drawn from 0 to 2 if None.
-        fresh: Whether the values that were set count as the natural ones: experiments then do not
-            add up with them to one intervention, and are faster.
-    """
-
-    name: str
-    prepare: Callable[[Any, ProbeGenerator], tuple[dict[str, Value], Any]]
-    act: Callable[[Any, Any, ProbeGenerator], Floats]
-    steps: int | None = None
-    fresh: bool = False
-
-
-class OpenLoopPolicy(ABC):
-    """A policy that ignores the state: all its actions are known beforehand."""
-
-    @abstractmethod
-    def ahead(self, world: Any, first: int, count: int) -> Floats:
-        """Return the actions of some control steps, shape (count, n_actions).
-
-        Args:
-            world: The present world. A policy asked for the first time may read it.
-            first: The first control step.
-            count: Number of control steps.
-        """
-
-    def __call__(self, world: Any) -> Floats:
-        """Return the action of the present step."""
-        action: Floats = self.ahead(world, world.index, 1)[0]
-        return action
-
-
-def kept_rows(actions: Floats, first: int, count: int) -> Floats:
-    """Return rows of actions; the last one is repeated."""
-    found: Floats = actions[np.minimum(np.arange(first, first + count), len(actions) - 1)]
-    return found
-
-
-def action_range(world: Any) -> tuple[Floats, Floats]:
-    """Return the lower and upper end of all actions, shape (n_actions,) each.
-
-    An action without an end is drawn from [-1, 1], or as far beyond the end that it has.
-    """
-    low, high = world.action_low, world.action_high
-    low = np.where(np.isfinite(low), low, np.minimum(-1.0, high - 2.0))
-    high = np.where(np.isfinite(high), high, np.maximum(1.0, low + 2.0))
-    return low, high
 
 
 @final
@@ -390,7 +305,7 @@ class Task(ABC):
         return np.asarray(np.clip(np.zeros(len(low)), low, high))
 
     def scenarios(self, world: Any) -> Sequence[Scenario]:
-        """List informative kinds of state at the start of an episode; none: those of any system."""
+        """List informative kinds of probe states; none: those of any system."""
         return ()
 
     def nearby(self, values: Values) -> Iterable[dict[str, Value]]:

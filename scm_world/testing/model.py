@@ -27,8 +27,8 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, InterventionError
+from scm_world.policies.planning import action_range
 from scm_world.queries import World
-from scm_world.tasks.base import action_range
 from scm_world.variables import Box, Categories, Draw, Integers, Noise, Rotations, Scale
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world import Audit, Batch, Simulation
