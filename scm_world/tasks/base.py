@@ -206,7 +206,6 @@ class Task(ABC):
         policies: Scripted policies of the task, by name.
         training: Fields of its learning recipe, such as ``{"steps": 200_000}``; those of an
             algorithm under its name. The others have their usual values.
-        checks_functions: Whether results of user functions are checked when a world begins.
         backend: Default backend.
         generated_graph: Whether edges follow from structure, so that some may never show.
         given: The arguments of the task.
@@ -235,7 +234,6 @@ class Task(ABC):
     n_actions: ClassVar[int | None] = None
     policies: ClassVar[Mapping[str, Callable[[], Any]]] = {}
     training: ClassVar[Mapping[str, Any]] = {}
-    checks_functions: ClassVar[bool] = False
     backend: ClassVar[str] = "mujoco"
     generated_graph: bool = False
 

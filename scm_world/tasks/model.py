@@ -194,7 +194,6 @@ class ModelTask(DeclaredTask):
     choices = Task.choices | {"action_mode": ("controls",), "preset": ("model",)}
     kinds = (("outcomes", str, Measured), ("observe", str), ("expose", str), ("ties", Variable))
     generated_graph = True
-    checks_functions = True
 
     model: Any = None
     expose: Iterable[str] | str | None = None
