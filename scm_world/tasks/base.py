@@ -21,15 +21,6 @@ TIME = "time_left_for_task"
 OVERLAP = "published_overlap"
 
 Scenario = tuple[Callable[..., tuple[dict[str, Value], Any]], Callable[..., Floats], int | None]
-"""How a probe state is prepared, its action is chosen, and the control steps before experiments.
-
-``prepare(world, rng)`` returns values to set in a world that has just been reset, and something for
-``act(world, something, rng)``, which returns an action, shape (n_actions,). It may step the world;
-``rng`` is a ``ProbeGenerator`` of ``scm_world.queries``. The steps are drawn from 0 to 2 if None.
-"""
-
-Score = tuple[tuple[str, ...], Callable[..., Any]]
-"""Names of variables, and a function of their values, shapes (..., *shape), with values (...)."""
 
 
 @final
@@ -90,7 +81,9 @@ class Goal:
         measures: Functions of the two vectors, shapes (..., n), with values of shape (...): the
             reward terms that they decide, such as ``success``, and ``published_overlap``, the
             fractional success of CausalWorld 1.2.
-        closeness: The score that planners maximise; minus the distance of the vectors if None.
+        closeness: The score that planners maximise: names of variables, and a function of their
+            values, shapes (..., *shape), with values (...); minus the distance of the vectors if
+            None.
         tools: Boxes that should be moved.
         targets: Goals, each with the box that its solution puts there.
     """
@@ -99,7 +92,7 @@ class Goal:
     desired: tuple[str, ...] = ()
     causes: tuple[str, ...] = ()
     measures: Mapping[str, Callable[[Floats, Floats], Any]] = field(default_factory=dict)
-    closeness: Score | None = None
+    closeness: tuple[tuple[str, ...], Callable[..., Any]] | None = None
     tools: tuple[str, ...] = ()
     targets: Mapping[str, str] = field(default_factory=dict)
 
@@ -303,7 +296,14 @@ class Task(ABC):
         return np.asarray(np.clip(np.zeros(len(low)), low, high))
 
     def scenarios(self, world: Any) -> Sequence[Scenario]:
-        """List informative kinds of probe states; none: those of any system."""
+        """List kinds of states in which causes show; none: those of any system.
+
+        Returns:
+            Of each: ``prepare(world, rng)``, which returns values to set in a world that has just
+            been reset, and something for ``act(world, something, rng)``, which returns an action;
+            and the number of control steps before experiments, drawn from 0 to 2 if None. ``rng``
+            has ``uniform(low, high, n)``.
+        """
         return ()
 
     def nearby(self, values: Values) -> Iterable[dict[str, Value]]:

@@ -161,13 +161,9 @@ class Composition:
         names = self.system.body_names
         return {row.name: names[row.body] for row in self.system.parameters if row.body >= 0}
 
-    def goals(self, values: Values) -> tuple[GoalRegion, ...]:
-        """Describe all goals."""
-        return ()
-
-    def light(self, values: Values) -> Light:
-        """Describe the light of pictures."""
-        return Light()
+    def looks(self, values: Values) -> tuple[tuple[GoalRegion, ...], Light]:
+        """Describe all goals, and the light of pictures."""
+        return (), Light()
 
     def cameras(self, values: Values) -> tuple[Camera, ...]:
         """Describe the cameras whose places are variables."""

@@ -228,12 +228,11 @@ def declared(name: str, given: Any) -> Variable:
     return Measured(name=name, parents=tuple(parents), mechanism=function, **form)
 
 
-def succeeded() -> Measured:
+def succeeded() -> Variable:
     """Declare success: more than nine tenths of the fractional success."""
     above_most = Function(above, constants={"threshold": FULFILLED})
     doc = "1 where more than nine tenths of the goal are filled."
-    form: dict[str, Any] = {"dtype": "integer", "bounds": Integers(0, 1), "doc": doc}
-    return Measured(name=SUCCESS, parents=(FRACTION,), mechanism=above_most, **form)
+    return declared(SUCCESS, (above_most, FRACTION)).model_copy(update={"doc": doc})
 
 
 @njit(cache=True)
