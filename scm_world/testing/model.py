@@ -132,18 +132,17 @@ class _Caller:
     def load(self, module: str) -> None:
         importlib.import_module(module)
 
-    def call(self, function: Callable[..., str], *arguments: Any) -> str:
+    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         return function(*arguments)
 
 
 _OTHER = Worker(_Caller)
 
 
-def elsewhere(function: Callable[..., str], *arguments: Any, module: str = __name__) -> str:
+def elsewhere(function: Callable[..., Any], *arguments: Any, module: str = __name__) -> Any:
     """Call a function in another process that has imported a module; it is always the same one."""
     _OTHER.ask("load", module)
-    found: str = _OTHER.ask("call", function, *arguments)
-    return found
+    return _OTHER.ask("call", function, *arguments)
 
 
 # --- checks -----------------------------------------------------------------------------------
