@@ -10,12 +10,11 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
 
-from scm_world._types import Integers
 from scm_world.backends.mujoco.fields import (
     MEDIUM,
     control_unit,
@@ -65,18 +64,19 @@ def callbacks() -> list[str]:
     ]
 
 
+_TRIANGLE = np.ones((3, 3)) - (2.0 - 1e-6) * np.eye(3)
+"""Takes moments of inertia to numbers that are not negative if none exceeds the sum of others."""
+
+
 def sensible(mj: mujoco.MjModel) -> bool:
     """Return whether masses, and what MuJoCo derives from them, are those of something that moves.
 
     They are finite and not negative, and moments of inertia obey the triangle inequality.
     """
-    most = mj.body_inertia.max(axis=1)
-    parts = mj.body_mass, mj.body_inertia, mj.dof_M0, mj.dof_invweight0, mj.body_invweight0
-    return (
-        all(part.min() >= 0.0 and part.max() < math.inf for part in parts)
-        and mj.dof_M0.min() > 0.0
-        and bool((mj.body_inertia.sum(axis=1) - 2.0 * most >= -1e-6 * most).all())
-    )
+    masses, moments = mj.body_mass, mj.body_inertia
+    derived = mj.dof_M0, mj.dof_invweight0, mj.body_invweight0.ravel()
+    found = np.concatenate([masses, moments.ravel(), (moments @ _TRIANGLE).ravel(), *derived])
+    return bool(found.min() >= 0.0 and found.max() < math.inf and derived[0].min() > 0.0)
 
 
 Bindings = Callable[[mujoco.MjModel, mujoco.MjData, Couplings], Iterable[Parameter]]
@@ -378,32 +378,6 @@ def _exposed(rows: Sequence[Parameter], patterns: Sequence[str] | None) -> set[s
 
 
 # --- states and inputs -------------------------------------------------------------------------
-
-
-class Permutation(NamedTuple):
-    """Where each of MuJoCo's numbers stands in the state vector.
-
-    Attributes:
-        positions: ``vector[positions]`` is ``qpos``.
-        velocities: ``vector[velocities]`` is ``qvel``.
-        activations: ``vector[activations]`` is ``act``.
-    """
-
-    positions: Integers
-    velocities: Integers
-    activations: Integers
-
-
-def permutation(model: Model) -> Permutation:
-    """Return the place of every number of MuJoCo's state in that of the tables."""
-    places = model.layout.slices
-    found: dict[str, list[tuple[int, int]]] = {"qpos": [], "qvel": [], "act": [], REPORTED: []}
-    for row in model.states:
-        found[row.array] += (
-            (number, place) for place, number in enumerate(row.numbers, places[row.name].start)
-        )
-    ordered = ([place for _, place in sorted(found[array])] for array in ("qpos", "qvel", "act"))
-    return Permutation(*(np.array(one, dtype=np.int64) for one in ordered))
 
 
 _COORDINATES = {
