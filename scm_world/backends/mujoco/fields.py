@@ -191,8 +191,10 @@ class Element:
             reason: Why not, to be read after its name.
             effect: The trees it acts on; those of the element if None.
         """
-        slot = where if callable(where) else None
-        if where and slot is None:
+        slot: Finder | None = None
+        if callable(where):
+            slot = where
+        elif where:
             index = self.i if index is None else index
             index = index if isinstance(index, tuple) else (index,)
             slot = partial(at, form, where, index, constant)
@@ -245,17 +247,16 @@ class Element:
 
     def solver(self, suffix: str = "", **rest: Any) -> Rows:
         """List how stiff and how hard a constraint is."""
-        array, low, high = prefix(self.kind), (SMALLEST, SMALLEST), math.inf
-        doc = "Time constant [s] and damping ratio of the constraint."
+        array, rest["usual"] = prefix(self.kind), False
+        low: Numbers = (SMALLEST, SMALLEST)
+        high, doc = math.inf, "Time constant [s] and damping ratio of the constraint."
         if (self["solref"] < 0.0).any():
             low, high = -math.inf, 0.0
             doc = "Stiffness and damping of the constraint, both negative."
-        bounds = {"low": low, "high": high}
-        rest["usual"] = False
-        yield self.row(f"solref{suffix}", "1", doc, f"{array}_solref", **bounds, **rest)
+        yield self.row(f"solref{suffix}", "1", doc, f"{array}_solref", low=low, high=high, **rest)
         doc = "Smallest and largest impedance, width of the transition, its midpoint and power."
-        ends = {"low": (0.0, 0.0, 0.0, 0.0, 1.0), "high": (1.0, 1.0, math.inf, 1.0, math.inf)}
-        yield self.row(f"solimp{suffix}", "1", doc, f"{array}_solimp", **ends, **rest)
+        rest |= {"low": (0.0, 0.0, 0.0, 0.0, 1.0), "high": (1.0, 1.0, math.inf, 1.0, math.inf)}
+        yield self.row(f"solimp{suffix}", "1", doc, f"{array}_solimp", **rest)
 
 
 _UNLIMITED = "is not in force: it has no limits"
