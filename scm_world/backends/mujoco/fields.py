@@ -171,25 +171,12 @@ class Element:
     ) -> Parameter:
         """Return a parameter with its value in the model, and in the data.
 
-        Args:
-            attribute: Its name.
-            unit: SI unit; {L} is that of the coordinate, {F} of a force and {I} of an inertia
-                along it.
-            doc: One sentence.
-            where: Arrays with its value (see ``slots.at``), or what finds it; ``""`` if nothing can
-                be written.
-            index: Place in the arrays; the number of the element if None.
-            form: How the value stands there.
-            constant: Whether constants of the model follow it (``mj_setConst``).
-            low: Lower bound; the default, if that is lower.
-            high: Upper bound.
-            kind: See ``Parameter``.
-            usual: Whether it is exposed by default.
-            visual: Whether it acts on pictures only.
-            off: Flags of the model that disable it.
-            acts: Whether it can be set, if no flag disables it.
-            reason: Why not, to be read after its name.
-            effect: The trees it acts on; those of the element if None.
+        In a unit, {L} is that of the coordinate, {F} of a force and {I} of an inertia along it.
+        ``where`` names the arrays of the value (see ``slots.at``) or finds it, ``index`` is its
+        place in them (the number of the element if None), and ``form`` makes a slot of the views.
+        Constants of the model follow what is ``constant`` (``mj_setConst``). A default below
+        ``low`` is the lower bound. The flags ``off`` of the model disable it; where it does not
+        act, ``reason`` says why. ``effect`` has the trees it acts on; those of the element if None.
         """
         slot: Finder | None = None
         if callable(where):
@@ -521,12 +508,7 @@ def table(mj: mujoco.MjModel, data: mujoco.MjData, trees: Couplings) -> list[Par
 
     Where two elements have the same name and attribute, the usual one keeps the plain name; if
     none or both are usual, both are distinguished by their kind: ``"geom:torso.color"``. So is what
-    has the name of a state.
-
-    Args:
-        mj: The model.
-        data: The state in which episodes begin.
-        trees: Of the model.
+    has the name of a state. The data are those of the beginning.
     """
     names, found = element_names(mj), list[tuple[str, Parameter]]()
     for kind, rows in ROWS.items():

@@ -147,14 +147,7 @@ def find_readouts(
     parameters: Sequence[Parameter],
     wanted: Sequence[str],
 ) -> Iterator[Readout]:
-    """Describe what was asked for.
-
-    Args:
-        mj: The compiled model.
-        source: What it was compiled from.
-        states: Rows of the state vector.
-        parameters: Those that are exposed.
-        wanted: Names: ``"tip.position"``, ``"body:tip.position"``, ``"imu.value"``.
+    """Describe what was asked for: ``"tip.position"``, ``"body:tip.position"``, ``"imu.value"``.
 
     Raises:
         ModelError: All names that cannot be computed, with the reasons.

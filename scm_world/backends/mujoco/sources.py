@@ -101,20 +101,10 @@ def realized(source: Source) -> tuple[mujoco.MjModel, tuple[str, ...]]:
 def read_source(
     source: Any, *, fixed_base: bool, options: Mapping[str, Any]
 ) -> tuple[Source, str, str, tuple[str, ...]]:
-    """Read and compile a model.
-
-    Args:
-        source: A path, XML text, an ``MjSpec`` or an ``MjModel``.
-        fixed_base: Whether the root link of a URDF is fixed to the world.
-        options: Options of MJCF that are set to something else.
+    """Read and compile a model; see ``reading.read_model``.
 
     Returns:
         The source, a name for the model, how to call it in errors, and what its compiler replaces.
-
-    Raises:
-        UnreadableFile: A file cannot be read.
-        ModelError: It is no such thing, MuJoCo refuses it, or it has plugins.
-        UnknownOption: An option is not one.
     """
     notes, plugins = tuple[str, ...](), ""
     if isinstance(source, mujoco.MjModel):

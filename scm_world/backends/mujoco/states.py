@@ -48,19 +48,11 @@ def read_rows(
     which: Any,
     into: Floats,
 ) -> int:
-    """Read the motions of some simulations as states.
+    """Write some rows of motions as states; return the last that is not finite, or -1.
 
-    Args:
-        motions: Of all simulations, one to a row.
-        forces: ``qfrc_actuator`` of all; without columns if nothing is reported.
-        places: Where in a state each number of a motion is.
-        reported: Places in the forces and in a state of what is reported, shape (2, m).
-        turned: Where in a state quaternion and angular velocity of each turned body are, (n, 7).
-        which: The rows, shape (m,).
-        into: The first columns of these rows are written.
-
-    Returns:
-        The last row in which a motion is not finite; -1 if there is none.
+    ``places`` has where in a state each number of a motion is, ``reported`` the places in
+    ``qfrc_actuator`` and in a state of what is reported (2, m), and ``turned`` those of quaternion
+    and angular velocity of each turned body in a state (n, 7).
     """
     wrong = -1
     for row in which:
@@ -87,16 +79,10 @@ def into_bodies(
 ) -> None:
     """Turn angular velocities in the world into those in the frames of the bodies.
 
-    A body whose quaternion and angular velocity are those that were read after the last step gets
-    MuJoCo's own numbers of that step: turning back and forth would change the last digits.
-
-    Args:
-        vector: The state to write.
-        turned: Where in it the seven numbers of each body are, shape (n, 7).
-        own: Where in the motion they are: quaternion (w, x, y, z) and angular velocity.
-        known: Quaternion and angular velocity that were read, nan for a new body, shape (n, 7).
-        exact: MuJoCo's own numbers then, shape (n, 7).
-        motion: Written.
+    A body whose quaternion and angular velocity are ``known``, read after the last step (nan for a
+    new body), gets the ``exact`` numbers that MuJoCo had then: turning back and forth would change
+    the last digits. ``turned`` and ``own`` have their places in the state and in the motion; all
+    four have shape (n, 7).
     """
     spin = np.empty(3)
     for body in range(turned.shape[0]):
