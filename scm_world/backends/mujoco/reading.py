@@ -65,10 +65,11 @@ def sensible(mj: mujoco.MjModel) -> bool:
 
     They are finite and not negative, and moments of inertia obey the triangle inequality.
     """
-    masses, moments = mj.body_mass, mj.body_inertia
-    derived = mj.dof_M0, mj.dof_invweight0, mj.body_invweight0.ravel()
-    found = np.concatenate([masses, moments.ravel(), (moments @ _TRIANGLE).ravel(), *derived])
-    return bool(found.min() >= 0.0 and found.max() < math.inf and derived[0].min() > 0.0)
+    moments, diagonal = mj.body_inertia, mj.dof_M0
+    parts = mj.body_mass, moments.ravel(), diagonal, mj.dof_invweight0, mj.body_invweight0.ravel()
+    found = np.concatenate(parts)
+    valid = found.min() >= 0.0 and found.max() < math.inf and diagonal.min() > 0.0
+    return bool(valid and (moments @ _TRIANGLE).min() >= 0.0)
 
 
 Bindings = Callable[[mujoco.MjModel, mujoco.MjData, Couplings], Iterable[Parameter]]
@@ -234,7 +235,8 @@ def _check_inertia(mj: mujoco.MjModel) -> Iterator[str]:
         return
     names = element_names(mj)
     possible = (mj.body_mass >= 0.0) & (mj.body_inertia >= 0.0).all(axis=1)
-    wrong = ~(possible & (mj.body_inertia @ _TRIANGLE >= 0.0).all(axis=1))
+    with np.errstate(invalid="ignore"):
+        wrong = ~(possible & (mj.body_inertia @ _TRIANGLE >= 0.0).all(axis=1))
     if wrong.any():
         bodies = ", ".join(repr(names["body"][body]) for body in np.flatnonzero(wrong))
         yield f"no body has such a mass, or such moments of inertia, as {bodies}"
