@@ -131,6 +131,7 @@ class Realization:
         self._last: LastStep | None = None
         self._written: Floats | None = None  # since the last step, if bodies are turned
         self._counts = data.warning.number
+        self._full = self._counts[1:3]  # times that contacts or constraints had no memory, plus 1
         self._size = int(mujoco.mj_stateSize(model, STATE))
         # MuJoCo prints a warning, and writes it to a file, when it counts the first of its kind.
         self._counts[:] = self._scratch.warning.number[:] = 1
@@ -193,9 +194,9 @@ class Realization:
     def problem(self) -> str:
         """Return why the state after a step is invalid; empty if it is valid."""
         mujoco.mj_getState(self.model, self.data, self._motion, MOTION)
-        if self._motion @ self._zeros == 0.0 and self._counts[1] + self._counts[2] == 2:
+        full = self._full.tolist() != [1, 1]
+        if self._motion.dot(self._zeros) == 0.0 and not full:
             return ""
-        full = self._counts[1] + self._counts[2] > 2
         self._counts[:] = 1
         if full:
             return FULL
@@ -304,11 +305,13 @@ class Realization:
         """Read parameters and moments of inertia back from the arrays of the model."""
         found: dict[ParameterKey, Floats] = {}
         for key in keys:
-            if key not in self._slots and key[1] == "inertia" and key[0] in self._bodies:
+            slot = self._slots.get(key)
+            if slot is not None:
+                found[key] = slot.read()
+            elif key[1] == "inertia" and key[0] in self._bodies:
                 found[key] = self.model.body_inertia[self._bodies.index(key[0])].copy()
             else:
                 self.check([key])
-                found[key] = self._slots[key].read()
         return found
 
     def edit(self, parameters: Parameters) -> None:
