@@ -303,12 +303,7 @@ class InMemory(Backend, ABC):
         self._place(scene.state)
 
     def apply(self, difference: Difference) -> None:
-        """Change structure, parameters and state without advancing time.
-
-        Raises:
-            UnknownOption: There is no such parameter. Nothing has changed.
-            WrongShape: A parameter has another shape. Nothing has changed.
-        """
+        """Change structure, parameters and state; where a parameter is wrong, nothing changes."""
         structure = difference.structure
         if structure is not None:
             now = Scene(self.structure, self._parameters, self._state)
@@ -326,11 +321,7 @@ class InMemory(Backend, ABC):
             self._place(difference.state)
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Return the parameters that were set.
-
-        Raises:
-            UnknownOption: There is no such parameter.
-        """
+        """Return the parameters that were set."""
         fake, found = getattr(self.structure, "fake", None), dict[ParameterKey, Floats]()
         for key in keys:
             body, what = key
