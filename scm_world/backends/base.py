@@ -155,14 +155,14 @@ class Backend(ABC):
 
     Attributes:
         name: Of the engine.
-        capabilities: What it can do beyond these methods.
+        capabilities: What it can do beyond these methods; what most can if a class says nothing.
         batch: Made of backends of this class and a number of threads, it steps several scenes.
         version: Of the engine.
         structure: What was compiled: it says how large states and commands are.
     """
 
     name: ClassVar[str]
-    capabilities: ClassVar[Capabilities]
+    capabilities: ClassVar[Capabilities] = Capabilities()
     batch: ClassVar[type[EngineBatch]] = EngineBatch
     version: str
     structure: Any

@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Floats, Integers, Value
-from scm_world.backends.base import Capabilities, EngineBatch, InMemory
+from scm_world.backends.base import EngineBatch, InMemory
 from scm_world.errors import EngineFailure, ModelError
 from scm_world.models.model import Numbers
 from scm_world.models.scene import ParameterKey, Parameters, Scene, State, StateLayout
@@ -318,7 +318,6 @@ class StepFunction(InMemory):
     """
 
     name: ClassVar[str] = "step"
-    capabilities: ClassVar[Capabilities] = Capabilities()
     batch: ClassVar[type[EngineBatch]] = StepBatch
     numbers: Floats
 
