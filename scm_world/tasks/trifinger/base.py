@@ -414,7 +414,7 @@ class Building(TriFingerTask):
         """List the blocks, and their places in the building."""
         airborne, targets = self.conventions.published_spaces, self.targets
         pieces = [
-            building.bodies(self.piece, name, tuple(which.items()), airborne)
+            building.bodies(self.piece, name, building.constants_of(which), airborne)
             for name, which in self.parts()
         ]
         yield from (tool for tool, _ in pieces)

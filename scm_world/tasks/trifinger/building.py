@@ -23,7 +23,7 @@ from scm_world.tasks.trifinger.entities.blocks import ToolBlock, block_mass
 from scm_world.tasks.trifinger.entities.goals import GoalBlock, goal_orientation, goal_position
 from scm_world.tasks.trifinger.views import SIZE, view
 from scm_world.variables import Function, Variable
-from scm_world.variables.mechanisms import Stacked
+from scm_world.variables.mechanisms import Constant, Stacked
 
 MASS = "blocks_mass"
 BOX = 10  # numbers of a box in a goal vector: size (3), position (3), quaternion (4)
@@ -94,8 +94,15 @@ def view_of(
     return tuple(dict.fromkeys(itertools.chain(*parts))), SIZE * len(parts), seen
 
 
-Part = tuple[str, dict[str, float]]
-"""The name of a part of a building, and the numbers that say which one it is."""
+Part = tuple[str, dict[str, Any]]
+"""The name of a part of a building, and the numbers, or arrays, that say which one it is."""
+
+Constants = tuple[tuple[str, Constant], ...]
+
+
+def constants_of(which: Mapping[str, Any]) -> Constants:
+    """Return the numbers of a part as mechanisms keep them: arrays as tuples."""
+    return tuple(Function("part", constants=which).constants.items())
 
 
 def blocks_mass(default: float) -> Variable:
@@ -140,7 +147,7 @@ class Piece:
                 raise ModelError([f"Piece.{field}={given!r}: {advice}"])
 
 
-def _bound(causes: Causes | None, constants: Mapping[str, float]) -> dict[str, Any]:
+def _bound(causes: Causes | None, constants: Mapping[str, Constant]) -> dict[str, Any]:
     """Return parents and mechanism."""
     if causes is None or isinstance(causes, str):
         return {"parents": () if causes is None else (causes,), "mechanism": None}
@@ -153,7 +160,7 @@ def _bound(causes: Causes | None, constants: Mapping[str, float]) -> dict[str, A
 
 @lru_cache(maxsize=512)  # they are immutable, and most structures of a family have them
 def bodies(
-    piece: Piece, name: str, which: tuple[tuple[str, float], ...], airborne: bool
+    piece: Piece, name: str, which: Constants, airborne: bool
 ) -> tuple[ToolBlock, GoalBlock]:
     """Describe a block of a building, and its place.
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import InterventionError
-from scm_world.tasks.base import ProbeGenerator, Scenario
+from scm_world.tasks.base import Scenario
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import WALL_RADIUS
@@ -46,7 +46,7 @@ def above(world: Any, name: str) -> tuple[Floats, float]:
 
 def touched(
     world: Any,
-    rng: ProbeGenerator,
+    rng: Any,
     middle: Floats,
     bottom: float,
     heights: tuple[float, float],
@@ -69,9 +69,7 @@ def touched(
     return states, angles, height
 
 
-def pressed(
-    world: Any, rng: ProbeGenerator, middle: Floats, bottom: float, count: int = HIGHEST
-) -> Setting:
+def pressed(world: Any, rng: Any, middle: Floats, bottom: float, count: int = HIGHEST) -> Setting:
     """Stack the first blocks and let the fingers press on one of them that they reach."""
     edges = sizes(world)[:HIGHEST][:count]
     states = stacked(world, rng, middle, bottom, count=count)
@@ -88,7 +86,7 @@ def pressed(
 
 def stacked(
     world: Any,
-    rng: ProbeGenerator,
+    rng: Any,
     middle: Floats,
     bottom: float,
     yaw: float = 0.0,
@@ -109,7 +107,7 @@ def stacked(
 # --- where fingers are --------------------------------------------------------------------------
 
 
-def facing(rng: ProbeGenerator) -> Floats:
+def facing(rng: Any) -> Floats:
     """Return the direction in which each finger stands, with a little spread [rad]."""
     tips = np.array([[-0.05945, 0.15864], [0.16711, -0.02783], [-0.10766, -0.13080]])
     directions: Floats = np.arctan2(tips[:, 1], tips[:, 0]) + rng.uniform(-0.2, 0.2, 3)
@@ -135,7 +133,7 @@ def joints_for(world: Any, tips: Floats) -> Floats:
     return inverse(tips, float(world["robot_height"]), near).joint_positions
 
 
-def fingers_at(world: Any, rng: ProbeGenerator, tips: Floats) -> dict[str, Value]:
+def fingers_at(world: Any, rng: Any, tips: Floats) -> dict[str, Value]:
     """Put the fingertips somewhere, and the blocks out of their way, unless it is not free."""
     states: dict[str, Value] = {"joint_positions": joints_for(world, tips)}
     if not world.composition.obstacles:  # one may stand in the middle
@@ -150,7 +148,7 @@ PLACES = "obstacle_places"
 # --- one block, or none -------------------------------------------------------------------------
 
 
-def touch(world: Any, rng: ProbeGenerator) -> Setting:
+def touch(world: Any, rng: Any) -> Setting:
     """Stand the first block amid the fingers and let all three press on it."""
     middle = rng.uniform(-0.02, 0.02, 2)
     states, angles, _ = touched(world, rng, middle, 0.0, (0.3, 0.8), yaw=0.8)
@@ -158,7 +156,7 @@ def touch(world: Any, rng: ProbeGenerator) -> Setting:
     return states, drive
 
 
-def on_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
+def on_obstacle(world: Any, rng: Any) -> Setting:
     """Stand the blocks on the first obstacle and let all three fingers press on one."""
     center, bottom = above(world, world.composition.obstacles[0])
     middle = center + rng.uniform(-0.002, 0.002, 2)
@@ -168,7 +166,7 @@ def on_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
     return states, around(middle, rng.uniform(0.0, 0.02), angles + 0.4, height - 0.02)
 
 
-def block_in_air(world: Any, rng: ProbeGenerator) -> Setting:
+def block_in_air(world: Any, rng: Any) -> Setting:
     """Drop the first block, tumbling."""
     name = world.composition.blocks[0]
     states = {
@@ -180,26 +178,26 @@ def block_in_air(world: Any, rng: ProbeGenerator) -> Setting:
     return states, present_tips(world)
 
 
-def free(world: Any, rng: ProbeGenerator) -> Setting:
+def free(world: Any, rng: Any) -> Setting:
     """Change nothing; the robot drives somewhere."""
     return {}, present_tips(world) + rng.uniform(-0.05, 0.05, 9)
 
 
-def finger_on_floor(world: Any, rng: ProbeGenerator) -> Setting:
+def finger_on_floor(world: Any, rng: Any) -> Setting:
     """Put the fingertips on the floor and let them rub it."""
     angles, radius = facing(rng), rng.uniform(0.1, 0.13)
     states = fingers_at(world, rng, around(ORIGIN, radius, angles, TIP + CLEARANCE))
     return states, around(ORIGIN, radius - 0.02, angles + 0.2, -0.02)
 
 
-def finger_at_wall(world: Any, rng: ProbeGenerator) -> Setting:
+def finger_at_wall(world: Any, rng: Any) -> Setting:
     """Put the fingertips at the ring wall and let them rub it."""
     angles, height = facing(rng), rng.uniform(0.08, 0.14)
     states = fingers_at(world, rng, around(ORIGIN, WALL_RADIUS - TIP - 3e-3, angles, height))
     return states, around(ORIGIN, WALL_RADIUS + 0.03, angles + 0.15, height + 0.02)
 
 
-def fingers_together(world: Any, rng: ProbeGenerator) -> Setting:
+def fingers_together(world: Any, rng: Any) -> Setting:
     """Put the fingertips side by side in the middle and let them press on one another."""
     angles, middle = facing(rng), rng.uniform(-0.02, 0.02, 2)
     height = rng.uniform(0.05, 0.1)
@@ -210,12 +208,12 @@ def fingers_together(world: Any, rng: ProbeGenerator) -> Setting:
 # --- all blocks ---------------------------------------------------------------------------------
 
 
-def tower(world: Any, rng: ProbeGenerator) -> Setting:
+def tower(world: Any, rng: Any) -> Setting:
     """Stand the blocks on one another and let the fingers press on one of them."""
     return pressed(world, rng, rng.uniform(-0.01, 0.01, 2), 0.0)
 
 
-def block_at_wall(world: Any, rng: ProbeGenerator) -> Setting:
+def block_at_wall(world: Any, rng: Any) -> Setting:
     """Slide the blocks along the wall, on one another."""
     size = sizes(world)[0]
     angle = rng.uniform(-np.pi, np.pi)
@@ -230,12 +228,12 @@ def block_at_wall(world: Any, rng: ProbeGenerator) -> Setting:
     return states, present_tips(world)
 
 
-def solved(world: Any, rng: ProbeGenerator) -> Setting:
+def solved(world: Any, rng: Any) -> Setting:
     """Begin where the goal is fulfilled."""
     return world.task.solution(world.values()), present_tips(world)
 
 
-def leaving(world: Any, rng: ProbeGenerator) -> Setting:
+def leaving(world: Any, rng: Any) -> Setting:
     """Begin where the goal is fulfilled, with the blocks on their way up."""
     states, tips = solved(world, rng)
     for name in world.composition.blocks:
@@ -247,7 +245,7 @@ def leaving(world: Any, rng: ProbeGenerator) -> Setting:
 # --- what may come into being -------------------------------------------------------------------
 
 
-def on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
+def on_newcomer(world: Any, rng: Any) -> Setting:
     """Stand some blocks where a further one would come into being, and press on one of them.
 
     High towers may be out of the fingers' reach there, so how many there are is drawn.
@@ -259,7 +257,7 @@ def on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
     return pressed(world, rng, *place, some)
 
 
-def all_on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
+def all_on_newcomer(world: Any, rng: Any) -> Setting:
     """Stand all blocks where a further one would come into being; the robot stays where it is."""
     place = _newcomer(world)
     if place is None:
@@ -267,7 +265,7 @@ def all_on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
     return stacked(world, rng, *place), present_tips(world)
 
 
-def on_coming_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
+def on_coming_obstacle(world: Any, rng: Any) -> Setting:
     """Set the next obstacle into the middle, and press on blocks above it."""
     places, here = np.array(world[PLACES]), len(world.composition.obstacles)
     edge = numbers.OBSTACLE_SIZE[2]
@@ -277,7 +275,7 @@ def on_coming_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
     return {PLACES: places, **states}, drive
 
 
-def obstacle_ahead(world: Any, rng: ProbeGenerator) -> Setting:
+def obstacle_ahead(world: Any, rng: Any) -> Setting:
     """Set obstacles, should there be any, to where the fingers are about to go."""
     tips = present_tips(world).reshape(3, 3)
     places = np.array(world[PLACES])
@@ -305,7 +303,7 @@ def _newcomer(world: Any) -> tuple[Floats, float] | None:
 
 # --- which there are ----------------------------------------------------------------------------
 
-Kind = tuple[Callable[[Any, ProbeGenerator], Setting], int | None]
+Kind = tuple[Callable[[Any, Any], Setting], int | None]
 """How a state is prepared, and how many control steps are then taken; see ``Scenario``."""
 
 _WITHOUT_BLOCKS: tuple[Kind, ...] = (
@@ -347,10 +345,10 @@ def scenarios(world: Any) -> tuple[Scenario, ...]:
         found = (*found, (obstacle_ahead, 0))
     if world.compiled.bundles and not made.blocks:  # else they act through blocks, too
         found = (*found, (fingers_together, None))
-    return tuple(Scenario(prepare.__name__, prepare, driven, steps) for prepare, steps in found)
+    return tuple((prepare, driven, steps) for prepare, steps in found)
 
 
-def driven(world: Any, drive: Floats, rng: ProbeGenerator) -> Floats:
+def driven(world: Any, drive: Floats, rng: Any) -> Floats:
     """Turn fingertip positions into an action of the world's mode, with a little variety."""
     if world.action_mode == "end_effector_positions":
         return np.asarray(drive + rng.uniform(-0.005, 0.005, 9))

@@ -191,9 +191,9 @@ class BlockWorld(Composition):
         bodies = self.touched()
         return {name: body for name, (body, _) in self.parameters().items() if body in bodies}
 
-    def goals(self, values: Values) -> tuple[GoalRegion, ...]:
-        """Describe all goals."""
-        return tuple(
+    def looks(self, values: Values) -> tuple[tuple[GoalRegion, ...], Light]:
+        """Describe all goals, and the light of pictures."""
+        goals = (
             GoalRegion(
                 name=entity.name,
                 shape=entity.shape if entity.hull is None else "hull",
@@ -206,10 +206,7 @@ class BlockWorld(Composition):
             for entity in self.entities
             if entity.kind == "goal"
         )
-
-    def light(self, values: Values) -> Light:
-        """Describe the light of pictures."""
-        return light_of(values)
+        return tuple(goals), light_of(values)
 
     def cameras(self, values: Values) -> tuple[Camera, ...]:
         """Describe the three cameras of the robot."""
