@@ -19,10 +19,9 @@ from scm_world.tasks import Picking
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping import Feedback
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, body_of
-from scm_world.tasks.trifinger.grasping.choice import Choice
+from scm_world.tasks.trifinger.grasping.choice import Choice, gripped
 from scm_world.tasks.trifinger.grasping.feedback import TOUCHING, held
 from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, poses, torques
-from scm_world.tasks.trifinger.grasping.ways import gripped
 from scm_world.training.imitation import lesson
 
 MODE = "end_effector_positions"

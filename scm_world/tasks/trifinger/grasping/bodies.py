@@ -107,26 +107,9 @@ def body_of(name: str, values: Mapping[str, Value]) -> Cuboid:
     return Cuboid(name, half, place, yaw, np.array(lean))
 
 
-def instant(world: Any) -> tuple[int, int, int]:
-    """Return which episode it is, as seed and number, and which of its control steps."""
-    return world.noise.seed, world.episode, world.index
-
-
 @final
 class Sight:
     """The present of a world with blocks that have goals, read once per control step.
-
-    Attributes:
-        joints: Joint positions of the robot, shape (9,) [rad].
-        before: Those that were commanded last; where there are none, the present ones.
-        tips: The fingertips, shape (3, 3) [m].
-        left: How many control steps the episode still has.
-        height: Height of the robot [m].
-        weights: Forces that carry the fingers themselves, shape (3, 3, 3) [N]; see ``torques``.
-        aside: Where unused fingertips are, shape (3, 3) [m].
-        walls: Names of what stands in the way and is not moved.
-        solid: Those of everything that fingers could run into.
-        pairs: Blocks, each with its goal.
 
     Raises:
         ActionError: The task of the world has no blocks with goals.
@@ -139,33 +122,35 @@ class Sight:
     def look(self, world: Any) -> None:
         """Read how things are now."""
         values: Mapping[str, Value] = world.evaluate(())
-        self._values, self.joints = values, np.array(values["joint_positions"])
-        self.left = world.max_episode_length - world.index
+        self._values = values
+        self.left = world.max_episode_length - world.index  # control steps of the episode
+        self.joints = np.array(values["joint_positions"])  # (9,) [rad]
         if self._version != world.version:  # all else moves only when someone intervenes
             self._intervened(world, values)
-        self.tips, self.before = self.tips_at(self.joints), self.joints
+        self.tips = self.tips_at(self.joints)
+        self.before = self.joints  # what was commanded last, if anything
         if world.index > 0:
             last = np.array(world.evaluate(("action",))["action"])
             self.before = self.solve(last) if "effector" in world.action_mode else last
 
     def _intervened(self, world: Any, values: Mapping[str, Any]) -> None:
         self._version, task = world.version, world.compiled.task
-        self.height = float(values["robot_height"])
+        self.height = float(values["robot_height"])  # [m]
         self._gains = np.tile(np.maximum(values["position_gains"], LEAST_GAIN), N_FINGERS)
         self._limit = STRENGTH * float(values["torque_limit"])
-        self.weights = np.zeros((N_FINGERS, 3, 3))
+        self.weights = np.zeros((N_FINGERS, 3, 3))  # [N] that carry the fingers; see ``torques``
         for finger, name in enumerate(hardware.FINGERS):
             links = [values[f"{hardware.link_name(name, link)}.mass"] for link in (2, 3)]
             masses = np.array([*links, hardware.TIP_MASS], dtype=np.float64)
             self.weights[finger, :, 2] = -float(values["gravity"][2]) * masses
-        self.aside = self.tips_at(np.array(hardware.ASIDE))
-        self.walls = world.composition.obstacles
-        self.solid = (*world.composition.blocks, *self.walls)
-        self.pairs = tuple(
+        self.aside = self.tips_at(np.array(hardware.ASIDE))  # where unused fingertips are
+        self.walls = world.composition.obstacles  # names of what is in the way and is not moved
+        self.solid = (*world.composition.blocks, *self.walls)  # of all that fingers could run into
+        self.pairs = [  # blocks, each with its goal
             (tool, goal)
             for goal, tool in task.goal.targets.items()
             if tool in self.solid and f"{goal}.size" in values
-        )
+        ]
         if not self.pairs:
             problem = f"a grasp needs blocks that have goals; {task.name!r} has none"
             raise ActionError(problem, None)

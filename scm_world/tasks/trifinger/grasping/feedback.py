@@ -12,18 +12,18 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import ActionError
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, instant, turn_about_z
-from scm_world.tasks.trifinger.grasping.choice import Choice
-from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS
-from scm_world.tasks.trifinger.grasping.ways import (
+from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, turn_about_z
+from scm_world.tasks.trifinger.grasping.choice import (
     CLEARANCE,
     EDGE,
     OPENINGS,
     SAMPLES,
+    Choice,
     Grip,
     Move,
     passing,
 )
+from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS
 
 FREE = np.zeros((3, 3))
 TRAVEL, CLOSE = 0.022, 0.006  # [m] per control step, of fingertips far from a block, and beside it
@@ -66,7 +66,10 @@ class Feedback:
 
     What it does follows from where things are and from its last command, not from the time. So a
     network can imitate it, and it goes on from wherever somebody else has led. It remembers which
-    block it takes, by which grip, and where to.
+    block it takes, by which grip, and where to; all else is read in each step: fingertips go above
+    the grip, down, towards the faces, and press; then the block goes towards its goal, higher than
+    that as long as it is away from it. A command is the command before, corrected by a share of the
+    error: so forces need not be known exactly.
 
     One instance serves any number of episodes and of worlds.
 
@@ -78,7 +81,7 @@ class Feedback:
     """
 
     def __init__(self) -> None:
-        self._programs: WeakKeyDictionary[Any, Program] = WeakKeyDictionary()
+        self._programs: WeakKeyDictionary[Any, tuple[Any, Program]] = WeakKeyDictionary()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle without what is going on."""
@@ -93,9 +96,11 @@ class Feedback:
         if world.action_mode == "joint_torques":
             problem = "a grasp needs joint or fingertip positions as actions, not torques"
             raise ActionError(problem, world.action_mode)
-        program = self._programs.get(world)
-        if program is None or program.next != instant(world):
-            program = self._programs[world] = Program(world)
+        episode, index = (world.noise.seed, world.episode), world.index
+        expected, program = self._programs.get(world, (None, None))
+        if program is None or expected != (episode, index):
+            program = Program(world)
+        self._programs[world] = (episode, index + 1), program
         command = program.command(world)
         tips = "effector" in world.action_mode
         return program.sight.tips_at(command).ravel() if tips else command
@@ -109,7 +114,7 @@ class Feedback:
             Shape (n + 5,) where there are n blocks with goals: which of them it takes, which
             fingers take part, whether they let go, and whether they go back since they were stuck.
         """
-        program = self._programs[world]
+        _, program = self._programs[world]
         move, pairs = program.move, program.sight.pairs
         used = move.grip.used if move is not None else (False,) * 3
         taken = [move is not None and tool == move.end.name for tool, _ in pairs]
@@ -118,33 +123,19 @@ class Feedback:
 
 @final
 class Program:
-    """The policy in one episode.
-
-    The only memory is the job: which block is taken, by which grip, and where to. All else is read
-    from the world in each step: fingertips go above the grip, down, towards the faces, and press;
-    then the block goes towards its goal, higher than that as long as it is away from it. The last
-    block is not let go of. A command is the command before, corrected by a share of the error: so
-    forces need not be known exactly.
-
-    Attributes:
-        sight: The present of the world.
-        move: The job.
-        opens: Whether fingers let go.
-        back: For how many control steps they still go back since they were stuck.
-        next: The instant whose command comes next.
-    """
+    """The policy in one episode, and its memory: the job."""
 
     def __init__(self, world: Any) -> None:
-        self.sight, self.next = Sight(world), instant(world)
+        self.sight = Sight(world)
         self.move: Move | None = None
-        self.opens, self.back = False, 0
+        self.opens = False  # whether fingers let go
+        self.back = 0  # control steps for which they still go back since they were stuck
         self._goals: Any = None  # for which the job was chosen
         self._idle = self._waiting = 0
 
     def command(self, world: Any) -> Floats:
         """Compute the joint positions to command now, shape (9,) [rad]."""
-        sight, (seed, episode, index) = self.sight, self.next
-        self.next = seed, episode, index + 1
+        sight = self.sight
         sight.look(world)
         move, tips = self._planned(), sight.tips
         if self.back > 0:

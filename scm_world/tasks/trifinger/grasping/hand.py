@@ -76,12 +76,9 @@ def deepest_kernel(
 
 @njit(cache=True)
 def torques(joints: Floats, height: float, forces: Floats) -> Floats:
-    """Compute the torques with which fingers exert forces, shape (n, 9) [N m].
+    """Compute the torques with which fingers exert forces at joints (n, 9) [rad], alike [N m].
 
-    Args:
-        joints: Shape (n, 9) [rad].
-        height: Of the robot [m].
-        forces: Of middle link, lower link and tip of each finger, shape (n, 3, 3, 3) [N].
+    The forces are those of middle link, lower link and tip of each finger, shape (n, 3, 3, 3) [N].
     """
     out = np.empty(joints.shape)
     for row in range(len(joints)):
@@ -104,19 +101,10 @@ def torques(joints: Floats, height: float, forces: Floats) -> Floats:
 def poses(
     tips: Floats, near: Floats, height: float, halves: Floats, centers: Floats, turns: Floats
 ) -> tuple[Floats, NDArray[np.bool_], Floats]:
-    """Find joints for fingertips, and how deep fingers then lie in one another and in boxes.
+    """Find joints for fingertips [m], near others, all of shape (n, 9) [rad].
 
-    Args:
-        tips: Shape (n, 9) [m].
-        near: Joint positions to stay close to, shape (n, 9) [rad].
-        height: Of the robot [m].
-        halves: Of the boxes, as ``deepest_kernel`` takes it; so too what follows.
-        centers: Shape (m, 3) [m].
-        turns: Shape (m, 3, 3).
-
-    Returns:
-        Joints, shape (n, 9) [rad]; whether all fingertips are reached, shape (n,); and the
-        depths, shape (n,) [m].
+    Also return whether all fingertips are reached, and how deep legs lie in boxes or in one another
+    [m], shape (n,); see ``deepest_kernel``.
     """
     joints, reached = np.empty(tips.shape), np.empty(len(tips), dtype=np.bool_)
     depths = np.empty(len(tips))
