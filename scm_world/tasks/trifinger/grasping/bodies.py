@@ -94,7 +94,7 @@ class Cuboid:
             for body in (self, goal)
             for part in (2.0 * body.half, body.place, from_rotation_vector([0.0, 0.0, body.yaw]))
         )
-        return float(kernels.filled(*poses))
+        return float(kernels.filled(*poses, tools=1.0))
 
 
 def body_of(name: str, values: Mapping[str, Value]) -> Cuboid:
