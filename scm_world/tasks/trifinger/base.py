@@ -62,7 +62,7 @@ HEAD = (
 )
 """The first rows of every observation."""
 
-_ROWS: Mapping[str, Any] = {
+ROWS: Mapping[str, Any] = {
     "size": ((0.03, 0.1), 0.0, 0.6),
     "cartesian_position": (((-0.5, -0.5, 0.0), (0.5, 0.5, 0.5)), -1.0, 1.0),
     "orientation": ((-10.0, 10.0), -1.0, 1.0),
@@ -76,12 +76,7 @@ def observe(name: str, kind: int, *parts: str) -> Iterable[Observed]:
     """List the published type of a body, its size and pose, and further quantities of it."""
     yield Observed(f"{name}.type", (kind, kind), low=0.0, high=30.0)
     for part in ("size", "cartesian_position", "orientation", *parts):
-        yield Observed(f"{name}.{part}", *_ROWS[part])
-
-
-def observe_position(name: str) -> Observed:
-    """Return the three numbers of a goal that is a point."""
-    return Observed(f"{name}.cartesian_position", *_ROWS["cartesian_position"])
+        yield Observed(f"{name}.{part}", *ROWS[part])
 
 
 REWARD = "reward"

@@ -76,14 +76,7 @@ class Piece:
 def bodies(
     piece: Piece, name: str, which: tuple[tuple[str, float], ...], airborne: bool
 ) -> tuple[Entity, Entity]:
-    """Describe a block of a building, and its place.
-
-    Args:
-        piece: Where they come from.
-        name: Their name, without ``tool_`` and ``goal_``.
-        which: The constants that say which one it is.
-        airborne: Whether blocks may begin in the air, as in the predecessor.
-    """
+    """Describe a part of a building, of which ``which`` are the constants: block and place."""
 
     def taken(causes: Causes | None) -> dict[str, Any]:
         if causes is None or isinstance(causes, str):
@@ -95,7 +88,7 @@ def bodies(
 
     mine, its = f"tool_{name}", f"goal_{name}"
     sizes = [
-        numbers.PART_SIZES.derived(f"{solid}.size", piece.size, **taken(piece.size))
+        numbers.PART_SIZES.derived(f"{solid}.size", piece.size, constants=taken(piece.size))
         for solid in (mine, its)
     ]
     start, *start_from = piece.start
@@ -109,8 +102,8 @@ def bodies(
         spaces=numbers.places(numbers.half_height(f"{mine}.size"), airborne=airborne),
     )
     pose = (
-        position(its, piece.place, **taken(piece.place)),
-        orientation(its, piece.turn, **taken(piece.turn)),
+        position(its, piece.place, taken(piece.place)),
+        orientation(its, piece.turn, taken(piece.turn)),
     )
     return block, body("goal", its, sizes[1], *pose, yaw=False)
 

@@ -56,11 +56,11 @@ class Range:
         return Exogenous(default=default, **fields)
 
     def derived(
-        self, name: str, causes: Causes, doc: str = "", *, inverse: Any = None, **constants: Any
+        self, name: str, causes: Causes, doc: str = "", constants: Any = None, inverse: Any = None
     ) -> Variable:
         """Declare a copy of a variable, or a function of variables and of constants."""
         function, *parents = (same, causes) if isinstance(causes, str) else causes
-        mechanism = Function(function, constants=constants)
+        mechanism = Function(function, constants=constants or {})
         fields = {**vars(self), "name": name, "doc": doc or self.doc, "inverse": inverse}
         return Derived(parents=tuple(parents), mechanism=mechanism, **fields)
 
@@ -112,10 +112,6 @@ def places(low: Bound, *, airborne: bool) -> tuple[Box, Box]:
     tops = (HEIGHT_A, HEIGHT_B) if airborne else (low, low)
     return cylindrical(RADIUS_A, low, tops[0]), cylindrical(RADIUS_B, low, tops[1])
 
-
-# --- goal families whose blocks follow from a few numbers -----------------------------------------
-BLOCKS_MASS = 0.08  # [kg]
-DROP_REGION = ((-0.11, -0.11, 0.0), (0.11, 0.11, 0.22))  # [m]
 
 # --- kinds of variables: bounds, A, B; those of what the predecessor hides are ours ---------------
 RESTITUTION = Range(Box(0.0, 0.8), Box(0.0, 0.3), Box(0.3, 0.6))
@@ -216,17 +212,11 @@ PART_SIZES = Range(Box(0.005, 0.3), unit="m", shape=(3,), doc="Full edge lengths
 OBSTACLE_SIZES = Range(Box(0.005, 0.6), unit="m", shape=(3,), doc="Full edge lengths.")
 
 # --- defaults ------------------------------------------------------------------------------
-GRAVITY = (0.0, 0.0, -9.81)  # [m/s²]
 SURFACE_FRICTION = 0.5
-BLOCK_FRICTION = 1.0
 BLOCK_MASS = 0.02  # [kg]
+BLOCKS_MASS = 0.08  # [kg] in families whose blocks follow from a few numbers
 BLOCK_SIZE = (0.065, 0.065, 0.065)  # [m]
-FLOOR_COLOR = (0.31, 0.27, 0.25)
-STAGE_COLOR = (0.95, 0.95, 0.95)
-BLOCK_COLOR = (1.0, 0.0, 0.0)
 GOAL_COLOR = (0.0, 1.0, 0.0)
 OBSTACLE_SIZE = (0.01, 0.01, 0.01)  # [m]
-FINGER_FRICTION = 0.5
-SPINNING_FRICTION = 0.001
 ZERO = (0.0, 0.0, 0.0)
 IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion (x, y, z, w)

@@ -38,6 +38,7 @@ DROPS = (
     (0.09, -0.08, 0.1),
 )
 """Where blocks are let go by default, in turn [m]."""
+REGION = ((-0.11, -0.11, 0.0), (0.11, 0.11, 0.22))  # [m] where they are let go in A and B
 
 STARTS = ((1, -1), (-1, 1), (0, -1), (1, 0), (-1, 0), (0, 1), (-1, -1), (1, 1), (0, 0))
 """Where blocks begin, in steps along x and y: first where the default drops are not."""
@@ -202,8 +203,7 @@ class General(Building):
     ) -> None:
         super().__init__(**common)
         region, anywhere = (
-            Box(*(tuple(end) * MOST for end in ends))
-            for ends in (numbers.DROP_REGION, numbers.POSITION_ENDS)
+            Box(*(end * MOST for end in ends)) for ends in (REGION, numbers.POSITION_ENDS)
         )
         bounds, turns = Box(-2.0 * math.pi, 2.0 * math.pi), Box(0.0, 2.0 * math.pi)
         self.roots = (

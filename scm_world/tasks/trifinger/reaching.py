@@ -16,7 +16,7 @@ from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, weighted
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware, kernels, shaping
-from scm_world.tasks.trifinger.base import TriFingerTask, observe, observe_position
+from scm_world.tasks.trifinger.base import ROWS, TriFingerTask, observe
 from scm_world.tasks.trifinger.entities.bodies import (
     COUNT,
     body,
@@ -153,7 +153,7 @@ class Reaching(TriFingerTask):
 
     def observed(self) -> Iterable[Observed]:
         """Observe the three goals and the obstacles."""
-        yield from map(observe_position, GOALS)
+        yield from (Observed(place, *ROWS["cartesian_position"]) for place in PLACES)
         for name in obstacle_names(self.arranged):
             yield from observe(name, 10)
 

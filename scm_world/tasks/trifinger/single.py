@@ -46,10 +46,7 @@ SIZE = "block.size"
 def start_place(option: str, place: Place, below: float) -> tuple[float, float, float]:
     """Read where a block begins: x and y of its center, and the height of its lowest point [m].
 
-    Args:
-        option: Its name, for the error.
-        place: x and y, for a block on the floor, or x, y and z of the center [m].
-        below: How far it reaches below its center [m].
+    It stands on the floor if no z is given, and reaches so far ``below`` its center [m].
 
     Raises:
         UnknownOption: These are not two or three numbers, or it would reach below the floor.
@@ -64,10 +61,7 @@ def start_place(option: str, place: Place, below: float) -> tuple[float, float, 
 def floor_place(option: str, place: Place, height: float) -> tuple[float, float]:
     """Read the place of something on the floor: radius [m] and angle [rad].
 
-    Args:
-        option: Its name, for the error.
-        place: x and y, or x, y and z of the center [m].
-        height: The only z it can have [m].
+    ``height`` is the only z of the center that can be given [m].
 
     Raises:
         UnknownOption: These are not two or three numbers, or it would not stand on the floor.
@@ -145,23 +139,19 @@ class OneBlock(TriFingerTask):
             )
         mass = common.pop("tool_block_mass", numbers.BLOCK_MASS)
         self._mass = checked("tool_block_mass", mass, numbers.BLOCK_MASSES.bounds)
-        self._turns = {
-            name: self._turn(option, common.pop(option, numbers.IDENTITY))
-            for name, option in ((name, f"{name}_orientation") for name in (TOOL, GOAL))
-        }
+        self._turns = dict[str, Quaternion]()
+        for name in (TOOL, GOAL):
+            option = f"{name}_orientation"
+            turn = unit_quaternion(option, common.pop(option, numbers.IDENTITY))
+            if self.shape is not None:  # it is turned from the way its points were given
+                x, y, z, w = canonical(quaternion_product(turn, self.shape.axes)).tolist()
+                turn = x, y, z, w
+            self._turns[name] = turn
         self.place = start_place("tool_block_position", tool_block_position, self.below(TOOL))
         super().__init__(**common)
         if self.shape is not None:  # it turns about the vertical only
             turns = {f"{GOAL}.euler_orientation": f"{GOAL}.yaw"}
             self.goal_causes = tuple(turns.get(name, name) for name in self.goal_causes)
-
-    def _turn(self, option: str, given: Any) -> Quaternion:
-        """Read how a body begins turned; a hull is turned from the way its points were given."""
-        turn = unit_quaternion(option, given)
-        if self.shape is None:
-            return turn
-        x, y, z, w = canonical(quaternion_product(turn, self.shape.axes)).tolist()
-        return x, y, z, w
 
     def below(self, name: str) -> float:
         """Compute how far block or goal reaches below its center as it begins [m]."""
@@ -191,22 +181,20 @@ class OneBlock(TriFingerTask):
         self,
         *causes: str,
         spaces: tuple[Box, Box] | None = None,
-        start: Callable[..., Floats] = stand,
-        **constants: Any,
+        start: Function | None = None,
     ) -> Entity:
         """Describe the block.
 
         Args:
             causes: Further causes of the place at the start, besides size, orientation and shape.
             spaces: A and B of its cylindrical position; those on the floor if None.
-            start: Function of the causes: where it begins.
-            constants: Constants of this function; ``place`` if there are none.
+            start: Where it begins; it stands at ``place`` if None.
         """
         return tool(
             TOOL,
             self._size(TOOL),
             numbers.BLOCK_MASSES.root(f"{TOOL}.mass", self._mass),
-            start=Function(start, constants=constants or {"place": self.place}),
+            start=start or Function(stand, constants={"place": self.place}),
             start_from=(*(() if self.shape is None else (f"{TOOL}.vertices",)), *causes),
             turn=self._turns[TOOL],
             hull=self.shape,
@@ -232,7 +220,7 @@ class OneBlock(TriFingerTask):
             circle = Box(-np.pi, np.pi)
             doc = "How far it is turned about the vertical from the way it rests."
             yaw = numbers.Range(circle, circle, circle, "rad").root(f"{GOAL}.yaw", 0.0, doc)
-            pose = (*place, yaw, orientation(GOAL, (about_z, yaw.name), rest=rest))
+            pose = (*place, yaw, orientation(GOAL, (about_z, yaw.name), {"rest": rest}))
         spaces = spaces or numbers.places(self.level(GOAL), airborne=False)
         how: dict[str, Any] = {"spaces": spaces, "yaw": box, "inverse": inverse}
         return body("goal", GOAL, self._size(GOAL), *pose, hull=self.shape, **how)
@@ -363,14 +351,14 @@ class Picking(OneBlock):
     def entities(self) -> Iterable[Entity]:
         """A block and its goal."""
         published, (x, y, z) = self.conventions.published_spaces, self.place
-        put_there: dict[str, Any] = {"start": put, "center": (x, y, z + self.below(TOOL))}
+        start = Function(put, constants={"center": (x, y, z + self.below(TOOL))})
         yield self.tool_block(
             spaces=numbers.places(self.level(TOOL), airborne=published),
-            **(put_there if published else {}),
+            start=start if published else None,
         )
         yield self.goal_block(
             self._height,
-            position(GOAL, (lifted, HEIGHT), place=(x, y)),
+            position(GOAL, (lifted, HEIGHT), {"place": (x, y)}),
             spaces=self._above(),
             inverse=above_the_center if published else from_cylindrical,
         )
@@ -481,9 +469,8 @@ class PickAndPlace(OneBlock):
 
     def entities(self) -> Iterable[Entity]:
         """A block, its goal and the wall between them."""
-        yield self.tool_block(
-            SIDE, spaces=self._sector(TOOL, sign=-1.0), start=stand_across, place=self.place
-        )
+        start = Function(stand_across, constants={"place": self.place})
+        yield self.tool_block(SIDE, spaces=self._sector(TOOL, sign=-1.0), start=start)
         a, b = (Box((near, ANGLES[0]), (far, ANGLES[1])) for near, far in (RADIUS_A, RADIUS_B))
         yield self.goal_block(
             replace(numbers.POLAR, a=a, b=b).root(f"{GOAL}.polar", self._polar),

@@ -187,7 +187,7 @@ class Stacking2(TriFingerTask):
                 "goal",
                 name,
                 sizes.derived(f"{name}.size", SIZE),
-                position(name, (floor_of_tower, center, SIZE, turned), side=side),
+                position(name, (floor_of_tower, center, SIZE, turned), {"side": side}),
                 orientation(name, turned),
                 yaw=False,
             )

@@ -110,19 +110,27 @@ def block_size(
 
 
 def position(
-    name: str, causes: Causes | None = None, *, default: Any = ZERO, **constants: Any
+    name: str, causes: Causes | None = None, constants: Any = None, *, default: Any = ZERO
 ) -> Variable:
     """Declare the center of a goal or obstacle [m]: a root, or what follows from causes."""
     kind, name = numbers.POSITIONS, f"{name}.cartesian_position"
-    return kind.root(name, default) if causes is None else kind.derived(name, causes, **constants)
+    return (
+        kind.root(name, default)
+        if causes is None
+        else kind.derived(name, causes, constants=constants)
+    )
 
 
 def orientation(
-    name: str, causes: Causes | None = None, *, default: Any = IDENTITY, **constants: Any
+    name: str, causes: Causes | None = None, constants: Any = None, *, default: Any = IDENTITY
 ) -> Variable:
     """Declare the quaternion of a goal or obstacle: a root, or what follows from causes."""
     kind, name = numbers.ORIENTATIONS, f"{name}.orientation"
-    return kind.root(name, default) if causes is None else kind.derived(name, causes, **constants)
+    return (
+        kind.root(name, default)
+        if causes is None
+        else kind.derived(name, causes, constants=constants)
+    )
 
 
 def coordinates(
@@ -154,7 +162,7 @@ def coordinates(
 
 
 KINDS = {
-    "block": ((1, 2), numbers.BLOCK_COLOR),
+    "block": ((1, 2), (1.0, 0.0, 0.0)),
     "obstacle": ((10, 10), ZERO),
     "goal": ((20, 23), numbers.GOAL_COLOR),
     "sphere": ((21, 21), numbers.GOAL_COLOR),
@@ -230,7 +238,7 @@ def tool(
         how: Arguments of ``coordinates``.
     """
     restart = (*start_from, size.name) if start_again else start_from
-    friction = numbers.BLOCK_FRICTIONS.root(f"{name}.friction", numbers.BLOCK_FRICTION)
+    friction = numbers.BLOCK_FRICTIONS.root(f"{name}.friction", 1.0)
     place = numbers.POSITIONS.state(
         f"{name}.cartesian_position",
         ZERO,
@@ -304,4 +312,4 @@ def scattered(count: int) -> Iterable[Entity]:
     """List the scattered boxes that there are."""
     for index, name in enumerate(obstacle_names(count)):
         size = numbers.OBSTACLE_SIZES.root(f"{name}.size", numbers.OBSTACLE_SIZE)
-        yield obstacle(name, size, position(name, (place, PLACES), index=float(index)))
+        yield obstacle(name, size, position(name, (place, PLACES), {"index": float(index)}))

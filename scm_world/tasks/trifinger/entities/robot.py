@@ -42,7 +42,7 @@ _SPEC = ControllerSpec()
 HIDDEN = (
     numbers.FRICTION.root(
         "finger_friction",
-        numbers.FINGER_FRICTION,
+        numbers.SURFACE_FRICTION,
         "Friction of all links; a contact has the product of two frictions.",
     ),
     numbers.JOINT_DAMPING.root("joint_damping", 0.0, "Passive damping of every joint."),

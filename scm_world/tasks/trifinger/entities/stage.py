@@ -11,7 +11,7 @@ from scm_world.models.camera import Camera
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.cameras import CAMERAS, published_poses
-from scm_world.tasks.trifinger.hardware import PRESET_NAMES
+from scm_world.tasks.trifinger.hardware import PRESET_NAMES, SPINNING_FRICTION
 from scm_world.variables import Box, Variable
 from scm_world.variables.reserved import PRESET, SENSOR_NOISE
 
@@ -28,11 +28,11 @@ def stage(preset: str) -> Entity:
     )
     variables = (
         numbers.GRAVITIES.root(
-            "gravity", numbers.GRAVITY, "Acceleration of free fall; it pulls the fingers too."
+            "gravity", (0.0, 0.0, -9.81), "Acceleration of free fall; it pulls the fingers too."
         ),
         *frictions,
-        numbers.COLOR.root("floor_color", numbers.FLOOR_COLOR),
-        numbers.COLOR.root("stage_color", numbers.STAGE_COLOR),
+        numbers.COLOR.root("floor_color", (0.31, 0.27, 0.25)),
+        numbers.COLOR.root("stage_color", (0.95, 0.95, 0.95)),
         numbers.RESTITUTION.root(
             "restitution",
             0.0,
@@ -40,7 +40,7 @@ def stage(preset: str) -> Entity:
         ),
         numbers.SPINNING.root(
             "spinning_friction",
-            numbers.SPINNING_FRICTION,
+            SPINNING_FRICTION,
             "Friction of every contact against turning about its normal.",
         ),
         numbers.PRESETS.root(
