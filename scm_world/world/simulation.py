@@ -545,10 +545,13 @@ class Simulation(WorldAttributes):
             raise
 
     def _inertia(self, change: Difference) -> Parameters:
-        if change.structure is not None or not self.composition.movers():
-            return {}
         bodies = {body for body, what in change.parameters if what in ("mass", "size")}
-        bodies -= {*self.composition.bodies}.difference(self.composition.movers())
+        if change.structure is not None or not bodies:
+            return {}
+        movers = self.composition.movers()
+        if not movers:
+            return {}
+        bodies -= {*self.composition.bodies}.difference(movers)
         return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
     def _applied(self, change: Difference) -> Parameters:
