@@ -15,6 +15,7 @@ from typing import Any, final
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._types import Floats
 
@@ -105,117 +106,100 @@ class EngineBody:
         return len(self.rows) - 1
 
 
-@final
-class Built:
-    """Everything that a compiled model has in the engine.
+def renewed(
+    engine: Any, before: list[EngineBody], mj: mujoco.MjModel, touching: list[int]
+) -> list[EngineBody]:
+    """Make what is missing, remove what is not needed, and return all units.
+
+    Everything stays in one order: what comes after something new is new, too.
 
     Args:
         engine: The functions of a physics client.
-
-    Attributes:
-        bodies: The link that carries the mass of each body that can move, by its number.
-        joints: The link of each joint, by its number; the base of a free body.
-        geoms: The link of each shape that can touch something, by its number.
+        before: The units in it.
+        mj: With the parameters in force.
+        touching: The shapes that can touch something.
     """
+    data, kept = mujoco.MjData(mj), 0
+    mujoco.mj_kinematics(mj, data)
+    units = list(_units(mj, touching))
+    paired = {*mj.pair_geom1.tolist(), *mj.pair_geom2.tolist()}
+    for unit in units:
+        _describe(unit, mj, data, paired)
+    for old, new in zip(before, units, strict=False):
+        if old != new:
+            break
+        new.multibody, kept = old.multibody, kept + 1
+    for unit in reversed(before[kept:]):
+        engine.removeBody(unit.multibody)
+    for unit in units[kept:]:
+        _create(engine, unit, custom(mj, "bullet_damping", -1 in unit.links[1]))
+    return units
 
-    def __init__(self, engine: Any) -> None:
-        self._engine = engine
-        self._units: list[EngineBody] = []
-        self.bodies: dict[int, Handle] = {}
-        self.joints: dict[int, Handle] = {}
-        self.geoms: dict[int, Handle] = {}
 
-    def make(self, mj: mujoco.MjModel, touching: list[int]) -> set[int]:
-        """Make what is missing. Everything stays in one order: what comes later is new, too.
-
-        Args:
-            mj: With the parameters in force.
-            touching: The shapes that can touch something.
-
-        Returns:
-            The multibodies that are gone.
-        """
-        data, engine, kept = mujoco.MjData(mj), self._engine, 0
-        mujoco.mj_kinematics(mj, data)
-        units = list(_units(mj, touching))
-        paired = {*mj.pair_geom1.tolist(), *mj.pair_geom2.tolist()}
-        for unit in units:
-            _describe(unit, mj, data, paired)
-        for old, new in zip(self._units, units, strict=False):
-            if old != new:
-                break
-            new.multibody, kept = old.multibody, kept + 1
-        gone = [unit.multibody for unit in self._units[kept:]]
-        for multibody in reversed(gone):
-            engine.removeBody(multibody)
-        self._units = units[:kept]
-        for unit in units[kept:]:
-            self._create(unit, custom(mj, "bullet_damping", -1 in unit.links[1]))
-            self._units.append(unit)
-        numbers = [(unit, (unit.bodies, unit.joints, unit.geoms)) for unit in units]
-        self.bodies, self.joints, self.geoms = (
-            {
-                number: (unit.multibody, link)
-                for unit, own in numbers
-                for number, link in zip(own[kind], unit.links[kind], strict=True)
-            }
-            for kind in range(3)
+def handles(units: list[EngineBody], kind: int) -> dict[int, Handle]:
+    """Map bodies (kind 0), joints (1) or shapes (2) to their links."""
+    return {
+        number: (unit.multibody, link)
+        for unit in units
+        for number, link in zip(
+            (unit.bodies, unit.joints, unit.geoms)[kind], unit.links[kind], strict=True
         )
-        return set(gone)
+    }
 
-    def _create(self, unit: EngineBody, damping: float) -> None:
-        """Make a unit, without what the engine does by itself: motors, sleep, a highest speed."""
-        engine, base, rows = self._engine, dict(unit.base), [list(row) for row in unit.rows]
-        for (shape, _), link in zip(unit.shapes, unit.links[2], strict=True):
-            kind = getattr(engine, shape["shapeType"])
-            number = engine.createCollisionShape(**{**shape, "shapeType": kind})
-            if link < 0:
-                base["baseCollisionShapeIndex"] = number
-            else:
-                rows[link][1] = number
-        for row in rows:
-            row[8] = getattr(engine, row[8])
-        # Pairs of shapes alone decide what touches, also within the multibody.
-        flags = engine.URDF_USE_SELF_COLLISION | engine.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
-        columns = dict(zip(LINK, map(list, zip(*rows, strict=True)), strict=bool(rows)))
-        made = engine.createMultiBody(flags=flags if unit.bodies else 0, **base, **columns)
-        unit.multibody = made
-        if unit.bodies:
-            # One property a call: beside damping or maxJointVelocity, others land on the base.
-            awake = engine.ACTIVATION_STATE_DISABLE_SLEEPING
-            engine.changeDynamics(made, -1, linearDamping=damping)
-            engine.changeDynamics(made, -1, angularDamping=damping)
-            engine.changeDynamics(made, -1, maxJointVelocity=FASTEST)
-            engine.changeDynamics(made, -1, activationState=awake)
-        for link in unit.links[1]:
-            if link < 0:
-                continue
-            if unit.rows[link][8] == "JOINT_SPHERICAL":
-                engine.setJointMotorControlMultiDof(
-                    made,
-                    link,
-                    engine.POSITION_CONTROL,
-                    targetPosition=[0.0, 0.0, 0.0, 1.0],
-                    positionGain=0.0,
-                    velocityGain=0.0,
-                    force=[0.0, 0.0, 0.0],
-                )
-            else:
-                engine.setJointMotorControl2(made, link, engine.VELOCITY_CONTROL, force=0.0)
-        zero = [0.0, 0.0, 0.0]
-        for first, other, offset, ratio in unit.gears:
-            ends, axis = (made, first, made, other), [1.0, 0.0, 0.0]
-            gear = engine.createConstraint(*ends, engine.JOINT_GEAR, axis, zero, zero)
-            engine.changeConstraint(
-                gear,
-                gearRatio=-ratio,
-                relativePositionTarget=offset,
-                erp=GEAR_ERP,
-                maxForce=STRONGEST,
+
+def _create(engine: Any, unit: EngineBody, damping: float) -> None:
+    """Make a unit, without what the engine does by itself: motors, sleep, a highest speed."""
+    base, rows = dict(unit.base), [list(row) for row in unit.rows]
+    for (shape, _), link in zip(unit.shapes, unit.links[2], strict=True):
+        kind = getattr(engine, shape["shapeType"])
+        number = engine.createCollisionShape(**{**shape, "shapeType": kind})
+        if link < 0:
+            base["baseCollisionShapeIndex"] = number
+        else:
+            rows[link][1] = number
+    for row in rows:
+        row[8] = getattr(engine, row[8])
+    # Pairs of shapes alone decide what touches, also within the multibody.
+    flags = engine.URDF_USE_SELF_COLLISION | engine.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
+    columns = dict(zip(LINK, map(list, zip(*rows, strict=True)), strict=bool(rows)))
+    made = engine.createMultiBody(flags=flags if unit.bodies else 0, **base, **columns)
+    unit.multibody = made
+    if unit.bodies:
+        # One property a call: beside damping or maxJointVelocity, others land on the base.
+        awake = engine.ACTIVATION_STATE_DISABLE_SLEEPING
+        engine.changeDynamics(made, -1, linearDamping=damping)
+        engine.changeDynamics(made, -1, angularDamping=damping)
+        engine.changeDynamics(made, -1, maxJointVelocity=FASTEST)
+        engine.changeDynamics(made, -1, activationState=awake)
+    for link in unit.links[1]:
+        if link < 0:
+            continue
+        if unit.rows[link][8] == "JOINT_SPHERICAL":
+            engine.setJointMotorControlMultiDof(
+                made,
+                link,
+                engine.POSITION_CONTROL,
+                targetPosition=[0.0, 0.0, 0.0, 1.0],
+                positionGain=0.0,
+                velocityGain=0.0,
+                force=[0.0, 0.0, 0.0],
             )
-        for (shape, margin), link in zip(unit.shapes, unit.links[2], strict=True):
-            if shape["shapeType"] == "GEOM_MESH":
-                engine.changeDynamics(made, link, collisionMargin=max(HULL_MARGIN, margin))
+        else:
+            engine.setJointMotorControl2(made, link, engine.VELOCITY_CONTROL, force=0.0)
+    zero = [0.0, 0.0, 0.0]
+    for first, other, offset, ratio in unit.gears:
+        ends, axis = (made, first, made, other), [1.0, 0.0, 0.0]
+        gear = engine.createConstraint(*ends, engine.JOINT_GEAR, axis, zero, zero)
+        engine.changeConstraint(
+            gear,
+            gearRatio=-ratio,
+            relativePositionTarget=offset,
+            erp=GEAR_ERP,
+            maxForce=STRONGEST,
+        )
+    for (shape, margin), link in zip(unit.shapes, unit.links[2], strict=True):
+        if shape["shapeType"] == "GEOM_MESH":
+            engine.changeDynamics(made, link, collisionMargin=max(HULL_MARGIN, margin))
 
 
 def _describe(unit: EngineBody, mj: mujoco.MjModel, data: mujoco.MjData, paired: set[int]) -> None:
@@ -271,9 +255,10 @@ def _describe(unit: EngineBody, mj: mujoco.MjModel, data: mujoco.MjData, paired:
     for geom in unit.geoms:
         shape = _shape(mj, geom, origin[int(mj.geom_bodyid[geom])])
         unit.shapes.append((shape, float(mj.geom_margin[geom])))
-    for equality in couplings(mj, unit.joints) if unit.joints else ():
-        ends = hinges[int(mj.eq_obj1id[equality])], hinges[int(mj.eq_obj2id[equality])]
-        unit.gears.append((*ends, *mj.eq_data[equality, :2].tolist()))
+    for equality in np.flatnonzero(coupled(mj)).tolist():
+        if int(mj.eq_obj1id[equality]) in hinges:
+            ends = hinges[int(mj.eq_obj1id[equality])], hinges[int(mj.eq_obj2id[equality])]
+            unit.gears.append((*ends, *mj.eq_data[equality, :2].tolist()))
     unit.rest = (
         *(mj.jnt_limited[unit.joints].tobytes(), mj.numeric_data.tobytes(), mj.opt.disableflags),
         *(geom in paired for geom in unit.geoms),
@@ -376,12 +361,10 @@ def joints_of(mj: mujoco.MjModel, body: int) -> range:
     return range(first, first + int(mj.body_jntnum[body]))
 
 
-def couplings(mj: mujoco.MjModel, joints: Sequence[int]) -> Iterator[int]:
-    """List the equality constraints in force that begin at some joints."""
+def coupled(mj: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Return which equality constraints are in force, shape (neq,)."""
     off = mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    for equality in np.flatnonzero(mj.eq_active0).tolist():
-        if not mj.opt.disableflags & int(off) and int(mj.eq_obj1id[equality]) in joints:
-            yield equality
+    return np.asarray(mj.eq_active0, dtype=np.bool_) & (not mj.opt.disableflags & int(off))
 
 
 def _corners(mj: mujoco.MjModel, geom: int, origin: Floats | None) -> bytes:

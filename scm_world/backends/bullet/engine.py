@@ -54,7 +54,10 @@ class Connection:
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(self._engine, name)
-        return partial(found, physicsClientId=self.handle) if callable(found) else found
+        if callable(found):
+            found = partial(found, physicsClientId=self.handle)
+        setattr(self, name, found)
+        return found
 
 
 def _disconnect(engine: Any, handle: int) -> None:
