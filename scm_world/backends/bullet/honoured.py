@@ -150,26 +150,28 @@ def accepted(structure: Any, given: Parameters, known: Parameters) -> Parameters
     if problems:
         advice = "take it out of the model, or use backend='mujoco'"
         raise ModelError([f"Bullet cannot honour {what}; {advice}" for what in problems])
-    table, found = changes(structure), dict[ParameterKey, Floats]()
-    for key in table.keys() ^ given.keys():
+    rows, honoured = structure.rows, changes(structure)
+    for key in rows.keys() ^ given.keys():
         raise UnknownOption("parameter", ".".join(key), map(".".join, known or given))
+    found = dict[ParameterKey, Floats]()
     for key, value in given.items():
-        found[key] = old = known.get(key, value)
-        if value is not old or not known:
+        old = known.get(key)
+        if old is None or value is not old:
             new = np.array(value, dtype=np.float64)
-            if not known or old.tobytes() != new.tobytes():
-                _check(*table[key], new)
-                found[key] = new
+            if old is None or old.tobytes() != new.tobytes():
+                _check(rows[key], key in honoured, new)
+                old = new
+        found[key] = old
     return found
 
 
-def _check(row: Parameter, change: bool | None, value: Floats) -> None:
+def _check(row: Parameter, honoured: bool, value: Floats) -> None:
     """Refuse a value that the engine cannot honour."""
     if not np.isfinite(value).all():
         raise EngineFailure(f"{row.name} must be finite, got {value.tolist()}", "bullet")
     if row.kind == "rotation" and not value.any():
         raise EngineFailure(f"{row.name} must be a quaternion, got {value.tolist()}", "bullet")
-    if change is None and not np.array_equal(np.broadcast_to(row.default, row.shape), value):
+    if not honoured and not np.array_equal(np.broadcast_to(row.default, row.shape), value):
         raise NotIntervenable(
             row.name,
             f"is no parameter on Bullet: there it keeps its default {row.default}; use "
@@ -247,8 +249,8 @@ def _bytes(mj: mujoco.MjModel, arrays: Mapping[str, Any]) -> NDArray[np.bool_]:
 
 
 @lru_cache(maxsize=64)
-def changes(model: Model) -> Mapping[ParameterKey, tuple[Parameter, bool | None]]:
-    """Map parameters to their rows, and whether a change needs new bodies; None: there is none.
+def changes(model: Model) -> Mapping[ParameterKey, bool]:
+    """Map the parameters that can be set to whether a change of them needs new bodies.
 
     Each is tried on a copy of the compiled model: the engine has a parameter if nothing is written
     but what it honours, or if only pictures have it.
@@ -271,7 +273,7 @@ def changes(model: Model) -> Mapping[ParameterKey, tuple[Parameter, bool | None]
     }
     before, taken, built = _saved(mj), _bytes(mj, live), _bytes(mj, new)
     slots = realized(model).slots(mj, mujoco.MjData(mj))
-    needs: dict[ParameterKey, bool] = {}
+    needs = dict[ParameterKey, bool]()
     for row in realized(model).parameters:
         slot = slots[row.key]
         value = np.array(np.broadcast_to(row.default, row.shape), dtype=np.float64)
@@ -286,17 +288,15 @@ def changes(model: Model) -> Mapping[ParameterKey, tuple[Parameter, bool | None]
             needs[row.key] = bool(built[changed].any())
         slot.write(present)
         follow_up(mj)
-    return {row.key: (row, False if row.visual else needs.get(row.key)) for row in model.parameters}
+    return needs | {row.key: False for row in model.parameters if row.visual}
 
 
 @lru_cache(maxsize=64)
 def rebuilt(model: Model) -> tuple[ParameterKey, ...]:
     """List the parameters that need new bodies."""
-    return tuple(key for key, (_, new) in changes(model).items() if new)
+    return tuple(key for key, new in changes(model).items() if new)
 
 
 def supports(model: Any, key: ParameterKey) -> bool:
-    """Return whether a parameter of a model can be set: the engine has it, or only pictures do."""
-    if not isinstance(model, Model):
-        return False
-    return changes(model).get(key, (None, None))[1] is not None
+    """Return whether a parameter of a model can be set."""
+    return isinstance(model, Model) and key in changes(model)
