@@ -161,7 +161,7 @@ class BulletBackend(Backend):
         Raises:
             UnknownOption: The scene has no such parameter.
         """
-        return self.client().parameters(keys)
+        return self.client().twin.parameters(keys)
 
     def read(self, into: Any = None) -> Any:
         """Write the present state into an existing one, or a new one."""

@@ -20,7 +20,6 @@ from scm_world.backends.bullet.build import (
     FREE,
     EngineBody,
     custom,
-    handles,
     renewed,
     solid,
     takes_armature,
@@ -186,6 +185,7 @@ class Client:
     Attributes:
         engine: Its functions for this client.
         holds: The world that it is in, with the parameters in force.
+        twin: MuJoCo's model.
         bodies: The link that carries the mass of each body that can move, by its number.
         joints: The link of each joint, by its number; the base of a free body.
         geoms: The link of each shape that can touch something, by its number.
@@ -207,44 +207,46 @@ class Client:
     # --- bodies ----------------------------------------------------------------------------------
 
     def replay(self, world: Step | Instant) -> None:
-        """Bring about a world, independently of what was here before."""
-        self.holds = None
-        first, steps = since(world)
-        self._canonicalize(first)
+        """Bring about a world, independently of what was here before.
+
+        Bodies stay where all their shapes stay; all else that depends on the past, the contact
+        caches, is cleared by entering the collision objects again, always in one order.
+        """
+        self.holds, (first, steps) = None, since(world)
+        self._free(self._saved)  # beyond a canonical world they are not exact
+        self._construct(realized(first.structure), first.parameters)
+        self.twin.reset()  # what the last step left there must not matter
+        self.twin.place(first.state)
+        for part in self._parts:
+            part.put(self.twin.data)
+        for place in self.geoms.values():  # pairs decide what touches
+            self.engine.setCollisionFilterGroupMask(*place, 0, 0)
         for one in steps:
             self.edit(one.parameters)
             self.step(one.command, one.substeps)
         self.holds = world
 
-    def _canonicalize(self, instant: Instant) -> None:
-        """Build the one world with these parameters and this state.
-
-        Bodies stay where all their shapes stay; all else that depends on the past, the contact
-        caches, is cleared by entering the collision objects again, always in one order.
-        """
-        self._free(self._saved)  # beyond a canonical world they are not exact
-        self._construct(realized(instant.structure), instant.parameters)
-        self._twin.reset()  # what the last step left there must not matter
-        self._twin.place(instant.state)
-        for part in self._parts:
-            part.put(self._twin.data)
-        for place in self.geoms.values():  # pairs decide what touches
-            self.engine.setCollisionFilterGroupMask(*place, 0, 0)
-
     def _construct(self, model: Model, parameters: Parameters) -> None:
         """Make what differs from what is there, and what live bodies cannot take on."""
         stays = self._model == model and alike(self._parameters, parameters, rebuilt(model))
         if self._model != model:
-            self._twin = Realization(model, parameters)
+            self.twin = Realization(model, parameters)
             self._model, self._parameters = model, parameters
             self._read_tables(reading.compiled(model))
         if stays:
             self.edit(parameters)
             return
-        self._twin.edit(parameters)
-        self._parameters, mj = parameters, self._twin.model
+        self.twin.edit(parameters)
+        self._parameters, mj = parameters, self.twin.model
         self._units = renewed(self.engine, self._units, mj, self._shapes)
-        self.bodies, self.joints, self.geoms = (handles(self._units, kind) for kind in range(3))
+        self.bodies, self.joints, self.geoms = (
+            {
+                number: (unit.multibody, link)
+                for unit in self._units
+                for number, link in getattr(unit, kind).items()
+            }
+            for kind in ("bodies", "joints", "geoms")
+        )
         # The engine has one rule for two links, in whichever order they are named, and keeps it.
         pairs = (sorted((self.geoms[one], self.geoms[two])) for one, two in self._touching)
         enabled = {(*first, *second) for first, second in pairs}
@@ -287,7 +289,7 @@ class Client:
             return
         fresh = {k: v for k, v in parameters.items() if self._parameters.get(k) is not v}
         if fresh:
-            self._twin.edit(fresh)
+            self.twin.edit(fresh)
         self._parameters = parameters
         if fresh:
             self._tell()
@@ -306,7 +308,7 @@ class Client:
         moved = self._moved()
         if self._trees != moved:
             self._trees = moved
-            self._driven = parts(self.engine, self._twin.model, self.joints, moved)
+            self._driven = parts(self.engine, self.twin.model, self.joints, moved)
 
     def _settings(
         self,
@@ -314,7 +316,7 @@ class Client:
         tuple[Callable[..., Any], Mapping[int, tuple[int, ...]], list[int], tuple[str, ...], Floats]
     ]:
         """List functions of the engine: places by number, numbers, arguments, a row for each."""
-        mj, engine = self._twin.model, self.engine
+        mj, engine = self.twin.model, self.engine
 
         def inertia(body: int, link: int, mass: float, **moments: float) -> None:
             engine.changeDynamics(body, link, mass=mass, localInertiaDiagonal=[*moments.values()])
@@ -359,7 +361,7 @@ class Client:
 
     def _moved(self) -> set[int]:
         """List the trees on which smooth forces act, other than weight."""
-        mj = self._twin.model
+        mj = self.twin.model
         if mj.opt.density > 0.0 or mj.opt.viscosity > 0.0:
             return set(range(mj.ntree))
         bodies = (
@@ -369,13 +371,9 @@ class Client:
         )
         return self._pulled.union(mj.body_treeid[np.concatenate(bodies)].tolist())
 
-    def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Read parameters from the arrays that the engine's numbers are made of."""
-        return self._twin.parameters(keys)
-
     def remarks(self, before: Parameters) -> tuple[str, ...]:
         """List which frictions were changed without an effect; see ``shares``."""
-        twin, found = self._twin, list[str]()
+        twin, found = self.twin, list[str]()
         now = shares(twin.model, self._dynamic, self._usual)
         for key, old in before.items():
             if key[1] == "friction":
@@ -400,15 +398,15 @@ class Client:
         ``a = (M + h D)^-1 (f - b)``, and ``Euler`` has the slopes of passive dampers alone; the
         forces ``M a + b`` let the engine's explicit step have it.
         """
-        self._twin.forget()
-        mj, data, options = self._twin.model, self._twin.data, self._twin.model.opt
+        self.twin.forget()
+        mj, data, options = self.twin.model, self.twin.data, self.twin.model.opt
         asked = options.disableflags, options.integrator
         options.disableflags |= SMOOTH
         if options.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             options.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         if custom(mj, "bullet_explicit_servos"):
             options.integrator = mujoco.mjtIntegrator.mjINT_EULER
-        self._twin.command[:] = command
+        self.twin.command[:] = command
         forces, rates, step = np.empty(mj.nv), np.empty(mj.nv), options.timestep
         advance = self.engine.stepSimulation
         for _ in range(substeps):
@@ -429,9 +427,9 @@ class Client:
     def read(self) -> Floats:
         """Ask the engine for the state."""
         for part in self._parts:
-            part.take(self._twin.data)
-        vector = np.empty(self._twin.structure.layout.size)
-        self._twin.read(vector)
+            part.take(self.twin.data)
+        vector = np.empty(self.twin.structure.layout.size)
+        self.twin.read(vector)
         return vector
 
     def contacts(self) -> tuple[ContactPoint, ...]:
@@ -439,7 +437,7 @@ class Client:
 
         The engine also keeps points of bodies that only came near; they are left out.
         """
-        names = {h: self._twin.owners[geom] for geom, h in self.geoms.items()}
+        names = {h: self.twin.owners[geom] for geom, h in self.geoms.items()}
         return tuple(
             ContactPoint(
                 bodies=(names[point[1], point[3]], names[point[2], point[4]]),
@@ -457,7 +455,7 @@ class Client:
     def save(self) -> SavedState:
         """Keep the engine's own state in this process as long as what is returned is held."""
         self._free(number for number, saved in self._saved.items() if saved() is None)
-        saved = SavedState(self.engine.saveState(), self._twin.data.act.copy())
+        saved = SavedState(self.engine.saveState(), self.twin.data.act.copy())
         self._saved[saved.number] = weakref.ref(saved)
         return saved
 
@@ -465,7 +463,7 @@ class Client:
         """Go back to a state if it is kept here. Parameters are not part of it."""
         if all(kept() is not saved for kept in self._saved.values()):
             return False
-        self._twin.data.act[:] = saved.activations
+        self.twin.data.act[:] = saved.activations
         self.engine.restoreState(stateId=saved.number)
         return True
 
