@@ -230,6 +230,11 @@ class Model:
         )
 
     @cached_property
+    def rows(self) -> dict[ParameterKey, Parameter]:
+        """The parameters, by key."""
+        return {row.key: row for row in self.parameters}
+
+    @cached_property
     def body_names(self) -> tuple[str, ...]:
         """Names of all bodies; the first is the world."""
         return tuple(body.name for body in self.bodies)

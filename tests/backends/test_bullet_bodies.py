@@ -287,7 +287,7 @@ def test_every_body_takes_part_in_contacts(backend: BulletBackend, early: bool) 
     mj = compiled(backend.structure)
     moves = mj.body_treeid[mj.geom_bodyid] >= 0
     free = mj.geom_bodyid >= mj.nbody - len(busy_scene().structure.blocks)
-    found = {geom: info(*place) for geom, place in client._built.geoms.items()}
+    found = {geom: info(*place) for geom, place in client.geoms.items()}
     for geom, one in found.items():
         if moves[geom]:  # the engine does not tell it of the others
             assert one[5] == pytest.approx(0.3**0.5)
