@@ -228,7 +228,7 @@ class TriFingerTask(Task):
 
     def _fraction(self) -> Measured:
         """Declare the fraction of the goals that is filled."""
-        published, parts = self.conventions.aligned_boxes, building.POSE
+        published, parts = self.conventions.published, building.POSE
         if self.shape is not None:
             mechanism = Function(shapes.hull_aligned if published else shapes.hull_filled)
             parts = ("vertices", *building.POSE[1:])
@@ -257,7 +257,7 @@ class TriFingerTask(Task):
     @property
     def seconds(self) -> float:
         """Ten seconds for each block [s]."""
-        still = len(self.obstacles) if self.conventions.static_counts else 0
+        still = len(self.obstacles) if self.conventions.published else 0
         return SECONDS_PER_BLOCK * (len(self.tools) + still)
 
     @property
@@ -270,7 +270,7 @@ class TriFingerTask(Task):
         exact, aligned = (
             partial(building.fraction_of, self.shape, published) for published in (False, True)
         )
-        fraction = aligned if self.conventions.aligned_boxes else exact
+        fraction = aligned if self.conventions.published else exact
         return Goal(
             achieved=have,
             desired=want,
@@ -363,7 +363,7 @@ class TriFingerTask(Task):
             self.decided_by,
             timing,
             self.conventions,
-            self.unchecked if self.conventions.published_spaces else (),
+            self.unchecked if self.conventions.published else (),
         )
         return made, [*made.variables(), *others]
 
@@ -412,7 +412,7 @@ class Building(TriFingerTask):
 
     def entities(self) -> Iterable[Entity]:
         """List the blocks, and their places in the building."""
-        airborne, targets = self.conventions.published_spaces, self.targets
+        airborne, targets = self.conventions.published, self.targets
         pieces = [
             building.bodies(self.piece, name, tuple(which.items()), airborne)
             for name, which in self.parts()

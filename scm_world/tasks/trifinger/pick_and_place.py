@@ -139,7 +139,7 @@ class PickAndPlace(TriFingerTask):
         size = sizes.declare(f"{WALL}.size", WALL_SIZE, "Full edge lengths.")
         center = (0.0, 0.0, WALL_SIZE[2] / 2.0)
         position = goal_position(WALL, default=center)  # in the predecessor it keeps its center
-        if not self.conventions.published_spaces:
+        if not self.conventions.published:
             position = numbers.POSITIONS.declare(
                 f"{WALL}.cartesian_position",
                 None,

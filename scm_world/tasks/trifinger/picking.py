@@ -101,7 +101,7 @@ class Picking(TriFingerTask):
 
     def entities(self) -> Iterable[Entity]:
         """A block and its goal."""
-        published = self.conventions.published_spaces
+        published = self.conventions.published
         center = (*self.block.place[:2], self.block.place[2] + self.block.below(TOOL))
         yield self.block.tool(
             spaces=numbers.places(self.block.level(TOOL), airborne=published),
@@ -124,7 +124,7 @@ class Picking(TriFingerTask):
         The predecessor publishes wider spaces, and moves every value that is drawn or set above the
         centre of the arena; see ``above_the_center``.
         """
-        if self.conventions.published_spaces:
+        if self.conventions.published:
             return (
                 numbers.cylindrical(numbers.RADIUS_A, *HEIGHT_A),
                 numbers.cylindrical(numbers.RADIUS_B, *HEIGHT_B),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from scm_world.models import Difference, Scene
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.entities.blocks import lowest_point
-from scm_world.tasks.trifinger.state import PhysicalState
 
 MOST = 9
 SHAPE = (MOST, 7)
@@ -91,7 +91,7 @@ def _dropped(lone: bytes, each: bytes) -> bytes:
     for name, drop in zip(names, drops, strict=True):
         common |= {(name, "size"): [size] * 3, (name, "mass"): mass, (name, "friction"): drop[6]}
     changed = {key: np.asarray(value, dtype=np.float64) for key, value in common.items()}
-    rest = PhysicalState(structure.layout)  # all blocks are in the sky, far from one another
+    rest: Any = structure.empty_state()  # all blocks are in the sky, far from one another
     rest.joint_positions[:] = hardware.RAISED
     rest.positions[:, 0] = 10.0 * np.arange(len(names))
     rest.positions[:, 2] = SKY

@@ -32,8 +32,7 @@ from scm_world.models.scene import Difference, Parameters, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping.bodies import turn_about_z
 from scm_world.tasks.trifinger.kinematics import forward, inverse
-from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.system import TriFinger
+from scm_world.tasks.trifinger.system import PhysicalState, TriFinger
 
 CUBE = 0.065  # [m] edge of the platform's cube
 TURN = math.radians(-48.0)  # of this package's world about z, so that the fingers lie alike

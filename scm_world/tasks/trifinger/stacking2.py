@@ -194,7 +194,7 @@ class Stacking2(TriFingerTask):
 
     def _tool(self, index: int, start: Function) -> Entity:
         name, size = TOOLS[index], block_size(f"{TOOLS[index]}.size", SIZE, spaces=False)
-        low, airborne = numbers.half_height(size.name), self.conventions.published_spaces
+        low, airborne = numbers.half_height(size.name), self.conventions.published
         return ToolBlock(
             name,
             size=size,
