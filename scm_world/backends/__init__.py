@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
 from scm_world._arguments import enter
@@ -36,7 +38,8 @@ def register(kind: Kind) -> Kind:
     """Register a custom backend by its ``name``, for every place that takes the name of a backend.
 
     It can decorate the class. New processes know it if the module that
-    registers it is imported there: put it at the top level of that module.
+    registers it is imported there: put it at the top level of that module. What an installed
+    package declares as an entry point of the group ``scm_world.backends`` is known everywhere.
 
     Args:
         kind: A class that passes ``scm_world.testing.backend.BackendConformance``, or as much of
@@ -59,8 +62,14 @@ def register(kind: Kind) -> Kind:
 
 
 def backends() -> tuple[str, ...]:
-    """Name all backends that ``make_backend`` knows: of this package, then those registered."""
-    return (*BACKENDS, *_REGISTERED)
+    """Name all backends that ``make_backend`` knows: of this package, then the others."""
+    return tuple(dict.fromkeys((*BACKENDS, *_REGISTERED, *_declared())))
+
+
+@cache
+def _declared() -> dict[str, EntryPoint]:
+    """Find the entry points of installed packages, by name."""
+    return {entry.name: entry for entry in entry_points(group="scm_world.backends")}
 
 
 def make_backend(name: str) -> Backend:
@@ -75,13 +84,16 @@ def make_backend(name: str) -> Backend:
         >>> make_backend("fake").name
         'fake'
     """
-    if name not in backends():
-        raise UnknownOption("backend", name, backends())
     if name in _REGISTERED:
         return _REGISTERED[name]()
+    if name not in _CLASSES:
+        if name not in _declared():
+            raise UnknownOption("backend", name, backends())
+        backend: Backend = _declared()[name].load()()
+        return backend
     module, class_name, requirement = _CLASSES[name]
     try:
-        backend: Backend = getattr(importlib.import_module(module), class_name)()
+        backend = getattr(importlib.import_module(module), class_name)()
     except MissingEngine:
         raise
     except ImportError as error:
