@@ -24,7 +24,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.base import Capabilities, EngineSnapshot, InMemory
+from scm_world.backends.base import EngineSnapshot, InMemory
 from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
 from scm_world.geometry.rotations import quaternion_product, to_rotation_vector
 from scm_world.models.scene import Difference, Parameters, Scene
@@ -61,7 +61,6 @@ class TriFingerPlatform(InMemory):
     """
 
     name: ClassVar[str] = "trifinger_platform"
-    capabilities: ClassVar[Capabilities] = Capabilities()
     _platform: Any
     _played: tuple[tuple[Floats, int], ...]
 

@@ -256,7 +256,7 @@ def _read(parts: Assembly) -> Model:
         name="trifinger",
         keyframe=START,
         states=states,
-        controls=[f"{joint}_servo" for joint in _JOINT_NAMES],
+        controls=N_JOINTS,
         bindings=partial(_rows, parts),
         frame="world",
         part_of={tip_name(finger): link_name(finger, 3) for finger in FINGERS},
