@@ -35,7 +35,9 @@ def _rotate(turn: Floats, vector: Floats, sign: float) -> None:
 
 
 @numba.njit(
-    "i8(f8[:, :], f8[:, :], i8[::1], i8[:, ::1], i8[:, ::1], i4[::1], f8[:, ::1])",
+    # MuJoCo's batch lends its forces for reading only
+    "i8(f8[:, :], Array(f8, 2, 'A', readonly=True), i8[::1], i8[:, ::1], i8[:, ::1], i4[::1], "
+    "f8[:, ::1])",
     cache=True,
     error_model="numpy",
 )
