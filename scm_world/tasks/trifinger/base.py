@@ -41,10 +41,9 @@ from scm_world.tasks.rewards import (
 )
 from scm_world.tasks.trifinger import hardware, kernels, shaping
 from scm_world.tasks.trifinger.conventions import CONVENTIONS, TriFingerConventions
-from scm_world.tasks.trifinger.entities.block_world import BlockWorld
+from scm_world.tasks.trifinger.entities.block_world import BlockWorld, fingers_reach
 from scm_world.tasks.trifinger.entities.robot import ACTIONS, robot
 from scm_world.tasks.trifinger.entities.stage import light_and_cameras, stage
-from scm_world.tasks.trifinger.feasibility import fingers_reach
 from scm_world.tasks.trifinger.hardware import PRESETS, RESOLUTIONS, TIMESTEP
 from scm_world.tasks.trifinger.scenarios import scenarios
 from scm_world.tasks.trifinger.shaping import POSE
