@@ -27,11 +27,19 @@ from scm_world.tasks.trifinger.entities.bodies import (
     tool,
 )
 from scm_world.variables import Function, Variable
+from scm_world.variables.mechanisms import Constant
 
 MASS = "blocks_mass"
 
-Part = tuple[str, dict[str, float]]
-"""The name of a part of a building, and the numbers that say which one it is."""
+Part = tuple[str, dict[str, Any]]
+"""The name of a part of a building, and the numbers, or arrays, that say which one it is."""
+
+Constants = tuple[tuple[str, Constant], ...]
+
+
+def constants_of(which: Mapping[str, Any]) -> Constants:
+    """Return the numbers of a part as mechanisms keep them: arrays as tuples."""
+    return tuple(Function("part", constants=which).constants.items())
 
 
 def blocks_mass(default: float) -> Variable:
@@ -73,9 +81,7 @@ class Piece:
 
 
 @lru_cache(maxsize=512)  # they are immutable, and most structures of a family have them
-def bodies(
-    piece: Piece, name: str, which: tuple[tuple[str, float], ...], airborne: bool
-) -> tuple[Entity, Entity]:
+def bodies(piece: Piece, name: str, which: Constants, airborne: bool) -> tuple[Entity, Entity]:
     """Describe a part of a building, of which ``which`` are the constants: block and place."""
 
     def taken(causes: Causes | None) -> dict[str, Any]:
@@ -140,7 +146,7 @@ class Building(TriFingerTask):
         """List the blocks, and their places in the building."""
         airborne, targets = self.conventions.published_spaces, self.targets
         pieces = [
-            bodies(self.piece, name, tuple(which.items()), airborne) for name, which in self.parts()
+            bodies(self.piece, name, constants_of(which), airborne) for name, which in self.parts()
         ]
         yield from (tool for tool, _ in pieces)
         yield from (goal for _, goal in pieces if goal.name in targets)

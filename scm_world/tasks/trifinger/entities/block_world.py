@@ -270,9 +270,9 @@ class BlockWorld(Composition):
         bodies = self.touched()
         return {name: body for name, (body, _) in self.parameters().items() if body in bodies}
 
-    def goals(self, values: Values) -> tuple[GoalRegion, ...]:
-        """Describe all goals."""
-        return tuple(
+    def looks(self, values: Values) -> tuple[tuple[GoalRegion, ...], Light]:
+        """Describe all goals, and the light of pictures."""
+        goals = tuple(
             GoalRegion(
                 name=entity.name,
                 shape=entity.shape if entity.hull is None else "hull",
@@ -285,11 +285,8 @@ class BlockWorld(Composition):
             for entity in self.entities
             if entity.kind == "goal"
         )
-
-    def light(self, values: Values) -> Light:
-        """Describe the light of pictures."""
         x, y, z = values["light_direction"].tolist()
-        return Light((x, y, z), float(values["light_ambient"]))
+        return goals, Light((x, y, z), float(values["light_ambient"]))
 
     def cameras(self, values: Values) -> tuple[Camera, ...]:
         """Describe the three cameras of the robot, with pictures of 128 x 128 pixels."""
