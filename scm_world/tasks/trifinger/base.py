@@ -79,7 +79,6 @@ def observe(name: str, kind: int, *parts: str) -> Iterable[Observed]:
 
 
 REWARD = "reward"
-SECONDS_PER_BLOCK = 10.0
 
 MEASURES = ("cartesian_position", "orientation", "linear_velocity", "angular_velocity")
 """States of a block, in the order in which they are listed."""
@@ -113,6 +112,9 @@ class TriFingerTask(Task):
         start: The same, if an option changed them.
         success: Replaces the usual goal, if given; see ``Common``.
         terminated: Ends an episode before its time, if given; see ``Common``.
+
+    Raises:
+        UnknownOption: An argument is not known, or out of the bounds of its variable.
     """
 
     choices: ClassVar[dict[str, Any]] = {
@@ -237,7 +239,7 @@ class TriFingerTask(Task):
     def seconds(self) -> float:
         """Ten seconds for each block [s]."""
         still = len(self.obstacles) if self.conventions.static_counts else 0
-        return SECONDS_PER_BLOCK * (len(self.tools) + still)
+        return 10.0 * (len(self.tools) + still)
 
     @property
     def goal(self) -> Goal:
