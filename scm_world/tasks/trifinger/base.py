@@ -39,14 +39,14 @@ from scm_world.tasks.rewards import (
     reward,
     succeeded,
 )
-from scm_world.tasks.trifinger import hardware, kernels, shaping
+from scm_world.tasks.trifinger import hardware, kernels
 from scm_world.tasks.trifinger.conventions import CONVENTIONS, TriFingerConventions
 from scm_world.tasks.trifinger.entities.block_world import BlockWorld, fingers_reach
 from scm_world.tasks.trifinger.entities.robot import ACTIONS, robot
 from scm_world.tasks.trifinger.entities.stage import light_and_cameras, stage
 from scm_world.tasks.trifinger.hardware import PRESETS, RESOLUTIONS, TIMESTEP
+from scm_world.tasks.trifinger.kernels import POSE
 from scm_world.tasks.trifinger.scenarios import scenarios
-from scm_world.tasks.trifinger.shaping import POSE
 from scm_world.tasks.trifinger.symmetry import thirds
 from scm_world.tasks.trifinger.views import boxes_apart, view_of
 from scm_world.variables import Function, Linear, Measured, Variable, names
@@ -135,7 +135,7 @@ class TriFingerTask(Task):
     default_weights: ClassVar[Mapping[str, float]]
     paper_weights: ClassVar[Mapping[str, float]] = {}
     dense_terms: ClassVar[tuple[Measured, ...]] = ()
-    ready_terms: ClassVar[tuple[Measured, ...]] = shaping.ROBOT
+    ready_terms: ClassVar[tuple[Measured, ...]] = kernels.ROBOT
     terms: tuple[Measured, ...] = ()
     options: ClassVar[type] = Common
     unchecked: ClassVar[tuple[str, ...]] = ()
@@ -261,7 +261,7 @@ class TriFingerTask(Task):
                 SUCCESS: lambda mine, its: fraction(mine, its) > FULFILLED,
                 OVERLAP: aligned,
             },
-            closeness=((shaping.TIPS, *have, *want), boxes_apart),
+            closeness=((kernels.TIPS, *have, *want), boxes_apart),
             tools=self.tools,
             targets=self.targets,
         )
