@@ -154,7 +154,7 @@ def read_model(
         raise ModelError([f"{where}: {'.'.join(key)}: {REVERSED}" for key in wrong])
     touch = mj.nflex > 0 or bool(trees.touches.any())
     staged = touch and int(mj.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
-    drift = tuple(_drift(mj, sealed, start))
+    drift = tuple(_drift(mj, sealed, start, elements.values()))
     for note in drift:
         warnings.warn(note, stacklevel=3)
     keys = "\0".join(f"{row.name}\0{row.key}" for row in parameters)
@@ -271,7 +271,9 @@ DRIFT = 1e-4
 """Differences that are worth a note [m] or [rad]."""
 
 
-def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator[str]:
+def _drift(
+    mj: mujoco.MjModel, source: Source, start: mujoco.MjData, elements: Iterable[StateRow]
+) -> Iterator[str]:
     """Measure how far plain MuJoCo, with its warm start, differs where iterations are few."""
     if mj.opt.iterations >= FEW:
         return
@@ -285,14 +287,13 @@ def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator
         ends.append(data.qpos.copy())
     apart = np.empty(mj.nv)
     mujoco.mj_differentiatePos(mj, apart, 1.0, *ends)
-    kinds = mj.jnt_type[mj.dof_jntid]
-    place = np.arange(mj.nv) - mj.jnt_dofadr[mj.dof_jntid]
-    slides = (kinds == int(_JNT.mjJNT_SLIDE)) | ((kinds == int(_JNT.mjJNT_FREE)) & (place < 3))
-    found = [
-        f"{np.abs(apart[which]).max():.2g} {unit}"
-        for which, unit in ((~slides, "rad"), (slides, "m"))
-        if np.abs(apart[which]).max(initial=0.0) > DRIFT or not np.isfinite(apart[which]).all()
-    ]
+    found = []
+    for unit in ("rad", "m"):
+        rows = (row for row in elements if row.array == "qvel" and row.unit == f"{unit}/s")
+        dofs = [number for row in rows for number in row.numbers]
+        most = np.abs(apart[dofs]).max(initial=0.0)
+        if not most <= DRIFT:
+            found.append(f"{most:.2g} {unit}")
     if found:
         few = mj.opt.iterations
         yield (
