@@ -23,7 +23,7 @@ from scm_world.backends.mujoco.states import (
     turned_bodies,
 )
 from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import EngineFailure, Infeasible, ModelError, UnknownOption
+from scm_world.errors import Infeasible, ModelError, UnknownOption
 from scm_world.models.model import REPORTED, Model
 from scm_world.models.scene import (
     REVERSED,
@@ -44,25 +44,8 @@ _ONLY = np.zeros(1, dtype=np.int32)
 """The row of a single vector."""
 
 
-def refuse_callbacks() -> None:
-    """Refuse to step while a callback of the user acts.
-
-    Raises:
-        EngineFailure: With the callbacks.
-    """
-    found = reading.callbacks()
-    if found:
-        raise EngineFailure("; ".join(found), "mujoco")
-
-
 def lost(structure: Any, vector: Floats, time: float) -> str:
-    """Return which states are not finite, and when, as a sentence.
-
-    Args:
-        structure: With the names of the states.
-        vector: The state, shape (structure.layout.size,).
-        time: Of the simulation, which begins with 0 at a reset [s].
-    """
+    """Return which states of a vector are not finite, and when [s], as a sentence."""
     places = structure.layout.slices
     names = [name for name, where in places.items() if not np.isfinite(vector[where]).all()]
     more = f" and {len(names) - 4} more" if len(names) > 4 else ""
@@ -84,7 +67,6 @@ class Realization:
 
     Attributes:
         structure: What was compiled.
-        owners: Name of the body of each shape: the geoms, then the flexes.
         model: With the present parameters.
         data: With the present state.
         kept: The parameters in force; at first, none has been written.
@@ -105,10 +87,6 @@ class Realization:
         self.data = data = mujoco.MjData(model)
         self._scratch = mujoco.MjData(model)
         self._slots = structure.slots(model, data)
-        self._constant = frozenset(key for key, slot in self._slots.items() if slot.constant)
-        self._follow_ups = {key: f for key, slot in self._slots.items() if (f := slot.follow_up)}
-        self._bodies = structure.body_names
-        self.owners = structure.owners
         self.kept: dict[ParameterKey, Floats] = {}
         self.revision = object()
         self.replay: tuple[Floats, int] | None = None
@@ -125,6 +103,7 @@ class Realization:
         self._last: LastStep | None = None
         self._written: Floats | None = None  # since the last step, if bodies are turned
         self._counts = data.warning.number
+        self._full = self._counts[1:3]  # times that contacts or constraints had no memory, plus 1
         self._size = int(mujoco.mj_stateSize(model, STATE))
         # MuJoCo prints a warning, and writes it to a file, when it counts the first of its kind.
         self._counts[:] = self._scratch.warning.number[:] = 1
@@ -184,9 +163,9 @@ class Realization:
     def problem(self) -> str:
         """Return why the state after a step is invalid; empty if it is valid."""
         mujoco.mj_getState(self.model, self.data, self._motion, MOTION)
-        if self._motion @ self._zeros == 0.0 and self._counts[1] + self._counts[2] == 2:
+        full = self._full.tolist() != [1, 1]
+        if self._motion.dot(self._zeros) == 0.0 and not full:
             return ""
-        full = self._counts[1] + self._counts[2] > 2
         self._counts[:] = 1
         if full:
             return FULL
@@ -203,19 +182,16 @@ class Realization:
 
     def touches(self) -> Touches:
         """Copy the contacts of the last physics step; of Runge-Kutta, those of its last stage."""
-        if self.replay is not None:
-            return self._replayed(*self.replay)
-        return touches(self.model, self.data, self.owners)
-
-    def _replayed(self, numbers: Floats, steps: int) -> Touches:
-        """Take steps again on other data, and copy the contacts of the last one."""
-        data = self._scratch
+        owners = self.structure.owners
+        if self.replay is None:
+            return touches(self.model, self.data, owners)
+        data, (numbers, steps) = self._scratch, self.replay
         mujoco.mj_setState(self.model, data, numbers, STATE)
         try:
             mujoco.mj_step(self.model, data, steps)
         except (mujoco.FatalError, mujoco.UnexpectedError):
             mujoco.mj_resetData(self.model, data)  # it failed then, too, and left no contacts
-        found = touches(self.model, data, self.owners)
+        found = touches(self.model, data, owners)
         mujoco.mj_resetData(self.model, data)
         data.warning.number[:] = 1
         return found
@@ -293,13 +269,15 @@ class Realization:
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
         """Read parameters and moments of inertia back from the arrays of the model."""
-        found: dict[ParameterKey, Floats] = {}
+        found, bodies = dict[ParameterKey, Floats](), self.structure.body_names
         for key in keys:
-            if key not in self._slots and key[1] == "inertia" and key[0] in self._bodies:
-                found[key] = self.model.body_inertia[self._bodies.index(key[0])].copy()
+            slot = self._slots.get(key)
+            if slot is not None:
+                found[key] = slot.read()
+            elif key[1] == "inertia" and key[0] in bodies:
+                found[key] = self.model.body_inertia[bodies.index(key[0])].copy()
             else:
                 self.check([key])
-                found[key] = self._slots[key].read()
         return found
 
     def edit(self, parameters: Parameters) -> None:
@@ -325,7 +303,7 @@ class Realization:
             if not before:
                 return
             wrong = reversed_ranges({key: kept[key] for key in before})
-            reason = REVERSED if wrong else self.followed(before)
+            reason = REVERSED if wrong else self._followed([*before])
             if reason:
                 wrong = wrong or self._culprits(before)
                 names = ", ".join(".".join(key).strip(".") for key in wrong)
@@ -336,15 +314,15 @@ class Realization:
                 if old is not None:  # where there is none, the model is new and is given up
                     kept[key] = old
                     slots[key].write(old)
-            self.followed(before)
+            self._followed([*before])
             raise
 
-    def followed(self, keys: Iterable[ParameterKey]) -> str:
+    def _followed(self, keys: list[ParameterKey]) -> str:
         """Compute what follows from some parameters; return why that is invalid, or nothing."""
-        keys = tuple(keys)
-        for follow_up in {self._follow_ups[key] for key in keys if key in self._follow_ups}:
+        slots = [self._slots[key] for key in keys]
+        for follow_up in {slot.follow_up for slot in slots if slot.follow_up is not None}:
             follow_up(self.model)
-        if self._constant.isdisjoint(keys):
+        if not any(slot.constant for slot in slots):
             return ""
         try:
             mujoco.mj_setConst(self.model, self._scratch)
@@ -360,10 +338,10 @@ class Realization:
 
     def _culprits(self, keys: Iterable[ParameterKey]) -> list[ParameterKey]:
         """List the parameters among some that no body can have; all that count if none is wrong."""
-        constant = [key for key in keys if key in self._constant]
-        wrong = []
+        constant, wrong = [key for key in keys if self._slots[key].constant], []
         for key in constant:
-            value, most = self._slots[key].read(), self._slots[key].read().max()
+            value = self._slots[key].read()
+            most = value.max()
             bad = not np.isfinite(value).all() or (key[1] == "mass" and value < 0.0)
             if bad or (key[1] == "inertia" and 2.0 * most - value.sum() > 1e-6 * most):
                 wrong.append(key)
