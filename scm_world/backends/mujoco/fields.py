@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import chain, count
-from typing import Any, Literal, final
+from typing import Any, final
 
 import mujoco
 import numpy as np
@@ -162,13 +162,12 @@ class Element:
         constant: bool = False,
         low: Numbers = -math.inf,
         high: Numbers = math.inf,
-        kind: Literal["real", "rotation", "inertia", "switch"] = "real",
         usual: Any = True,
-        visual: bool = False,
         off: str = "",
         acts: Any = True,
         reason: str = "",
         effect: Effect | None = None,
+        **rest: Any,
     ) -> Parameter:
         """Return a parameter with its value in the model, and in the data.
 
@@ -214,11 +213,10 @@ class Element:
             always=always,
             contact=contact,
             slot=slot,
-            kind=kind,
-            visual=visual,
             body=self.body if self.kind in ("body", "geom") else -1,
             usual=bool(usual),
             refusal=refusal,
+            **rest,
         )
 
     def turn(self, doc: str, array: str, index: Any = None, **rest: Any) -> Parameter:
