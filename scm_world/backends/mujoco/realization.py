@@ -97,7 +97,7 @@ class Realization:
         self._motion, self._zeros = np.empty(len(self._places)), np.zeros(len(self._places))
         self._names, self._turned, self._own = turned_bodies(structure, compiled)
         self._spins = self._turned[:, 4:]
-        self._reported = np.stack(structure.places(REPORTED))
+        self._reported = structure.places(REPORTED)
         self._row = self._motion[None], self._forces[None], self._places, self._reported
         self.lean = not (self._reported.size or self._names)
         self._last: LastStep | None = None
