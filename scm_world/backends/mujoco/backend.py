@@ -114,17 +114,8 @@ class MujocoBackend(Backend):
             self._return()
         if found := callbacks():
             raise EngineFailure("; ".join(found), self.name)
-        now = self.realization
-        now.command[:] = command
-        now.forget()
         self._touches = None
-        try:
-            mujoco.mj_step(now.model, now.data, substeps)
-        except (mujoco.FatalError, mujoco.UnexpectedError) as error:
-            now.recover()
-            raise EngineFailure(f"MuJoCo: {error}", self.name) from error
-        problem = now.problem()
-        if problem:
+        if problem := self.realization.step(command, substeps):
             raise EngineFailure(problem, self.name)
 
     def contacts(self) -> tuple[ContactPoint, ...]:
