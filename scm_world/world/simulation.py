@@ -266,7 +266,7 @@ class Simulation(WorldAttributes):
         self._adopt(origin, origin.model, self._origin_static, 0)
         self._draw_nature()
         self._forget()
-        if self.task.checks_functions and not self._checked:
+        if not self._checked:
             self._values.compute()
             check_functions(self.compiled, self._values.now)
             self._checked = True

@@ -19,14 +19,12 @@ from scm_world.backends.mujoco.states import (
     MOTION,
     LastStep,
     into_bodies,
-    into_world,
     read_rows,
-    settle,
     turned_bodies,
 )
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import Infeasible, ModelError, UnknownOption
-from scm_world.models.model import Model
+from scm_world.models.model import REPORTED, Model
 from scm_world.models.scene import (
     REVERSED,
     ParameterKey,
@@ -94,18 +92,14 @@ class Realization:
         self.replay: tuple[Floats, int] | None = None
         self.command = data.ctrl[: structure.n_commands]
         self._forces = data.qfrc_actuator
-        self._places = np.concatenate(reading.permutation(structure)).astype(np.int64)
+        motion = [structure.places(array)[1] for array in ("qpos", "qvel", "act")]
+        self._places = np.concatenate(motion)
         self._motion, self._zeros = np.empty(len(self._places)), np.zeros(len(self._places))
         self._names, self._turned, self._own = turned_bodies(structure, compiled)
-        places = structure.layout.slices
-        pairs = [
-            (place, number)
-            for row in structure.states
-            if row.reported
-            for place, number in enumerate(row.numbers, places[row.name].start)
-        ]
-        self._reported = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-        self.lean = not (pairs or self._names)
+        self._spins = self._turned[:, 4:]
+        self._reported = np.stack(structure.places(REPORTED))
+        self._row = self._motion[None], self._forces[None], self._places, self._reported
+        self.lean = not (self._reported.size or self._names)
         self._last: LastStep | None = None
         self._written: Floats | None = None  # since the last step, if bodies are turned
         self._counts = data.warning.number
@@ -120,13 +114,9 @@ class Realization:
     def read(self, into: Floats) -> None:
         """Write the state into a vector, shape (layout.size,)."""
         mujoco.mj_getState(self.model, self.data, self._motion, MOTION)
-        into[self._places] = self._motion
-        if self._reported.size:
-            into[self._reported[0]] = self._forces[self._reported[1]]
-        if self._names:
-            into_world(into[None], _ONLY, self._turned)
-        if self._written is not None:
-            settle(self._written, into, self._turned)
+        read_rows(*self._row, self._turned, _ONLY, into[None])
+        if self._written is not None:  # as it was written, although turning has rounded it
+            into[self._spins] = self._written[self._spins]
 
     def place(self, vector: Floats) -> None:
         """Write a state; all else stays as it is. What is as the last step left it stays exact."""
@@ -152,8 +142,9 @@ class Realization:
 
     def rows(self, batch: Batch) -> Callable[[Any, Floats], int]:
         """Return what reads some states out of a batch, and returns a row that is not finite."""
-        forces = batch.bind("qfrc_actuator") if self._reported.size else None
-        return partial(read_rows, batch.state, forces, self._places, self._turned, self._reported)
+        forces = batch.bind("qfrc_actuator") if self._reported.size else np.empty((0, 0))
+        motions = batch.state[:, 1 : 1 + len(self._places)]
+        return partial(read_rows, motions, forces, self._places, self._reported, self._turned)
 
     def reset(self) -> None:
         """Forget every step; parameters stay."""
