@@ -120,10 +120,9 @@ class Realization:
 
     def place(self, vector: Floats) -> None:
         """Write a state; all else stays as it is. What is as the last step left it stays exact."""
-        remembered = self._remembered() if self._names else None
         motion = vector[self._places]
-        if remembered is not None:
-            names, known, exact = remembered
+        if self._names:
+            names, known, exact = self._remembered()
             if names != self._names:
                 where = [names.index(name) if name in names else -1 for name in self._names]
                 nobody = np.full((1, 7), np.nan)
