@@ -179,7 +179,6 @@ class Model:
         instead: Makes the model that Bullet realises in place of this one, where that is another
             one. It can be pickled.
         views: Its cameras, and what pictures of goals show, where there is more than in its file.
-        fake: What moves without physics; see ``backends.fake``. It can be pickled.
     """
 
     name: str
@@ -198,7 +197,6 @@ class Model:
     owners: tuple[str, ...] = field(default=(), repr=False)
     instead: Callable[[], Model] | None = field(default=None, repr=False)
     views: Any = field(default=None, repr=False)
-    fake: Any = field(default=None, repr=False)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Model) and self.digest == other.digest
@@ -228,6 +226,11 @@ class Model:
             tuple(np.concatenate([*start, np.empty(0)]).tolist()),
             frozenset(row.name for row in self.states if row.reported),
         )
+
+    @cached_property
+    def rows(self) -> dict[ParameterKey, Parameter]:
+        """The parameters, by key."""
+        return {row.key: row for row in self.parameters}
 
     @cached_property
     def body_names(self) -> tuple[str, ...]:

@@ -215,7 +215,7 @@ class TriFingerTask(Task):
     def readouts(self) -> Iterable[Variable]:
         """Declare reward terms, fractional success and success."""
         yield from self.dense()
-        published, parts = self.conventions.aligned_boxes, POSE
+        published, parts = self.conventions.published, POSE
         constants = {"tools": float(len(self.tools))}
         if self.shape is not None:
             function: Any = kernels.hull_aligned if published else kernels.hull_filled
@@ -237,7 +237,7 @@ class TriFingerTask(Task):
     @property
     def seconds(self) -> float:
         """Ten seconds for each block [s]."""
-        still = len(self.obstacles) if self.conventions.static_counts else 0
+        still = len(self.obstacles) if self.conventions.published else 0
         return SECONDS_PER_BLOCK * (len(self.tools) + still)
 
     @property
@@ -250,7 +250,7 @@ class TriFingerTask(Task):
         exact, aligned = (
             partial(kernels.fraction_of, self.shape, published) for published in (False, True)
         )
-        fraction = aligned if self.conventions.aligned_boxes else exact
+        fraction = aligned if self.conventions.published else exact
         return Goal(
             achieved=have,
             desired=want,

@@ -144,7 +144,7 @@ class Building(TriFingerTask):
 
     def entities(self) -> Iterable[Entity]:
         """List the blocks, and their places in the building."""
-        airborne, targets = self.conventions.published_spaces, self.targets
+        airborne, targets = self.conventions.published, self.targets
         pieces = [
             bodies(self.piece, name, constants_of(which), airborne) for name, which in self.parts()
         ]

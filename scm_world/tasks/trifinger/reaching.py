@@ -147,7 +147,7 @@ class Reaching(TriFingerTask):
         )
         yield from self.terms
         weights = dict(self.weights)
-        if self.conventions.distance_as_reward:
+        if self.conventions.published:
             weights["reach_error"] = weights.pop(FRACTION)
         yield reward(weights)
 

@@ -350,7 +350,7 @@ class Picking(OneBlock):
 
     def entities(self) -> Iterable[Entity]:
         """A block and its goal."""
-        published, (x, y, z) = self.conventions.published_spaces, self.place
+        published, (x, y, z) = self.conventions.published, self.place
         start = Function(put, constants={"center": (x, y, z + self.below(TOOL))})
         yield self.tool_block(
             spaces=numbers.places(self.level(TOOL), airborne=published),
@@ -369,7 +369,7 @@ class Picking(OneBlock):
         The predecessor publishes wider spaces, and moves every value that is drawn or set above the
         centre of the arena; see ``above_the_center``.
         """
-        if self.conventions.published_spaces:
+        if self.conventions.published:
             return (
                 numbers.cylindrical(numbers.RADIUS_A, *HEIGHT_A),
                 numbers.cylindrical(numbers.RADIUS_B, *HEIGHT_B),
@@ -481,7 +481,7 @@ class PickAndPlace(OneBlock):
         size = sizes.root(f"{WALL}.size", WALL_SIZE)
         center = (0.0, 0.0, WALL_SIZE[2] / 2.0)
         place = position(WALL, default=center)  # in the predecessor it keeps its center
-        if not self.conventions.published_spaces:
+        if not self.conventions.published:
             doc = "Position of the center; it stands on the floor in the middle."
             follows = (wall_on_the_floor, size.name)
             place = numbers.POSITIONS.derived(f"{WALL}.cartesian_position", follows, doc)

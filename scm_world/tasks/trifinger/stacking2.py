@@ -163,7 +163,7 @@ class Stacking2(TriFingerTask):
             Function(beside, constants={"place": second, "other": first}),
         )
         sizes = replace(numbers.BLOCK_SIZES, a=None, b=None)
-        airborne = self.conventions.published_spaces
+        airborne = self.conventions.published
         for name, start, turn in zip(TOOLS, starts, self._turns, strict=True):
             yield tool(
                 name,

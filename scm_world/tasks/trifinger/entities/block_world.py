@@ -18,7 +18,7 @@ from scm_world.tasks.model import causes_of
 from scm_world.tasks.trifinger.cameras import CAMERAS
 from scm_world.tasks.trifinger.entities.robot import RobotCommands, acted_on
 from scm_world.tasks.trifinger.feasibility import buried_goals, clear, overlaps
-from scm_world.tasks.trifinger.hardware import FINGERS, LINK_NAMES, N_JOINTS, PRESET_NAMES, preset
+from scm_world.tasks.trifinger.hardware import FINGERS, LINK_NAMES, N_JOINTS, PRESETS
 from scm_world.variables import Variable
 from scm_world.variables.kinds import Coupled
 from scm_world.variables.reserved import PRESET
@@ -68,33 +68,33 @@ class BlockWorld(Composition):
     ) -> None:
         self.entities, self._shared, self._timing = entities, shared, timing
         self._deciding, self._conventions = task.decided_by, task.conventions
-        self._unchecked = task.unchecked if self._conventions.published_spaces else ()
+        self._unchecked = task.unchecked if self._conventions.published else ()
         self.blocks = tuple(e.name for e in entities if e.kind == "block")
         self.obstacles = tuple(e.name for e in entities if e.kind == "obstacle")
         blocks = (e for e in entities if e.kind == "block")
         self.hulls = tuple((e.name, e.hull) for e in blocks if e.hull is not None)
         self.bodies, self.hides_goals = (*self.blocks, *self.obstacles), bool(self.obstacles)
-        self._systems: dict[str, TriFinger] = {}
-        super().__init__(self._system(PRESET_NAMES[0]), RobotCommands(timing.action_mode))
+        self._systems: dict[int, TriFinger] = {}
+        super().__init__(self._system(0), RobotCommands(timing.action_mode))
 
     def structure(self, values: Values) -> TriFinger:
         """Return the model of the bodies, with the settings that a preset stands for."""
-        return self._system(PRESET_NAMES[int(values[PRESET])])
+        return self._system(int(values[PRESET]))
 
-    def _system(self, name: str) -> TriFinger:
-        if name not in self._systems:
+    def _system(self, number: int) -> TriFinger:
+        if number not in self._systems:
             from scm_world.tasks.trifinger.system import trifinger  # it loads an engine
 
-            self._systems[name] = trifinger(
+            self._systems[number] = trifinger(
                 self.blocks,
-                preset(name),
+                [*PRESETS.values()][number],
                 self.obstacles,
                 self.hulls,
                 torques=self._timing.action_mode == "joint_torques",
                 resolution=self._timing.resolution,
-                published=self._conventions.published_physics,
+                published=self._conventions.published,
             )
-        return self._systems[name]
+        return self._systems[number]
 
     def overlaps(
         self,
