@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable
 from typing import Any, TypeVar
 
 from scm_world._arguments import enter
@@ -18,10 +17,10 @@ from scm_world.errors import MissingEngine, UnknownOption
 from scm_world.models import Model
 
 _CLASSES = {
-    "mujoco": ("scm_world.backends.mujoco", "MujocoBackend", "mujoco>=3.17,<5"),
-    "bullet": ("scm_world.backends.bullet", "BulletBackend", "pybullet==3.2.7"),
-    "step": ("scm_world.backends.step", "StepFunction", "scm-world"),
-    "fake": ("scm_world.backends.fake", "FakeBackend", "scm-world"),
+    "mujoco": ("MujocoBackend", "mujoco>=3.17,<5"),
+    "bullet": ("BulletBackend", "pybullet==3.2.7"),
+    "step": ("StepFunction", "scm-world"),
+    "fake": ("FakeBackend", "scm-world"),
 }
 
 BACKENDS = tuple(_CLASSES)
@@ -49,12 +48,7 @@ def register(kind: Kind) -> Kind:
         ModelError: It is no class of backends, methods are missing, or it has no name.
         UnknownOption: Another one has this name.
     """
-
-    def check(kind: type[Backend]) -> Iterable[str]:
-        if not isinstance(getattr(kind, "capabilities", None), Capabilities):
-            yield f"{kind.__name__} has no capabilities; set capabilities = Capabilities()"
-
-    enter(_REGISTERED, kind, Backend, what="backend", taken=BACKENDS, check=check)
+    enter(_REGISTERED, kind, Backend, what="backend", taken=BACKENDS, check=lambda kind: ())
     return kind
 
 
@@ -79,14 +73,15 @@ def make_backend(name: str) -> Backend:
         raise UnknownOption("backend", name, backends())
     if name in _REGISTERED:
         return _REGISTERED[name]()
-    module, class_name, requirement = _CLASSES[name]
+    class_name, requirement = _CLASSES[name]
     try:
-        backend: Backend = getattr(importlib.import_module(module), class_name)()
+        module = importlib.import_module(f"scm_world.backends.{name}")
+        found: type[Backend] = getattr(module, class_name)
     except MissingEngine:
         raise
     except ImportError as error:
         raise MissingEngine(name, f"pip install {requirement!r}", str(error)) from error
-    return backend
+    return found()
 
 
 def read_model(source: Any, **options: Any) -> Model:

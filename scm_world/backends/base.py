@@ -155,14 +155,14 @@ class Backend(ABC):
 
     Attributes:
         name: Of the engine.
-        capabilities: What it can do beyond these methods.
+        capabilities: What it can do beyond these methods; what most can if a class says nothing.
         batch: Made of backends of this class and a number of threads, it steps several scenes.
         version: Of the engine.
         structure: What was compiled: it says how large states and commands are.
     """
 
     name: ClassVar[str]
-    capabilities: ClassVar[Capabilities]
+    capabilities: ClassVar[Capabilities] = Capabilities()
     batch: ClassVar[type[EngineBatch]] = EngineBatch
     version: str
     structure: Any
@@ -303,12 +303,7 @@ class InMemory(Backend, ABC):
         self._place(scene.state)
 
     def apply(self, difference: Difference) -> None:
-        """Change structure, parameters and state without advancing time.
-
-        Raises:
-            UnknownOption: There is no such parameter. Nothing has changed.
-            WrongShape: A parameter has another shape. Nothing has changed.
-        """
+        """Change structure, parameters and state; where a parameter is wrong, nothing changes."""
         structure = difference.structure
         if structure is not None:
             now = Scene(self.structure, self._parameters, self._state)
@@ -326,11 +321,7 @@ class InMemory(Backend, ABC):
             self._place(difference.state)
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Return the parameters that were set.
-
-        Raises:
-            UnknownOption: There is no such parameter.
-        """
+        """Return the parameters that were set."""
         fake, found = getattr(self.structure, "fake", None), dict[ParameterKey, Floats]()
         for key in keys:
             body, what = key

@@ -14,6 +14,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
+from scm_world._types import Integers
 from scm_world.models.scene import (
     ParameterKey,
     Scene,
@@ -79,7 +80,7 @@ class Parameter(Row):
     usual: bool = True
     refusal: str = ""
 
-    @property
+    @cached_property
     def key(self) -> ParameterKey:
         """The element and the property, as backends know it."""
         element, _, attribute = self.name.rpartition(".")
@@ -232,6 +233,18 @@ class Model:
     def body_names(self) -> tuple[str, ...]:
         """Names of all bodies; the first is the world."""
         return tuple(body.name for body in self.bodies)
+
+    def places(self, array: str) -> tuple[Integers, Integers]:
+        """Return places in an array of MuJoCo's data, in order, and those in the state vector."""
+        starts = self.layout.slices
+        pairs = sorted(
+            (number, place)
+            for row in self.states
+            if row.array == array
+            for place, number in enumerate(row.numbers, starts[row.name].start)
+        )
+        found = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+        return found[:, 0].copy(), found[:, 1].copy()
 
     def empty_state(self) -> State:
         """Return a state to read into."""

@@ -24,7 +24,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends import Capabilities, EngineSnapshot, register
+from scm_world.backends import EngineSnapshot, register
 from scm_world.backends.base import InMemory
 from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
 from scm_world.geometry.rotations import quaternion_product, to_rotation_vector
@@ -64,7 +64,6 @@ class TriFingerPlatform(InMemory):
     """
 
     name: ClassVar[str] = "trifinger_platform"
-    capabilities: ClassVar[Capabilities] = Capabilities()
     _platform: Any
 
     def __init__(self) -> None:

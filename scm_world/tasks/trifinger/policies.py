@@ -10,7 +10,6 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import ActionError
-from scm_world.tasks.base import OpenLoopPolicy, kept_rows
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping import Feedback
 from scm_world.tasks.trifinger.kinematics import forward, inverse
@@ -23,7 +22,7 @@ LEVEL = 0.035  # [m] height of the fingertips as they sweep
 
 
 @final
-class Sweep(OpenLoopPolicy):
+class Sweep:
     """The fingertips sweep over the floor to its middle, and stay there.
 
     What lies in their way is pushed. It depends on nothing but the control step, so that it adds
@@ -53,7 +52,13 @@ class Sweep(OpenLoopPolicy):
         if world.action_mode == "joint_torques":
             raise ActionError("a sweep needs positions as actions, not", world.action_mode)
         rows = self._way if "effector" in world.action_mode else self._joints
-        return kept_rows(rows, first, count)
+        found: Floats = rows[np.minimum(np.arange(first, first + count), len(rows) - 1)]
+        return found
+
+    def __call__(self, world: Any) -> Floats:
+        """Return the action of the present step."""
+        action: Floats = self.ahead(world, world.index, 1)[0]
+        return action
 
 
 SCRIPTED: Mapping[str, Callable[[], Any]] = {

@@ -14,7 +14,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import InterventionError
-from scm_world.tasks.base import ProbeGenerator, Scenario
+from scm_world.tasks.base import Scenario
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import WALL_RADIUS
@@ -36,7 +36,7 @@ Setting = tuple[States, Floats]
 # --- where fingers are --------------------------------------------------------------------------
 
 
-def facing(rng: ProbeGenerator) -> Floats:
+def facing(rng: Any) -> Floats:
     """Return the direction in which each finger stands, with a little spread [rad]."""
     tips = np.array([[-0.05945, 0.15864], [0.16711, -0.02783], [-0.10766, -0.13080]])
     directions: Floats = np.arctan2(tips[:, 1], tips[:, 0]) + rng.uniform(-0.2, 0.2, 3)
@@ -61,7 +61,7 @@ def joints_for(world: Any, tips: Floats) -> Floats:
     return inverse(tips, float(world["robot_height"]), hardware.REST).joint_positions
 
 
-def fingers_at(world: Any, rng: ProbeGenerator, tips: Floats) -> States:
+def fingers_at(world: Any, rng: Any, tips: Floats) -> States:
     """Put the fingertips somewhere, and the blocks out of their way, unless it is not free."""
     states: States = {"joint_positions": joints_for(world, tips)}
     if not world.composition.obstacles:  # one may stand in the middle
@@ -86,7 +86,7 @@ def above(world: Any, name: str) -> tuple[Floats, float]:
 
 def stacked(
     world: Any,
-    rng: ProbeGenerator,
+    rng: Any,
     middle: Floats,
     bottom: float,
     yaw: float = 0.0,
@@ -103,9 +103,7 @@ def stacked(
     return states
 
 
-def pressed(
-    world: Any, rng: ProbeGenerator, middle: Floats, bottom: float, count: int = HIGHEST
-) -> Setting:
+def pressed(world: Any, rng: Any, middle: Floats, bottom: float, count: int = HIGHEST) -> Setting:
     """Stack the first blocks and let the fingers press on one of them that they reach."""
     edges = sizes(world)[:count]
     states = stacked(world, rng, middle, bottom, count=count)
@@ -122,7 +120,7 @@ def pressed(
 
 def touched(
     world: Any,
-    rng: ProbeGenerator,
+    rng: Any,
     middle: Floats,
     bottom: float,
     heights: tuple[float, float],
@@ -148,26 +146,26 @@ def touched(
 # --- the robot, and one block -------------------------------------------------------------------
 
 
-def free(world: Any, rng: ProbeGenerator) -> Setting:
+def free(world: Any, rng: Any) -> Setting:
     """Change nothing; the robot drives somewhere."""
     return {}, present_tips(world) + rng.uniform(-0.05, 0.05, 9)
 
 
-def finger_on_floor(world: Any, rng: ProbeGenerator) -> Setting:
+def finger_on_floor(world: Any, rng: Any) -> Setting:
     """Put the fingertips on the floor and let them rub it."""
     angles, radius = facing(rng), rng.uniform(0.1, 0.13)
     states = fingers_at(world, rng, around(ORIGIN, radius, angles, TIP + CLEARANCE))
     return states, around(ORIGIN, radius - 0.02, angles + 0.2, -0.02)
 
 
-def finger_at_wall(world: Any, rng: ProbeGenerator) -> Setting:
+def finger_at_wall(world: Any, rng: Any) -> Setting:
     """Put the fingertips at the ring wall and let them rub it."""
     angles, height = facing(rng), rng.uniform(0.08, 0.14)
     states = fingers_at(world, rng, around(ORIGIN, WALL_RADIUS - TIP - 3e-3, angles, height))
     return states, around(ORIGIN, WALL_RADIUS + 0.03, angles + 0.15, height + 0.02)
 
 
-def fingers_together(world: Any, rng: ProbeGenerator) -> Setting:
+def fingers_together(world: Any, rng: Any) -> Setting:
     """Put the fingertips side by side in the middle and let them press on one another."""
     angles, middle = facing(rng), rng.uniform(-0.02, 0.02, 2)
     height = rng.uniform(0.05, 0.1)
@@ -175,7 +173,7 @@ def fingers_together(world: Any, rng: ProbeGenerator) -> Setting:
     return states, around(middle, 0.0, angles, height + rng.uniform(-0.02, 0.02))
 
 
-def touch(world: Any, rng: ProbeGenerator) -> Setting:
+def touch(world: Any, rng: Any) -> Setting:
     """Stand the first block amid the fingers and let all three press on it."""
     middle = rng.uniform(-0.02, 0.02, 2)
     states, angles, _ = touched(world, rng, middle, 0.0, (0.3, 0.8), yaw=0.8)
@@ -183,7 +181,7 @@ def touch(world: Any, rng: ProbeGenerator) -> Setting:
     return states, drive
 
 
-def block_in_air(world: Any, rng: ProbeGenerator) -> Setting:
+def block_in_air(world: Any, rng: Any) -> Setting:
     """Drop the first block, tumbling."""
     name = world.composition.blocks[0]
     states = {
@@ -198,12 +196,12 @@ def block_in_air(world: Any, rng: ProbeGenerator) -> Setting:
 # --- all blocks ---------------------------------------------------------------------------------
 
 
-def tower(world: Any, rng: ProbeGenerator) -> Setting:
+def tower(world: Any, rng: Any) -> Setting:
     """Stand the blocks on one another and let the fingers press on one of them."""
     return pressed(world, rng, rng.uniform(-0.01, 0.01, 2), 0.0)
 
 
-def on_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
+def on_obstacle(world: Any, rng: Any) -> Setting:
     """Stand the blocks on the first obstacle and let all three fingers press on one."""
     center, bottom = above(world, world.composition.obstacles[0])
     middle = center + rng.uniform(-0.002, 0.002, 2)
@@ -213,7 +211,7 @@ def on_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
     return states, around(middle, rng.uniform(0.0, 0.02), angles + 0.4, height - 0.02)
 
 
-def block_at_wall(world: Any, rng: ProbeGenerator) -> Setting:
+def block_at_wall(world: Any, rng: Any) -> Setting:
     """Slide the blocks along the wall, on one another."""
     size, names = sizes(world)[0], world.composition.blocks[:HIGHEST]
     angle = rng.uniform(-np.pi, np.pi)
@@ -226,12 +224,12 @@ def block_at_wall(world: Any, rng: ProbeGenerator) -> Setting:
     return states, present_tips(world)
 
 
-def solved(world: Any, rng: ProbeGenerator) -> Setting:
+def solved(world: Any, rng: Any) -> Setting:
     """Begin where the goal is fulfilled."""
     return world.task.solution(world.values()), present_tips(world)
 
 
-def leaving(world: Any, rng: ProbeGenerator) -> Setting:
+def leaving(world: Any, rng: Any) -> Setting:
     """Begin where the goal is fulfilled, with the blocks on their way up."""
     states, tips = solved(world, rng)
     for name in world.composition.blocks:
@@ -243,7 +241,7 @@ def leaving(world: Any, rng: ProbeGenerator) -> Setting:
 # --- what may come into being -------------------------------------------------------------------
 
 
-def on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
+def on_newcomer(world: Any, rng: Any) -> Setting:
     """Stand some blocks where a further one would come into being, and press on one of them.
 
     High towers may be out of the fingers' reach there, so how many there are is drawn.
@@ -255,7 +253,7 @@ def on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
     return pressed(world, rng, *place, some)
 
 
-def all_on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
+def all_on_newcomer(world: Any, rng: Any) -> Setting:
     """Stand all blocks where a further one would come into being; the robot stays where it is."""
     place = _newcomer(world)
     if place is None:
@@ -278,7 +276,7 @@ def _newcomer(world: Any) -> tuple[Floats, float] | None:
     return None
 
 
-def on_coming_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
+def on_coming_obstacle(world: Any, rng: Any) -> Setting:
     """Set the next obstacle into the middle, and press on blocks above it."""
     places, edge = np.array(world[PLACES]), numbers.OBSTACLE_SIZE[2]
     middle = rng.uniform(-0.01, 0.01, 2)
@@ -287,7 +285,7 @@ def on_coming_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
     return {PLACES: places, **states}, drive
 
 
-def obstacle_ahead(world: Any, rng: ProbeGenerator) -> Setting:
+def obstacle_ahead(world: Any, rng: Any) -> Setting:
     """Set obstacles, should there be any, to where the fingers are about to go."""
     tips, places = present_tips(world).reshape(3, 3), np.array(world[PLACES])
     inward = -tips * [1.0, 1.0, 0.0] / np.linalg.norm(tips[:, :2], axis=1, keepdims=True)
@@ -299,7 +297,7 @@ def obstacle_ahead(world: Any, rng: ProbeGenerator) -> Setting:
 
 # --- which there are ----------------------------------------------------------------------------
 
-STEPS: dict[Callable[[Any, ProbeGenerator], Setting], int] = {
+STEPS: dict[Callable[[Any, Any], Setting], int] = {
     on_newcomer: 0,
     all_on_newcomer: 0,
     on_coming_obstacle: 0,
@@ -331,10 +329,10 @@ def scenarios(world: Any) -> list[Scenario]:
         found.append(obstacle_ahead)
     if world.compiled.bundles and not blocks:  # else they act through blocks, too
         found.append(fingers_together)
-    return [Scenario(prepare.__name__, prepare, driven, STEPS.get(prepare)) for prepare in found]
+    return [(prepare, driven, STEPS.get(prepare)) for prepare in found]
 
 
-def driven(world: Any, drive: Floats, rng: ProbeGenerator) -> Floats:
+def driven(world: Any, drive: Floats, rng: Any) -> Floats:
     """Turn fingertip positions into an action of the world's mode, with a little variety."""
     if world.action_mode == "end_effector_positions":
         return np.asarray(drive + rng.uniform(-0.005, 0.005, 9))

@@ -205,7 +205,7 @@ def _read(parts: Assembly) -> Model:
         name="trifinger",
         keyframe=START,
         states=states,
-        controls=[f"{joint}_servo" for joint in _JOINT_NAMES],
+        controls=N_JOINTS,
         bindings=lambda mj, data, trees: (one for one, _ in _rows(mj, data, trees, parts)),
         frame="world",
         part_of={tip_name(finger): link_name(finger, 3) for finger in FINGERS},

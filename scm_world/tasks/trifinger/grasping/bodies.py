@@ -84,7 +84,7 @@ class Cuboid:
             for body in (self, goal)
             for part in (2.0 * body.half, body.place, from_rotation_vector([0.0, 0.0, body.yaw]))
         )
-        return float(kernels.filled(*poses))
+        return float(kernels.filled(*poses, tools=1.0))
 
     def turns(self, goal: Cuboid) -> list[float]:
         """List by how much it may be turned to stand like its goal, the least first [rad].
