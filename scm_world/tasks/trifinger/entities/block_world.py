@@ -112,15 +112,13 @@ def _clear(joints: Floats, heights: Floats, limit: float) -> NDArray[np.bool_]:
 
     Rows with True have to be looked at with ``overlaps``.
     """
-    found, none = np.empty(len(joints), dtype=np.bool_), np.empty((0, 3))
+    found, none = np.empty(len(joints), dtype=np.bool_), np.empty((0, 3, 5))
     for row in range(len(joints)):
         tips, apart = forward_kernel(joints[row], heights[row]), True
         for x, y, z in tips.reshape(3, 3):
             apart &= z > WALL_HEIGHT or math.hypot(x, y) - WALL_RADIUS <= limit
-        legs = np.empty((0, 3, 3))
-        found[row] = apart and (
-            deepest_kernel(joints[row], heights[row], none, none, legs) <= limit + BALLS_MARGIN
-        )
+        most = limit + BALLS_MARGIN
+        found[row] = apart and deepest_kernel(joints[row], heights[row], none) <= most
     return found
 
 
