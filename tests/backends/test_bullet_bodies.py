@@ -20,8 +20,7 @@ from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
 from scm_world.models import Difference, Scene
 from scm_world.models.scene import ParameterKey
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.system import trifinger
+from scm_world.tasks.trifinger.system import PhysicalState, trifinger
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="needs pybullet"

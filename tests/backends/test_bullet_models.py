@@ -24,7 +24,7 @@ from scm_world.backends.bullet import BulletBackend
 from scm_world.backends.bullet.client import shares, usual_friction
 from scm_world.backends.bullet.honoured import supports, unsupported
 from scm_world.backends.mujoco.fields import element_names
-from scm_world.backends.mujoco.reading import compiled, permutation
+from scm_world.backends.mujoco.reading import compiled
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
 from scm_world.models import Difference, Model, Parameter
@@ -240,9 +240,9 @@ def touching(model: Model) -> list[tuple[int, int]]:
 
 def placed(backend: BulletBackend, model: Model, data: mujoco.MjData) -> Any:
     """Put a model into MuJoCo's state, with contacts switched off; return the client."""
-    state, places = model.empty_state(), permutation(model)
-    state.vector[places.positions] = data.qpos
-    state.vector[places.velocities] = data.qvel
+    state = model.empty_state()
+    state.vector[model.places("qpos")[1]] = data.qpos
+    state.vector[model.places("qvel")[1]] = data.qvel
     backend.build(model.default_scene().with_(state=state))
     client = backend.client()
     for first, second in touching(model):
@@ -268,7 +268,7 @@ def placed(backend: BulletBackend, model: Model, data: mujoco.MjData) -> Any:
 def test_one_step_is_that_of_mujoco(backend: BulletBackend, name: str) -> None:
     """Joints, springs, dampers and actuators of all kinds accelerate as in MuJoCo."""
     model = described(name)
-    velocities = permutation(model).velocities
+    velocities = model.places("qvel")[1]
     for seed in range(3):
         mj, data = moved(model, seed)
         before, h = data.qvel.copy(), mj.opt.timestep

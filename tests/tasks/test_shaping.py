@@ -42,14 +42,15 @@ def test_the_kernel_of_the_corners_is_the_published_one(seed: int) -> None:
     """4 / (e^(s d) + 2 + e^(-s d)) of the mean distance of eight corners."""
     (here, turn), (there, goal_turn) = pose(seed), pose(seed + 10)
     far = np.linalg.norm(corners(here, turn) - corners(there, goal_turn), axis=-1).mean()
-    found = shaping.goal_kernel(SIZE, here, turn, SIZE, there, goal_turn, 30.0)
+    found = shaping.goal_kernel(SIZE, here, turn, SIZE, there, goal_turn, sharpness=30.0)
     assert found == pytest.approx(4.0 / (np.exp(30.0 * far) + 2.0 + np.exp(-30.0 * far)))
 
 
 def test_a_kernel_ends_at_one_and_at_zero() -> None:
     """Where block and goal are one, and where they are far apart."""
     here, turn = pose(0)
-    assert shaping.goal_kernel(SIZE, here, turn, SIZE, here, -turn, 30.0) == pytest.approx(1.0)
+    found = shaping.goal_kernel(SIZE, here, turn, SIZE, here, -turn, sharpness=30.0)
+    assert found == pytest.approx(1.0)
     assert shaping.logistic(100.0, shaping.FINE) == pytest.approx(0.0, abs=1e-300)
     assert shaping.logistic(np.log(3 + np.sqrt(8)) / shaping.COARSE, shaping.COARSE) == (
         pytest.approx(0.5)
@@ -82,7 +83,7 @@ def test_the_fingertips_have_a_kernel_each() -> None:
     tips, goals = np.arange(9) / 100, np.zeros((3, 3))
     far = np.linalg.norm(tips.reshape(3, 3), axis=1)
     expected = np.mean(4.0 / (np.exp(30.0 * far) + 2.0 + np.exp(-30.0 * far)))
-    assert shaping.reach_kernel(tips, *goals, 30.0) == pytest.approx(expected)
+    assert shaping.reach_kernel(tips, *goals, sharpness=30.0) == pytest.approx(expected)
     assert shaping.minus_length(np.array([3.0, 0.0, 4.0])) == -5.0
 
 

@@ -13,7 +13,7 @@ from scm_world.evaluation import evaluate
 from scm_world.geometry import rotation_matrix
 from scm_world.tasks import TASKS, term
 from scm_world.tasks.trifinger.feasibility import buried_goals
-from scm_world.tasks.trifinger.pushing import Pushing
+from scm_world.tasks.trifinger.single import Pushing
 from scm_world.variables import Box, Draw, Function, Measured
 from scm_world.variables.kinds import SpaceName
 from scm_world.world import Simulation

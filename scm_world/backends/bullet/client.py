@@ -446,7 +446,7 @@ class Client:
 
         The engine also keeps points of bodies that only came near; they are left out.
         """
-        names = {h: self.twin.owners[geom] for geom, h in self.geoms.items()}
+        names = {h: self.twin.structure.owners[geom] for geom, h in self.geoms.items()}
         return tuple(
             ContactPoint(
                 bodies=(names[point[1], point[3]], names[point[2], point[4]]),

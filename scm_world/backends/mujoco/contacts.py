@@ -32,16 +32,11 @@ class Touches:
 
     def contacts(self) -> tuple[ContactPoint, ...]:
         """Name the bodies."""
-        return tuple(
-            ContactPoint(
-                (self.owners[first], self.owners[second]),
-                row[:3].copy(),
-                row[3:6].copy(),
-                -float(row[6]),
-                float(row[7]),
-            )
-            for (first, second), row in zip(self.shapes, self.numbers, strict=True)
-        )
+        found = []
+        for (one, other), row in zip(self.shapes, self.numbers, strict=True):
+            names, (distance, force) = (self.owners[one], self.owners[other]), row[6:].tolist()
+            found.append(ContactPoint(names, row[:3].copy(), row[3:6].copy(), -distance, force))
+        return tuple(found)
 
 
 def touches(model: mujoco.MjModel, data: mujoco.MjData, owners: tuple[str, ...]) -> Touches:

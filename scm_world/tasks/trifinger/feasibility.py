@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container
+from collections.abc import Container, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from scm_world._types import ArrayLike, Floats
+from scm_world._types import Floats
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models.scene import TOLERANCE, GoalRegion, Overlap, Scene
 from scm_world.tasks.trifinger import hardware
@@ -65,25 +65,16 @@ def overlaps(scene: Scene, *, tolerance: float, enough: float = math.inf) -> tup
     return tuple(Overlap(bodies, depth) for bodies, depth in deepest.items())
 
 
-def thin(candidates: Any, limit: float) -> None:
-    """Leave out candidates whose fingers lie deep in one another, or beyond the ring.
-
-    Most draws of the joints are of this kind. What is left has to be looked at with ``overlaps``.
+@njit(cache=True)
+def clear(joints: Floats, heights: Floats, limit: float) -> NDArray[np.bool_]:
+    """Return for each row of joints whether fingers may be clear of one another and of the ring.
 
     Args:
-        candidates: Draws of an intervention.
-        limit: How deep is too deep where a link takes part [m].
+        joints: Shape (n, 9) [rad].
+        heights: Of the robot, shape (n,) [m].
+        limit: How deep is too deep where a link takes part [m]. Rows with True have to be looked at
+            with ``overlaps``.
     """
-    joints = candidates.state(slice(0, hardware.N_JOINTS))
-    if len(joints) > 1:
-        height = candidates.parameter(("robot", "height"))
-        heights = np.broadcast_to(height, len(joints))
-        candidates.keep(_clear(joints, np.ascontiguousarray(heights), limit))
-
-
-@njit(cache=True)
-def _clear(joints: Floats, heights: Floats, limit: float) -> NDArray[np.bool_]:
-    """Tell of each row of joints whether fingers may be clear of one another and of the ring."""
     found, none = np.empty(len(joints), dtype=np.bool_), np.empty((0, 3))
     for row in range(len(joints)):
         tips, apart = forward_kernel(joints[row], heights[row]), True
@@ -109,19 +100,25 @@ def buried_goals(scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         inside = (Overlap((goal.name, o), _depth_in_box(goal, scene, o)) for o in obstacles)
         found += [overlap for overlap in inside if overlap.depth > TOLERANCE]
     solid = [goal for goal in goals if goal.shape != "sphere"]
-    if solid:  # blocks in the places of goals
-        from scm_world.tasks.trifinger.system import trifinger  # it loads an engine
-
-        hulls = tuple((goal.name, goal.hull) for goal in solid if goal.hull is not None)
-        blocks = tuple(goal.name for goal in solid)
-        there = trifinger(blocks, obstacles=obstacles, hulls=hulls).default_scene()
-        parameters = {**there.parameters, **scene.parameters}
-        parameters |= {(goal.name, "size"): goal.size for goal in solid if goal.hull is None}
-        for pose, goal in zip(there.state.blocks, solid, strict=True):
-            pose[:3], pose[3:7] = goal.position, goal.orientation
-        listed = overlaps(there.with_(parameters=parameters), tolerance=TOLERANCE)
+    if solid:
+        listed = overlaps(_filled(solid, scene.parameters, obstacles), tolerance=TOLERANCE)
         found += [overlap for overlap in listed if overlap.bodies[1] in obstacles]
     return tuple(found)
+
+
+def _filled(
+    goals: Sequence[GoalRegion], parameters: Mapping[Any, Any], obstacles: tuple[str, ...] = ()
+) -> Scene:
+    """Return a scene with blocks in the places of goals."""
+    from scm_world.tasks.trifinger.system import trifinger  # it loads an engine
+
+    hulls = tuple((goal.name, goal.hull) for goal in goals if goal.hull is not None)
+    blocks = tuple(goal.name for goal in goals)
+    scene = trifinger(blocks, obstacles=obstacles, hulls=hulls).default_scene()
+    sizes = {(goal.name, "size"): goal.size for goal in goals if goal.hull is None}
+    for pose, goal in zip(scene.state.blocks, goals, strict=True):
+        pose[:3], pose[3:7] = goal.position, goal.orientation
+    return scene.with_(parameters={**scene.parameters, **parameters, **sizes})
 
 
 def _depth_in_box(goal: GoalRegion, scene: Scene, obstacle: str) -> float:
@@ -135,22 +132,11 @@ def _depth_in_box(goal: GoalRegion, scene: Scene, obstacle: str) -> float:
 
 
 def fingers_reach(
-    size: ArrayLike, position: ArrayLike, orientation: ArrayLike, joints: ArrayLike, height: float
+    size: Floats, position: Floats, orientation: Floats, joints: Floats, height: float
 ) -> bool:
-    """Tell whether a finger lies in a box.
-
-    Args:
-        size: Full edge lengths of the box, shape (3,) [m].
-        position: Its center, shape (3,) [m].
-        orientation: Its quaternion (x, y, z, w).
-        joints: Of the robot, shape (9,) [rad].
-        height: Of its base [m].
-    """
-    from scm_world.tasks.trifinger.system import trifinger  # it loads an engine
-
-    scene = trifinger(("box",)).default_scene()
+    """Return whether a finger lies in a box with these edges and this pose, at given joints."""
+    box = GoalRegion("box", "box", size, position, orientation, color=np.zeros(3))
+    scene = _filled([box], {("robot", "height"): height})
     scene.state.joint_positions[:] = joints
-    scene.state.positions[0], scene.state.orientations[0] = position, orientation
-    parameters = {**scene.parameters, ("box", "size"): size, ("robot", "height"): height}
-    found = overlaps(scene.with_(parameters=parameters), tolerance=TOLERANCE)
+    found = overlaps(scene, tolerance=TOLERANCE)
     return any("box" in o.bodies and o.bodies[1] in hardware.LINK_NAMES for o in found)

@@ -12,6 +12,7 @@ Source:
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -20,17 +21,15 @@ from scm_world._types import Floats, Value
 from scm_world.geometry.rotations import rotation_kernel
 from scm_world.geometry.scalars import scalar
 from scm_world.tasks.rewards import term
-from scm_world.tasks.trifinger.kernels import distance
+from scm_world.tasks.trifinger import hardware, kernels
+from scm_world.tasks.trifinger.kernels import BOX, distance
 from scm_world.variables import Function, Measured, Parent
+from scm_world.variables.mechanisms import Stacked
 
 COARSE = 30.0  # [1/m] the kernel falls to a half at 6 cm
 FINE = 150.0  # [1/m] and here at 12 mm
 BEHIND = 0.05  # [m] from the center of a block to where a fingertip pushes it
 NEAR = 0.01  # [m] nearer to the goal, where to push from moves towards the center of the block
-
-_TOOL, _GOAL = "tool_block", "goal_block"
-_MOVES = ("cartesian_position", "orientation")
-_POSE = ("size", *_MOVES)
 
 
 @njit(cache=True)
@@ -46,63 +45,44 @@ def logistic(length: float, sharpness: float) -> float:
 
 
 @njit(cache=True)
-def corner_distance(
-    size: Floats,
-    position: Floats,
-    orientation: Floats,
-    goal_size: Floats,
-    goal_position: Floats,
-    goal_orientation: Floats,
-) -> float:
-    """Compute the mean distance of the eight corners of two boxes, corner by corner [m]."""
+def corner_distance(box: Floats, goal: Floats) -> float:
+    """Compute the mean distance of the eight corners of two boxes, corner by corner [m].
+
+    Each is its size [m], its position [m] and its quaternion, shape (10,).
+    """
     turn, goal_turn = np.empty((3, 3)), np.empty((3, 3))
-    rotation_kernel(orientation, turn)
-    rotation_kernel(goal_orientation, goal_turn)
+    rotation_kernel(box[6:], turn)
+    rotation_kernel(goal[6:], goal_turn)
     total = 0.0
     for corner in range(8):
         squared = 0.0
         for row in range(3):
-            gap = position[row] - goal_position[row]
+            gap = box[3 + row] - goal[3 + row]
             for axis in range(3):
                 side = 0.5 if (corner >> axis) & 1 else -0.5
-                gap += side * (
-                    turn[row, axis] * size[axis] - goal_turn[row, axis] * goal_size[axis]
-                )
+                gap += side * (turn[row, axis] * box[axis] - goal_turn[row, axis] * goal[axis])
             squared += gap * gap
         total += math.sqrt(squared)
     return total / 8.0
 
 
+@Stacked
 @njit(cache=True)
-def goal_kernel(
-    size: Floats,
-    position: Floats,
-    orientation: Floats,
-    goal_size: Floats,
-    goal_position: Floats,
-    goal_orientation: Floats,
-    sharpness: Value,
-) -> float:
-    """Compute the kernel of the mean distance of the corners, in [0, 1]."""
-    far = corner_distance(size, position, orientation, goal_size, goal_position, goal_orientation)
-    return logistic(far, scalar(sharpness))
+def goal_kernel(boxes: Floats, sharpness: Value) -> float:
+    """Compute the kernel of the mean distance of the corners of block and goal, in [0, 1]."""
+    return logistic(corner_distance(boxes[:BOX], boxes[BOX:]), scalar(sharpness))
 
 
+@Stacked
 @njit(cache=True)
-def corners_progress(
-    size: Floats,
-    position: Floats,
-    orientation: Floats,
-    position_before: Floats,
-    orientation_before: Floats,
-    goal_size: Floats,
-    goal_position: Floats,
-    goal_orientation: Floats,
-) -> float:
-    """Compute how much nearer the corners of the block came to those of the goal [m]."""
-    goal = goal_size, goal_position, goal_orientation
-    before = corner_distance(size, position_before, orientation_before, *goal)
-    return before - corner_distance(size, position, orientation, *goal)
+def corners_progress(boxes: Floats) -> float:
+    """Compute how much nearer the corners of the block came to those of the goal [m].
+
+    ``boxes`` has size and pose of the block, its pose before, and size and pose of the goal.
+    """
+    block, goal = boxes[:BOX], boxes[-BOX:]
+    before = np.concatenate((block[:3], boxes[BOX:-BOX]))
+    return corner_distance(before, goal) - corner_distance(block, goal)
 
 
 @njit(cache=True)
@@ -128,15 +108,13 @@ def pushing_progress(
     return before - pushing_distance(tips, block, goal)
 
 
+@Stacked
 @njit(cache=True)
-def reach_kernel(
-    tips: Floats, goal_60: Floats, goal_120: Floats, goal_300: Floats, sharpness: Value
-) -> float:
-    """Compute the mean kernel of the three fingertips, shape (9,), and their goals, in [0, 1]."""
-    steep = scalar(sharpness)
-    total = logistic(distance(tips[:3], goal_60), steep)
-    total += logistic(distance(tips[3:6], goal_120), steep)
-    total += logistic(distance(tips[6:], goal_300), steep)
+def reach_kernel(points: Floats, sharpness: Value) -> float:
+    """Compute the mean kernel of the three fingertips and their goals, in [0, 1]."""
+    total = 0.0
+    for i in range(0, 9, 3):
+        total += logistic(distance(points[i : i + 3], points[9 + i : 12 + i]), scalar(sharpness))
     return total / 3.0
 
 
@@ -152,74 +130,69 @@ def minus_change(now: Floats, before: Floats) -> float:
     return -distance(now, before)
 
 
-_BLOCK = tuple(f"{_TOOL}.{part}" for part in _POSE)
-_WANTED = tuple(f"{_GOAL}.{part}" for part in _POSE)
 TIPS = "end_effector_positions"
-WAS = Parent(TIPS, 1)
-_REACH = (TIPS, *(f"goal_{f}.cartesian_position" for f in ("60", "120", "300")))
+TIPS_WAS = Parent(TIPS, 1)
+POSE = ("size", "cartesian_position", "orientation")
+TOOL, GOAL = "tool_block", "goal_block"
+_BOXES = tuple(f"{name}.{part}" for name in (TOOL, GOAL) for part in POSE)
+BLOCK, TARGET = f"{TOOL}.cartesian_position", f"{GOAL}.cartesian_position"
+WAS = Parent(BLOCK, 1)
+PLACES = tuple(f"goal_{finger}.cartesian_position" for finger in hardware.FINGERS)
 
-ROBOT: tuple[Measured, ...] = (
-    term(
-        "reward.speed",
-        minus_length,
-        ("joint_velocities",),
-        "Minus the norm of the joint velocities [rad/s].",
-    ),
-    term(
-        "reward.effort",
-        minus_length,
-        ("joint_torques",),
-        "Minus the norm of the joint torques [N m].",
-    ),
+SMOOTHNESS = "smoothness", minus_change, ("joint_velocities", Parent("joint_velocities", 1))
+TIPS_TO_BLOCK = "tips_to_block", kernels.tips_progress, (TIPS, TIPS_WAS, BLOCK, WAS)
+TURNED = (
+    "orientation",
+    kernels.turn_progress,
+    (f"{TOOL}.orientation", Parent(f"{TOOL}.orientation", 1), f"{GOAL}.orientation"),
+)
+"""Terms that several tasks have by themselves."""
+
+
+def _terms(*rows: tuple[Any, ...]) -> tuple[Measured, ...]:
+    return tuple(term(f"reward.{name}", *row) for name, *row in rows)
+
+
+_SPEED = "Minus the norm of the joint velocities [rad/s]."
+_EFFORT = "Minus the norm of the joint torques [N m]."
+ROBOT = _terms(
+    ("speed", minus_length, ("joint_velocities",), _SPEED),
+    ("effort", minus_length, ("joint_torques",), _EFFORT),
 )
 """Terms of every task. The second one keeps fingers from pressing a block from all sides."""
 
-SMOOTHNESS = "smoothness", minus_change, ("joint_velocities", Parent("joint_velocities", 1))
-"""A term that most tasks have by themselves."""
+_COARSE, _FINE = ({"sharpness": sharpness} for sharpness in (COARSE, FINE))
+_TURN = f"{TOOL}.orientation"
 
-ONE_BLOCK: tuple[Measured, ...] = (
-    *ROBOT,
-    term(
-        "reward.goal_kernel",
-        Function(goal_kernel, constants={"sharpness": COARSE}),
-        (*_BLOCK, *_WANTED),
+ONE_BLOCK = ROBOT + _terms(
+    (
+        "goal_kernel",
+        Function(goal_kernel, constants=_COARSE),
+        _BOXES,
         "How near the corners of the block are to those of the goal, in [0, 1].",
     ),
-    term(
-        "reward.goal_kernel_fine",
-        Function(goal_kernel, constants={"sharpness": FINE}),
-        (*_BLOCK, *_WANTED),
+    (
+        "goal_kernel_fine",
+        Function(goal_kernel, constants=_FINE),
+        _BOXES,
         "How near the corners are, in [0, 1]; it is felt within about 2 cm.",
     ),
-    term(
-        "reward.corners_to_goal",
-        corners_progress,
-        (*_BLOCK, *(Parent(f"{_TOOL}.{part}", 1) for part in _MOVES), *_WANTED),
-    ),
-    term(
-        "reward.tip_behind_block",
-        pushing_progress,
-        (
-            *(TIPS, WAS),
-            *(f"{_TOOL}.cartesian_position", Parent(f"{_TOOL}.cartesian_position", 1)),
-            f"{_GOAL}.cartesian_position",
-        ),
-    ),
+    ("corners_to_goal", corners_progress, (*_BOXES[:3], WAS, Parent(_TURN, 1), *_BOXES[3:])),
+    ("tip_behind_block", pushing_progress, (TIPS, TIPS_WAS, BLOCK, WAS, TARGET)),
 )
 """Terms of tasks with one block and one goal."""
 
-REACHING: tuple[Measured, ...] = (
-    *ROBOT,
-    term(
-        "reward.reach_kernel",
-        Function(reach_kernel, constants={"sharpness": COARSE}),
-        _REACH,
+REACHING = ROBOT + _terms(
+    (
+        "reach_kernel",
+        Function(reach_kernel, constants=_COARSE),
+        (TIPS, *PLACES),
         "How near the fingertips are to their goals, in [0, 1].",
     ),
-    term(
-        "reward.reach_kernel_fine",
-        Function(reach_kernel, constants={"sharpness": FINE}),
-        _REACH,
+    (
+        "reach_kernel_fine",
+        Function(reach_kernel, constants=_FINE),
+        (TIPS, *PLACES),
         "How near the fingertips are, in [0, 1]; it is felt within about 2 cm.",
     ),
 )

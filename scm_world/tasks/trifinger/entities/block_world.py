@@ -6,18 +6,19 @@ import math
 from collections.abc import Container, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, final
 
+import numpy as np
+
 from scm_world._types import Values
 from scm_world.models import GoalRegion, Light, ParameterKey, Scene
-from scm_world.models.camera import Camera
+from scm_world.models.camera import Camera, camera_from
 from scm_world.models.scene import Overlap
 from scm_world.tasks.base import Timing
 from scm_world.tasks.composition import Composition, Entity
 from scm_world.tasks.model import causes_of
-from scm_world.tasks.trifinger.conventions import TriFingerConventions
+from scm_world.tasks.trifinger.cameras import CAMERAS
 from scm_world.tasks.trifinger.entities.robot import RobotCommands, acted_on
-from scm_world.tasks.trifinger.entities.stage import cameras_of, light_of
-from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
-from scm_world.tasks.trifinger.hardware import FINGERS, LINK_NAMES, PRESET_NAMES, preset
+from scm_world.tasks.trifinger.feasibility import buried_goals, clear, overlaps
+from scm_world.tasks.trifinger.hardware import FINGERS, LINK_NAMES, N_JOINTS, PRESETS
 from scm_world.variables import Variable
 from scm_world.variables.kinds import Coupled
 from scm_world.variables.reserved import PRESET
@@ -40,15 +41,8 @@ PARAMETERS = {
 }
 """Variables that are parameters of the model, as far as it has them, under other names."""
 
-QUANTITIES = {
-    "mass": "mass",
-    "size": "size",
-    "friction": "friction",
-    "color": "color",
-    "cartesian_position": "position",
-    "orientation": "orientation",
-}
-"""Quantities of bodies that are parameters, as far as the model has them, and its names of them."""
+QUANTITIES = ("mass", "size", "friction", "color", "cartesian_position", "orientation")
+"""Quantities of bodies that are parameters, as far as the model has them; ``position`` in it."""
 
 if TYPE_CHECKING:
     from scm_world.tasks.trifinger.system import TriFinger
@@ -61,53 +55,46 @@ class BlockWorld(Composition):
     Args:
         entities: In the order of the observation.
         shared: Variables that belong to no single entity.
-        deciding: Variables that decide which entities there are. A body that comes or goes acts
-            on the others by contact, so they do.
+        task: Its conventions say how deep bodies may lie in one another after an intervention, and
+            whether Bullet has the physics of the predecessor. A body that comes or goes acts on the
+            others by contact, so the variables of ``decided_by`` do.
         timing: Says how the robot is commanded, and how finely joints are cut.
-        conventions: Say how deep bodies may lie in one another after an intervention, and
-            whether Bullet has the physics of the predecessor.
-        unchecked: Entities on which an intervention is accepted however deep it puts bodies.
     """
 
     solid = True
 
     def __init__(
-        self,
-        entities: tuple[Entity, ...],
-        shared: tuple[Variable, ...],
-        deciding: tuple[str, ...],
-        timing: Timing,
-        conventions: TriFingerConventions,
-        unchecked: tuple[str, ...] = (),
+        self, entities: tuple[Entity, ...], shared: tuple[Variable, ...], task: Any, timing: Timing
     ) -> None:
-        self.entities, self._shared, self._deciding = entities, shared, deciding
-        self._timing, self._conventions, self._unchecked = timing, conventions, unchecked
+        self.entities, self._shared, self._timing = entities, shared, timing
+        self._deciding, self._conventions = task.decided_by, task.conventions
+        self._unchecked = task.unchecked if self._conventions.published else ()
         self.blocks = tuple(e.name for e in entities if e.kind == "block")
         self.obstacles = tuple(e.name for e in entities if e.kind == "obstacle")
         blocks = (e for e in entities if e.kind == "block")
         self.hulls = tuple((e.name, e.hull) for e in blocks if e.hull is not None)
         self.bodies, self.hides_goals = (*self.blocks, *self.obstacles), bool(self.obstacles)
-        self._systems: dict[str, TriFinger] = {}
-        super().__init__(self._system(PRESET_NAMES[0]), RobotCommands(timing.action_mode))
+        self._systems: dict[int, TriFinger] = {}
+        super().__init__(self._system(0), RobotCommands(timing.action_mode))
 
     def structure(self, values: Values) -> TriFinger:
         """Return the model of the bodies, with the settings that a preset stands for."""
-        return self._system(PRESET_NAMES[int(values[PRESET])])
+        return self._system(int(values[PRESET]))
 
-    def _system(self, name: str) -> TriFinger:
-        if name not in self._systems:
+    def _system(self, number: int) -> TriFinger:
+        if number not in self._systems:
             from scm_world.tasks.trifinger.system import trifinger  # it loads an engine
 
-            self._systems[name] = trifinger(
+            self._systems[number] = trifinger(
                 self.blocks,
-                preset(name),
+                [*PRESETS.values()][number],
                 self.obstacles,
                 self.hulls,
                 torques=self._timing.action_mode == "joint_torques",
                 resolution=self._timing.resolution,
-                published=self._conventions.published_physics,
+                published=self._conventions.published,
             )
-        return self._systems[name]
+        return self._systems[number]
 
     def overlaps(
         self,
@@ -130,8 +117,15 @@ class BlockWorld(Composition):
         )
 
     def thin(self, candidates: Any, limit: float) -> None:
-        """Leave out candidates whose fingers cross one another."""
-        thin(candidates, max(limit, self._conventions.robot_tolerance))
+        """Leave out candidates whose fingers lie deep in one another, or beyond the ring.
+
+        Most draws of the joints are of this kind.
+        """
+        joints = candidates.state(slice(0, N_JOINTS))
+        if len(joints) > 1:
+            heights = np.broadcast_to(candidates.parameter(("robot", "height")), len(joints))
+            limit = max(limit, self._conventions.robot_tolerance)
+            candidates.keep(clear(joints, np.ascontiguousarray(heights), limit))
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable; edges into states follow from the kinematic trees."""
@@ -167,15 +161,14 @@ class BlockWorld(Composition):
         """Return which variable sets which physical parameter."""
         known, found = {row.key for row in self.system.parameters}, dict[str, ParameterKey]()
         for entity in self.entities:
-            names = dict.fromkeys(variable.name for variable in entity.variables)
-            found |= {name: key for name, key in PARAMETERS.items() if name in names}
-            split = [name.rpartition(".") for name in names]
-            found |= {
-                f"{body}.{ours}": (body, its)
-                for ours, its in QUANTITIES.items()
-                for body, _, quantity in split
-                if quantity == ours
-            }
+            names = [variable.name for variable in entity.variables]
+            found |= {name: PARAMETERS[name] for name in names if name in PARAMETERS}
+            for part in QUANTITIES:
+                bodies = (
+                    name.removesuffix(f".{part}") for name in names if name.endswith(f".{part}")
+                )
+                its = part.removeprefix("cartesian_")
+                found |= {f"{body}.{part}": (body, its) for body in bodies}
         return {name: key for name, key in found.items() if key in known}
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
@@ -191,9 +184,9 @@ class BlockWorld(Composition):
         bodies = self.touched()
         return {name: body for name, (body, _) in self.parameters().items() if body in bodies}
 
-    def goals(self, values: Values) -> tuple[GoalRegion, ...]:
-        """Describe all goals."""
-        return tuple(
+    def looks(self, values: Values) -> tuple[tuple[GoalRegion, ...], Light]:
+        """Describe all goals, and the light of pictures."""
+        goals = tuple(
             GoalRegion(
                 name=entity.name,
                 shape=entity.shape if entity.hull is None else "hull",
@@ -206,11 +199,17 @@ class BlockWorld(Composition):
             for entity in self.entities
             if entity.kind == "goal"
         )
-
-    def light(self, values: Values) -> Light:
-        """Describe the light of pictures."""
-        return light_of(values)
+        x, y, z = values["light_direction"].tolist()
+        return goals, Light((x, y, z), float(values["light_ambient"]))
 
     def cameras(self, values: Values) -> tuple[Camera, ...]:
-        """Describe the three cameras of the robot."""
-        return cameras_of(values)
+        """Describe the three cameras of the robot, with pictures of 128 x 128 pixels."""
+        return tuple(
+            camera_from(
+                camera.name,
+                values[f"camera_{camera.name}.position"],
+                values[f"camera_{camera.name}.orientation"],
+                float(values[f"camera_{camera.name}.field_of_view"]),
+            )
+            for camera in CAMERAS
+        )
