@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from scm_world.tasks.trifinger.entities.blocks import block_size
+from scm_world.tasks.trifinger.entities.bodies import block_size
 
 from scm_world.errors import ModelError
 from scm_world.tasks import Building
