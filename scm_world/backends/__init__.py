@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
 from scm_world._arguments import enter
@@ -35,7 +37,8 @@ def register(kind: Kind) -> Kind:
     """Register a custom backend by its ``name``, for every place that takes the name of a backend.
 
     It can decorate the class. New processes know it if the module that
-    registers it is imported there: put it at the top level of that module.
+    registers it is imported there: put it at the top level of that module. What an installed
+    package declares as an entry point of the group ``scm_world.backends`` is known everywhere.
 
     Args:
         kind: A class that passes ``scm_world.testing.backend.BackendConformance``, or as much of
@@ -53,8 +56,14 @@ def register(kind: Kind) -> Kind:
 
 
 def backends() -> tuple[str, ...]:
-    """Name all backends that ``make_backend`` knows: of this package, then those registered."""
-    return (*BACKENDS, *_REGISTERED)
+    """Name all backends that ``make_backend`` knows: of this package, then the others."""
+    return tuple(dict.fromkeys((*BACKENDS, *_REGISTERED, *_declared())))
+
+
+@cache
+def _declared() -> dict[str, EntryPoint]:
+    """Find the entry points of installed packages, by name."""
+    return {entry.name: entry for entry in entry_points(group="scm_world.backends")}
 
 
 def make_backend(name: str) -> Backend:
@@ -69,14 +78,18 @@ def make_backend(name: str) -> Backend:
         >>> make_backend("fake").name
         'fake'
     """
-    if name not in backends():
-        raise UnknownOption("backend", name, backends())
     if name in _REGISTERED:
         return _REGISTERED[name]()
+    found: type[Backend]
+    if name not in _CLASSES:
+        if name not in _declared():
+            raise UnknownOption("backend", name, backends())
+        found = _declared()[name].load()
+        return found()
     class_name, requirement = _CLASSES[name]
     try:
         module = importlib.import_module(f"scm_world.backends.{name}")
-        found: type[Backend] = getattr(module, class_name)
+        found = getattr(module, class_name)
     except MissingEngine:
         raise
     except ImportError as error:
@@ -97,9 +110,6 @@ def read_model(source: Any, **options: Any) -> Model:
         >>> read_model(f"<mujoco><worldbody>{ball}</worldbody></mujoco>").layout.names[:2]
         ('ball.cartesian_position', 'ball.orientation')
     """
-    from scm_world.backends.mujoco import check_installation
-
-    check_installation()
     from scm_world.backends.mujoco.reading import read_model as read
 
     return read(source, **options)

@@ -289,8 +289,8 @@ class BackendWrapper(Backend, ABC):
 class InMemory(Backend, ABC):
     """What keeps a scene in memory: parameters in a dict, the state in a vector.
 
-    Only ``step`` is left to a class that derives from it. Where a model has a ``fake``, that
-    computes moments of inertia.
+    Only ``step`` is left to a class that derives from it. A model may have a method
+    ``inertia(parameters, body)``, which computes moments of inertia.
     """
 
     version = "1"
@@ -322,11 +322,11 @@ class InMemory(Backend, ABC):
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
         """Return the parameters that were set."""
-        fake, found = getattr(self.structure, "fake", None), dict[ParameterKey, Floats]()
+        inertia, found = getattr(self.structure, "inertia", None), dict[ParameterKey, Floats]()
         for key in keys:
             body, what = key
-            if what == "inertia" and fake is not None and (body, "mass") in self._parameters:
-                found[key] = np.asarray(fake.inertia(self.structure, self._parameters, body))
+            if what == "inertia" and inertia is not None and (body, "mass") in self._parameters:
+                found[key] = inertia(self._parameters, body)
             else:
                 found[key] = self._known(key).copy()
         return found

@@ -179,7 +179,6 @@ class Model:
         instead: Makes the model that Bullet realises in place of this one, where that is another
             one. It can be pickled.
         views: Its cameras, and what pictures of goals show, where there is more than in its file.
-        fake: What moves without physics; see ``backends.fake``. It can be pickled.
     """
 
     name: str
@@ -198,7 +197,6 @@ class Model:
     owners: tuple[str, ...] = field(default=(), repr=False)
     instead: Callable[[], Model] | None = field(default=None, repr=False)
     views: Any = field(default=None, repr=False)
-    fake: Any = field(default=None, repr=False)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Model) and self.digest == other.digest
@@ -230,12 +228,17 @@ class Model:
         )
 
     @cached_property
+    def rows(self) -> dict[ParameterKey, Parameter]:
+        """The parameters, by key."""
+        return {row.key: row for row in self.parameters}
+
+    @cached_property
     def body_names(self) -> tuple[str, ...]:
         """Names of all bodies; the first is the world."""
         return tuple(body.name for body in self.bodies)
 
-    def places(self, array: str) -> tuple[Integers, Integers]:
-        """Return places in an array of MuJoCo's data, in order, and those in the state vector."""
+    def places(self, array: str) -> Integers:
+        """Return places in an array of MuJoCo's data, in order, and in the vector, shape (2, n)."""
         starts = self.layout.slices
         pairs = sorted(
             (number, place)
@@ -243,8 +246,7 @@ class Model:
             if row.array == array
             for place, number in enumerate(row.numbers, starts[row.name].start)
         )
-        found = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-        return found[:, 0].copy(), found[:, 1].copy()
+        return np.ascontiguousarray(np.array(pairs, dtype=np.int64).reshape(-1, 2).T)
 
     def empty_state(self) -> State:
         """Return a state to read into."""

@@ -1,22 +1,23 @@
-"""What a picture shows: shapes in the world. Engine-free."""
+"""Shapes in the world: the contents of a picture. Engine-free."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import product
-from typing import Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import ArrayLike, Floats, Integers
 
-Kind = Literal["box", "ellipsoid", "capsule", "cylinder", "plane", "mesh"]
-
-KINDS: tuple[Kind, ...] = ("box", "ellipsoid", "capsule", "cylinder", "plane", "mesh")
+KINDS = ("box", "ellipsoid", "capsule", "cylinder", "plane", "mesh")
 BOX, ELLIPSOID, CAPSULE, CYLINDER, PLANE, MESH = range(len(KINDS))
 
 GOAL_OPACITY = 0.3  # Source: CausalWorld 1.2, silhouettes
+
+PLAIN = np.array([np.inf, np.inf, 0.0, 0.0, 0.0])
+"""Where there is no checkerboard."""
 
 _UNIT_CUBE = np.array(list(product((0.0, 1.0), repeat=3)))
 
@@ -39,61 +40,25 @@ class Mesh(NamedTuple):
     high: Floats
 
 
-class Tiles(NamedTuple):
-    """The checkerboard on a plane; the shape has the color of the first tile.
-
-    The first tile is the one with the least x and the greatest y. Along an axis along which the
-    plane does not end, it is the one whose edge with the least x, or the greatest y, is at 0.
-
-    Attributes:
-        size: Edges of a tile along the first and the second axis, shape (2,) [m].
-        color: Red, green, blue in [0, 1] of every other tile, shape (3,).
-    """
-
-    size: tuple[float, float]
-    color: tuple[float, float, float]
-
-
-class Shape(NamedTuple):
-    """One thing to draw.
+class ShapeTable(NamedTuple):
+    """The numbers of shapes, one row each.
 
     Capsules and cylinders lie along the third axis of their frame. A plane is seen from the side
-    of its third axis only.
-
-    Attributes:
-        kind: What it is.
-        halves: Half the edges of the box around it in its own frame, shape (3,) [m]; of a plane,
-            0 along an axis along which it does not end; of a mesh, without meaning.
-        position: Origin of its frame in the world, shape (3,) [m].
-        rotation: From its frame to the world, shape (3, 3).
-        color: Red, green, blue and opacity in [0, 1], shape (4,).
-        body: Number of the body that it belongs to, -1 if it belongs to none.
-        moves: Whether that body can move.
-        mesh: The triangles of a mesh, in its frame.
-        tiles: The checkerboard on a plane, if there is one.
-    """
-
-    kind: Kind
-    halves: Floats
-    position: Floats
-    rotation: Floats
-    color: Floats
-    body: int = -1
-    moves: bool = False
-    mesh: Mesh | None = None
-    tiles: Tiles | None = None
-
-
-class ShapeTable(NamedTuple):
-    """The numbers of shapes, one row each; see ``Shape``.
+    of its third axis only. On a plane there may be a checkerboard; its first tile, of the color of
+    the plane, is the one with the least x and the greatest y. Along an axis along which the plane
+    does not end, it is the one whose edge with the least x, or the greatest y, is at 0.
 
     Attributes:
         kinds: Indices into ``KINDS``, shape (n,).
-        halves: Shape (n, 3) [m].
-        positions: Shape (n, 3) [m].
-        rotations: Shape (n, 3, 3).
-        colors: Shape (n, 4).
-        bodies: Shape (n,).
+        halves: Half the edges of the box around each in its own frame, shape (n, 3) [m]; of a
+            plane, 0 along an axis along which it does not end; of a mesh, without meaning.
+        positions: Origins of their frames in the world, shape (n, 3) [m].
+        rotations: From their frames to the world, shape (n, 3, 3).
+        colors: Red, green, blue and opacity in [0, 1], shape (n, 4).
+        bodies: Numbers of the bodies that they belong to, -1 for none, shape (n,).
+        moves: Whether these bodies can move, shape (n,).
+        tiles: Edges of a tile along the first and the second axis [m], and red, green, blue of
+            every other tile, shape (n, 5); without a checkerboard the edges are infinite.
     """
 
     kinds: Integers
@@ -102,6 +67,8 @@ class ShapeTable(NamedTuple):
     rotations: Floats
     colors: Floats
     bodies: Integers
+    moves: NDArray[np.bool_]
+    tiles: Floats
 
 
 class Shapes(NamedTuple):
@@ -109,59 +76,44 @@ class Shapes(NamedTuple):
 
     Attributes:
         table: Their numbers.
-        moves: Whether the body of each can move, shape (n,).
-        meshes: Triangles, by row.
-        tiles: Checkerboards on planes, by row.
+        meshes: Triangles in the frame of the shape, by row.
     """
 
     table: ShapeTable
-    moves: NDArray[np.bool_]
     meshes: Mapping[int, Mesh]
-    tiles: Mapping[int, Tiles]
 
     @classmethod
-    def of(cls, shapes: Sequence[Shape]) -> Shapes:
-        """Collect shapes."""
-        n = len(shapes)
+    def of(
+        cls,
+        kinds: Sequence[int],
+        halves: Sequence[ArrayLike],
+        positions: Sequence[ArrayLike],
+        rotations: Sequence[ArrayLike],
+        colors: Sequence[ArrayLike],
+        bodies: Sequence[int] | None = None,
+        moves: Sequence[bool] | None = None,
+    ) -> Shapes:
+        """Collect shapes without checkerboards or meshes; by default none moves."""
+        n = len(kinds)
         table = ShapeTable(
-            np.array([KINDS.index(shape.kind) for shape in shapes], dtype=np.int64),
-            np.array([shape.halves for shape in shapes], dtype=np.float64).reshape(n, 3),
-            np.array([shape.position for shape in shapes], dtype=np.float64).reshape(n, 3),
-            np.array([shape.rotation for shape in shapes], dtype=np.float64).reshape(n, 3, 3),
-            np.array([shape.color for shape in shapes], dtype=np.float64).reshape(n, 4),
-            np.array([shape.body for shape in shapes], dtype=np.int64),
+            np.array(kinds, dtype=np.int64),
+            np.array(halves, dtype=np.float64).reshape(n, 3),
+            np.array(positions, dtype=np.float64).reshape(n, 3),
+            np.array(rotations, dtype=np.float64).reshape(n, 3, 3),
+            np.array(colors, dtype=np.float64).reshape(n, 4),
+            np.array([-1] * n if bodies is None else bodies, dtype=np.int64),
+            np.array([False] * n if moves is None else moves, dtype=np.bool_),
+            np.tile(PLAIN, (n, 1)),
         )
-        meshes = {i: shape.mesh for i, shape in enumerate(shapes) if shape.mesh is not None}
-        tiles = {i: shape.tiles for i, shape in enumerate(shapes) if shape.tiles is not None}
-        return cls(table, np.array([shape.moves for shape in shapes], dtype=bool), meshes, tiles)
-
-    def listed(self) -> list[Shape]:
-        """List the shapes."""
-        table = self.table
-        return [
-            Shape(
-                KINDS[table.kinds[i]],
-                table.halves[i],
-                table.positions[i],
-                table.rotations[i],
-                table.colors[i],
-                int(table.bodies[i]),
-                bool(self.moves[i]),
-                self.meshes.get(i),
-                self.tiles.get(i),
-            )
-            for i in range(len(self.moves))
-        ]
+        return cls(table, {})
 
     def joined(self, others: Shapes) -> Shapes:
         """Return these shapes, then others."""
-        n = len(self.moves)
-        columns = zip(self.table, others.table, strict=True)
+        n = len(self.table.kinds)
+        pairs = zip(self.table, others.table, strict=True)
+        columns: list[Any] = [np.concatenate(pair) for pair in pairs]
         return Shapes(
-            ShapeTable(*(np.concatenate(pair) for pair in columns)),
-            np.concatenate([self.moves, others.moves]),
-            {**self.meshes, **{n + i: mesh for i, mesh in others.meshes.items()}},
-            {**self.tiles, **{n + i: tiles for i, tiles in others.tiles.items()}},
+            ShapeTable(*columns), {**self.meshes, **{n + i: m for i, m in others.meshes.items()}}
         )
 
     def corners(self, rows: Integers) -> Floats:

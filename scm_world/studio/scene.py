@@ -6,6 +6,7 @@ import struct
 from base64 import b64encode
 from collections.abc import Iterable
 from contextlib import suppress
+from math import isfinite
 from typing import Any, final
 
 import numpy as np
@@ -16,7 +17,7 @@ from scm_world.backends.base import ContactPoint
 from scm_world.backends.renderer import body_names, shapes_of
 from scm_world.errors import ModelError
 from scm_world.models.scene import Scene
-from scm_world.models.shapes import Mesh, Shape
+from scm_world.models.shapes import KINDS, Mesh, Shapes
 
 FRAME = 1
 """The first number of a binary message that is a frame."""
@@ -29,7 +30,7 @@ class SentShapes:
     """Numbers for lists of shapes and for meshes, so that each is sent once."""
 
     def __init__(self) -> None:
-        self._known: dict[Any, tuple[int, list[Shape]]] = {}
+        self._known: dict[Any, tuple[int, Shapes]] = {}
         self._meshes: dict[int, tuple[int, Mesh]] = {}
         self._count = 0
 
@@ -40,14 +41,14 @@ class SentShapes:
             The number; for each shape position and orientation (x, y, z, w), shape (n, 7); and the
             message that describes the shapes, if there was none of this number before.
         """
-        shapes: list[Shape] = []
+        shapes = Shapes.of([], [], [], [], [])
         if scene is not None:  # equations have none
             with suppress(ModelError):  # a step function has no shapes
-                shapes = shapes_of(scene).listed()
-        key = tuple(
-            (s.kind, s.halves.tobytes(), s.color.tobytes(), id(s.mesh), s.body, s.tiles)
-            for s in shapes
-        )
+                shapes = shapes_of(scene)
+        table, n = shapes.table, len(shapes.table.kinds)
+        look = table.kinds, table.halves, table.colors, table.bodies, table.tiles
+        meshes = tuple((row, id(mesh)) for row, mesh in shapes.meshes.items())
+        key = (*(column.tobytes() for column in look), meshes)
         message = None
         if key not in self._known:
             if len(self._known) >= MOST_SCENES:
@@ -55,34 +56,36 @@ class SentShapes:
             self._known[key] = self._count, shapes  # keeps meshes alive, and so their ids
             self._count += 1
             message = self._described(self._known[key][0], shapes, scene)
-        poses = np.zeros((len(shapes), 7), dtype=np.float64)
-        if shapes:
-            poses[:, :3] = [s.position for s in shapes]
-            poses[:, 3:] = Rotation.from_matrix(np.array([s.rotation for s in shapes])).as_quat()
+        poses = np.zeros((n, 7), dtype=np.float64)
+        if n:
+            poses[:, :3] = table.positions
+            poses[:, 3:] = Rotation.from_matrix(table.rotations).as_quat()
         return self._known[key][0], poses, message
 
-    def _described(self, number: int, shapes: list[Shape], scene: Any) -> dict[str, Any]:
-        names = body_names(scene.structure) if shapes else ()
-        goals = len(shapes) - (len(scene.goals) if shapes else 0)
+    def _described(self, number: int, shapes: Shapes, scene: Any) -> dict[str, Any]:
+        table, n = shapes.table, len(shapes.table.kinds)
+        names = body_names(scene.structure) if n else ()
+        goals = n - (len(scene.goals) if n else 0)
         sent, listed = [], []
-        for index, s in enumerate(shapes):
-            mesh = None
-            if s.mesh is not None:
-                known = self._meshes.get(id(s.mesh))
-                if known is None or known[1] is not s.mesh:
-                    known = self._meshes[id(s.mesh)] = len(self._meshes) + 1000 * number, s.mesh
-                    sent.append(_mesh(known[0], s.mesh))
+        for i in range(n):
+            mesh, body, tiles = None, table.bodies[i], table.tiles[i].tolist()
+            if i in shapes.meshes:
+                shown = shapes.meshes[i]
+                known = self._meshes.get(id(shown))
+                if known is None or known[1] is not shown:
+                    known = self._meshes[id(shown)] = len(self._meshes) + 1000 * number, shown
+                    sent.append(_mesh(known[0], shown))
                 mesh = known[0]
             listed.append(
                 {
-                    "kind": s.kind,
-                    "halves": _short(s.halves),
-                    "color": _short(s.color),
+                    "kind": KINDS[table.kinds[i]],
+                    "halves": _short(table.halves[i]),
+                    "color": _short(table.colors[i]),
                     "mesh": mesh,
-                    "body": names[s.body] if 0 <= s.body < len(names) else "",
-                    "goal": scene.goals[index - goals].name if index >= goals else "",
-                    "moves": bool(s.moves),
-                    "tiles": s.tiles and [list(s.tiles.size), list(s.tiles.color)],
+                    "body": names[body] if 0 <= body < len(names) else "",
+                    "goal": scene.goals[i - goals].name if i >= goals else "",
+                    "moves": bool(table.moves[i]),
+                    "tiles": [tiles[:2], tiles[2:]] if isfinite(tiles[0]) else None,
                 }
             )
         return {"type": "scene", "scene": number, "shapes": listed, "meshes": sent}

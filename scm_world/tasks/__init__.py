@@ -14,7 +14,6 @@ from scm_world.tasks.factories import is_model, load_factory
 from scm_world.tasks.model import ModelTask
 from scm_world.tasks.rewards import Common, term
 from scm_world.tasks.step import StepTask
-from scm_world.tasks.trifinger import platform as _platform  # noqa: F401 # registers its backend
 from scm_world.tasks.trifinger.base import HEAD, TriFingerTask
 from scm_world.tasks.trifinger.building import Building, Towers
 from scm_world.tasks.trifinger.conventions import CONVENTIONS

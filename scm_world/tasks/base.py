@@ -111,16 +111,14 @@ class Conventions:
 
     Attributes:
         name: ``"scm_world"`` or ``"causal_world"``.
-        reward_times_dt: Rewards multiplied by the control period.
-        extra_step: Episodes one step longer than their length.
-        published_observation: The published normalisation of observations, which values may
-            leave, and a time feature in seconds minus steps where a length is given.
+        published: Whether they are those of CausalWorld 1.2: rewards multiplied by the control
+            period, episodes one step longer than their length, the published normalisation of
+            observations, which values may leave, and a time feature in seconds minus steps where a
+            length is given.
     """
 
     name: str = "scm_world"
-    reward_times_dt: bool = False
-    extra_step: bool = False
-    published_observation: bool = False
+    published: bool = False
 
     def adapt(self, variables: Iterable[Variable]) -> Iterable[Variable]:
         """Return the variables with the spaces of these conventions."""
@@ -214,7 +212,7 @@ class Task(ABC):
         "resolution": ("declared",),
         "conventions": {
             "scm_world": conventions,
-            "causal_world": Conventions("causal_world", True, True, True),
+            "causal_world": Conventions("causal_world", published=True),
         },
     }
     time_unit: float

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from scm_world.backends.renderer.shapes import SKY, draw_parts, goal_shapes, par
 from scm_world.geometry import rotation_matrix
 from scm_world.models.camera import Camera
 from scm_world.models.scene import GoalRegion, Light
-from scm_world.models.shapes import Kind, Mesh, Shape, Shapes, Tiles, mesh_of
+from scm_world.models.shapes import KINDS, Mesh, Shapes, mesh_of
 
 LIGHT = Light()
 CAMERA = Camera("test", (0.7, -1.1, 0.9), (0.0, 0.0, 0.0), width=160, height=120)
@@ -26,30 +27,39 @@ GREEN = np.array([0.0, 1.0, 0.0, 1.0])
 
 
 def shape(
-    kind: Kind,
+    kind: str,
     halves: tuple[float, float, float],
-    at: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    at: Sequence[float] = (0.0, 0.0, 0.0),
     *,
     color: Floats = RED,
     rotation: Floats = TURN,
     mesh: Mesh | None = None,
-    tiles: Tiles | None = None,
+    tiles: Sequence[float] | None = None,
     moves: bool = False,
-) -> Shape:
+) -> Shapes:
     """Make body 0."""
-    return Shape(kind, np.array(halves), np.array(at), rotation, color, 0, moves, mesh, tiles)
+    numbers = [KINDS.index(kind)], [halves], [at], [rotation], [color]
+    found = Shapes.of(*numbers, [0], [moves])._replace(meshes={} if mesh is None else {0: mesh})
+    if tiles is not None:
+        found.table.tiles[0] = tiles
+    return found
+
+
+def together(shapes: Sequence[Shapes]) -> Shapes:
+    """Put shapes into one scene."""
+    return reduce(Shapes.joined, shapes, Shapes.of([], [], [], [], []))
 
 
 def draw_shapes(
-    shapes: Sequence[Shape], camera: Camera, light: Light, *, shadows: bool = True
+    shapes: Sequence[Shapes], camera: Camera, light: Light, *, shadows: bool = True
 ) -> Canvas:
     """Draw a list of shapes."""
-    return draw_parts(parted(Shapes.of(shapes), shadows=shadows), camera, light)
+    return draw_parts(parted(together(shapes), shadows=shadows), camera, light)
 
 
-def corners(one: Shape) -> Floats:
+def corners(one: Shapes) -> Floats:
     """Compute the corners of the box around a shape."""
-    found: Floats = Shapes.of([one]).corners(np.array([0]))[0]
+    found: Floats = one.corners(np.array([0]))[0]
     return found
 
 
@@ -62,7 +72,7 @@ def box_mesh(halves: tuple[float, float, float]) -> Mesh:
     return mesh_of(hull.vertices, hull.faces)
 
 
-def grid_mesh(halves: tuple[float, float, float], kind: Kind, n: int = 200) -> Mesh:
+def grid_mesh(halves: tuple[float, float, float], kind: str, n: int = 200) -> Mesh:
     """Triangulate an ellipsoid, or the side and the ends of a cylinder, finely."""
     around = np.linspace(0.0, 2.0 * np.pi, n)
     if kind == "cylinder":
@@ -86,7 +96,7 @@ def seen(canvas: Canvas) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["box", "cylinder", "ellipsoid"])
-def test_a_solid_looks_like_its_triangles(kind: Kind) -> None:
+def test_a_solid_looks_like_its_triangles(kind: str) -> None:
     """Depth, color and outline of a solid are those of a fine mesh of it, but for rounding."""
     halves = (0.3, 0.2, 0.4) if kind != "cylinder" else (0.3, 0.3, 0.4)
     mesh = box_mesh(halves) if kind == "box" else grid_mesh(halves, kind)
@@ -103,7 +113,7 @@ def test_a_solid_looks_like_its_triangles(kind: Kind) -> None:
 
 
 @pytest.mark.parametrize("kind", ["box", "cylinder", "capsule", "ellipsoid", "mesh"])
-def test_the_inside_is_seen_from_within(kind: Kind) -> None:
+def test_the_inside_is_seen_from_within(kind: str) -> None:
     """A camera in a solid sees it everywhere, at the distance of its far side."""
     mesh = box_mesh((2.0, 2.0, 2.0)) if kind == "mesh" else None
     around = shape(kind, (2.0, 2.0, 4.0 if kind == "capsule" else 2.0), mesh=mesh)
@@ -150,14 +160,16 @@ def test_what_is_behind_the_camera_is_not_seen() -> None:
 
 
 @pytest.mark.parametrize("kind", ["box", "mesh", "plane"])
-def test_a_clear_shape_is_blended_once(kind: Kind) -> None:
+def test_a_clear_shape_is_blended_once(kind: str) -> None:
     """Half of the light comes from a clear shape, half from behind; depth is that of the solid."""
     clear = np.array([0.0, 0.0, 1.0, 0.5])
     mesh = box_mesh((0.4, 0.4, 0.4)) if kind == "mesh" else None
-    glass = shape(kind, (0.4, 0.4, 0.4), mesh=mesh, color=clear, rotation=np.eye(3))
+    glass, pane = (
+        shape(kind, (0.4, 0.4, 0.4), mesh=mesh, color=color, rotation=np.eye(3))
+        for color in (clear, np.array([0.0, 0.0, 1.0, 1.0]))
+    )
     with_, opaque, without = (
-        draw_shapes(shapes, CAMERA, LIGHT)
-        for shapes in ([glass], [glass._replace(color=np.array([0.0, 0.0, 1.0, 1.0]))], [])
+        draw_shapes(shapes, CAMERA, LIGHT) for shapes in ([glass], [pane], [])
     )
     inside = seen(opaque)
     middle = (opaque.rgb.astype(float) + without.rgb)[:, inside] / 2.0
@@ -216,7 +228,7 @@ def test_a_plane_ends_where_it_says() -> None:
 
 def test_tiles_of_a_plane() -> None:
     """The tile of the least x and greatest y has the first color, its neighbors the second."""
-    tiles = Tiles((0.2, 0.2), (0.0, 0.0, 1.0))
+    tiles = 0.2, 0.2, 0.0, 0.0, 1.0
     sheet = shape(
         "plane", (0.3, 0.3, 0.0), color=GREEN, rotation=np.eye(3), tiles=tiles
     )  # three by three
@@ -233,9 +245,9 @@ def test_tiles_of_a_plane() -> None:
 
 def test_far_tiles_fade() -> None:
     """Near the horizon a checkerboard has one color; there is no flicker of single pixels."""
-    tiles = Tiles((0.3, 0.3), (0.0, 0.0, 0.0))
+    floor = shape("plane", (0, 0, 0), rotation=np.eye(3), color=GREEN, tiles=(0.3, 0.3, 0, 0, 0))
     low = replace(CAMERA, eye=(0.0, -3.0, 1.0), target=(0.0, 0.0, 0.9), far=1e4)
-    canvas = draw_shapes([FLOOR._replace(tiles=tiles)], low, LIGHT)
+    canvas = draw_shapes([floor], low, LIGHT)
     first = int(np.argmax(seen(canvas)[:, 80]))
     row = canvas.rgb[1, first + 1]
 
@@ -258,13 +270,13 @@ def test_shadows_fall_on_planes() -> None:
 
 
 @pytest.mark.parametrize("kind", ["box", "mesh"])
-def test_shadow_of_a_tilted_plane(kind: Kind) -> None:
+def test_shadow_of_a_tilted_plane(kind: str) -> None:
     """A plane that is turned shows the shadow where the light meets it."""
     turn = rotation_matrix(np.array([np.sin(0.2), 0.0, 0.0, np.cos(0.2)]))
     normal = turn[:, 2]
     mesh = box_mesh((0.1, 0.1, 0.1)) if kind == "mesh" else None
     block = shape(kind, (0.1, 0.1, 0.1), tuple(0.4 * normal), mesh=mesh, rotation=np.eye(3))
-    slope = FLOOR._replace(rotation=turn)
+    slope = shape("plane", (0.0, 0.0, 0.0), rotation=turn, color=GREEN)
     light = Light(tuple(normal.tolist()))
     camera = replace(CAMERA, eye=(1.5, -1.0, 1.3))
     with_, without = (
@@ -290,7 +302,7 @@ def test_framing_shows_all_that_moves_and_fills_the_picture() -> None:
     ]
     wall = shape("box", (20.0, 0.1, 20.0), (0.0, 30.0, 0.0))
     size = 90, 200
-    camera = automatic_camera(Shapes.of([FLOOR, wall, *moving]), size)
+    camera = automatic_camera(together([FLOOR, wall, *moving]), size)
     points = camera.project(np.concatenate([corners(one) for one in moving]))
     share = points[:, :2] / (200, 90)
 
@@ -303,7 +315,7 @@ def test_framing_shows_all_that_moves_and_fills_the_picture() -> None:
 def test_framing_of_what_stands_still() -> None:
     """Where nothing moves, everything but planes is seen."""
     table = shape("box", (0.5, 0.5, 0.1), (1.0, 1.0, 0.5))
-    assert automatic_camera(Shapes.of([FLOOR, table]), (60, 80)).target == pytest.approx(
+    assert automatic_camera(together([FLOOR, table]), (60, 80)).target == pytest.approx(
         (1.0, 1.0, 0.5)
     )
 
@@ -311,14 +323,14 @@ def test_framing_of_what_stands_still() -> None:
 def test_following_keeps_a_body_near_the_middle() -> None:
     """A camera stays while a body moves a little, and then goes along with it."""
     body = shape("ellipsoid", (0.1, 0.1, 0.1), moves=True)
-    camera = automatic_camera(Shapes.of([FLOOR, body]), (60, 80))
-    near = Shapes.of([body._replace(position=np.array([0.02, 0.0, 0.0]))])
+    camera = automatic_camera(together([FLOOR, body]), (60, 80))
+    near = shape("ellipsoid", (0.1, 0.1, 0.1), (0.02, 0.0, 0.0), moves=True)
     assert following_camera(camera, near) is camera
 
     offset = np.subtract(camera.eye, camera.target)
     for x in np.linspace(0.0, 10.0, 50):
-        there = body._replace(position=np.array([x, 0.0, np.sin(x)]))
-        camera = following_camera(camera, Shapes.of([FLOOR, there]))
+        there = shape("ellipsoid", (0.1, 0.1, 0.1), (x, 0.0, np.sin(x)), moves=True)
+        camera = following_camera(camera, together([FLOOR, there]))
         pixels = camera.project(corners(there))[:, :2]
         assert (pixels > 0.0).all()
         assert (pixels < (80.0, 60.0)).all()
@@ -331,7 +343,7 @@ def test_goals_are_silhouettes() -> None:
     for kind, hull in (("box", None), ("sphere", None), ("hull", box_hull([0.3, 0.3, 0.3]))):
         goal = GoalRegion("goal", kind, np.full(3, 0.3), np.zeros(3), upright, RED[:3], hull)
         with_, without = (
-            draw_shapes(shapes, CAMERA, LIGHT) for shapes in (goal_shapes([goal]).listed(), [])
+            draw_shapes(shapes, CAMERA, LIGHT) for shapes in ([goal_shapes([goal])], [])
         )
         assert (with_.rgb != without.rgb).any(axis=0).sum() > 400
         np.testing.assert_array_equal(with_.depth, without.depth)

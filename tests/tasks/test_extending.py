@@ -11,11 +11,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from scm_world.tasks.trifinger.entities.blocks import block_size
 
 from scm_world.errors import ModelError
 from scm_world.tasks import Building
 from scm_world.tasks.trifinger.building import Piece, blocks_mass
-from scm_world.tasks.trifinger.entities.blocks import block_size
 from scm_world.testing.task import TaskConformance
 from scm_world.world import Simulation
 

@@ -7,7 +7,7 @@ from robot_scenes import box_hull, busy_scene, other_value
 
 from scm_world.models import Difference, Scene
 from scm_world.models.scene import complete
-from scm_world.tasks.trifinger.hardware import PRECISE, ControllerSpec
+from scm_world.tasks.trifinger.hardware import PRECISE
 from scm_world.tasks.trifinger.system import trifinger
 
 
@@ -66,11 +66,11 @@ def test_what_is_said_counts() -> None:
 
 def test_default_parameters_specify_the_published_controller() -> None:
     """The controller of the default parameters is the published one."""
-    parameters, spec = trifinger().default_scene().parameters, ControllerSpec()
+    parameters = trifinger().default_scene().parameters
     for name, value in (
-        ("position_gains", spec.kp),
-        ("velocity_gains", spec.kd),
-        ("safety_damping", spec.safety),
-        ("torque_limit", spec.limit),
+        ("position_gains", (10.0, 10.0, 10.0)),
+        ("velocity_gains", (0.1, 0.3, 0.001)),
+        ("safety_damping", (0.08, 0.08, 0.04)),
+        ("torque_limit", 0.36),
     ):
         np.testing.assert_array_equal(parameters["controller", name], value)

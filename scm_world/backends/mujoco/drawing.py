@@ -25,14 +25,12 @@ from scm_world.models.shapes import (
     CAPSULE,
     CYLINDER,
     ELLIPSOID,
-    KINDS,
     MESH,
+    PLAIN,
     PLANE,
     Mesh,
-    Shape,
     Shapes,
     ShapeTable,
-    Tiles,
     mesh_of,
 )
 
@@ -108,7 +106,8 @@ class VisibleModel:
         model, data, rows, kinds = self.model, self.data, self._rows, self._kinds
         halves = model.geom_size[rows[:, None], self._columns]
         halves[kinds == CAPSULE, 2] += halves[kinds == CAPSULE, 0]
-        colors, tiles = model.geom_rgba[rows], dict[int, Tiles]()
+        colors, tiles = model.geom_rgba[rows], np.empty((len(rows), 5))
+        tiles[:] = PLAIN
         if self._textures:
             plain = (colors == UNCOLORED).all(axis=1) & (self._materials >= 0)
             colors[plain] = model.mat_rgba[self._materials[plain]]
@@ -116,22 +115,18 @@ class VisibleModel:
         for row, material in enumerate(self._materials.tolist() if self._textures else ()):
             texture = self._textures[material] if material >= 0 else None
             if texture is not None and kinds[row] == PLANE:
-                tiles[row] = self._tiles(material, halves[row], colors[row, :3] * texture[1])
+                repeat = np.maximum(model.mat_texrepeat[material], 1e-6)
+                whole = np.ones(2) if model.mat_texuniform[material] else halves[row, :2]
+                tiles[row, :2] = np.where(whole > 0.0, whole, 1.0) / repeat  # a texture has 2 by 2
+                tiles[row, 2:] = colors[row, :3] * texture[1]
                 colors[row, :3] *= texture[0]
             elif texture is not None:
                 colors[row, :3] *= texture.mean(axis=0)
         places = data.geom_xpos[rows], data.geom_xmat[rows].reshape(-1, 3, 3)
-        table = ShapeTable(kinds, halves, *places, colors, self._bodies)
-        found = Shapes(table, self._moves[self._bodies], self._meshes, tiles)
-        return found.joined(Shapes.of(list(self._others()))) if self._more else found
-
-    def _tiles(self, material: int, halves: Floats, color: Floats) -> Tiles:
-        """Measure the tiles on a plane: a texture holds two by two."""
-        repeat = np.maximum(self.model.mat_texrepeat[material], 1e-6)
-        whole = np.ones(2) if self.model.mat_texuniform[material] else halves[:2]
-        first, second = (np.where(whole > 0.0, whole, 1.0) / repeat).tolist()
-        red, green, blue = color.tolist()
-        return Tiles((first, second), (red, green, blue))
+        moves = self._moves[self._bodies]
+        table = ShapeTable(kinds, halves, *places, colors, self._bodies, moves, tiles)
+        found = Shapes(table, self._meshes)
+        return found.joined(self._others()) if self._more else found
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -170,16 +165,17 @@ class VisibleModel:
         option.geomgroup[:] = 0
         return mujoco.MjvScene(self.model, MOST_SHAPES), option
 
-    def _others(self) -> Iterator[Shape]:
-        """List sites, tendons, flexes and skins."""
+    def _others(self) -> Shapes:
+        """Collect sites, tendons, flexes and skins."""
         model, data, (scene, option) = self.model, self.data, self._abstract
         mujoco.mj_comPos(model, data)
         mujoco.mj_flex(model, data)
         mujoco.mj_tendon(model, data)
         everything, camera = int(mujoco.mjtCatBit.mjCAT_ALL), mujoco.MjvCamera()
         mujoco.mjv_updateScene(model, data, option, None, camera, everything, scene)
+        rows, meshes = list[Any](), dict[int, Mesh]()
         for geom in scene.geoms[: scene.ngeom]:
-            halves, position, rotation, color = (
+            halves, *place, color = (
                 np.array(numbers, dtype=np.float64)
                 for numbers in (geom.size, geom.pos, geom.mat, geom.rgba)
             )
@@ -191,46 +187,44 @@ class VisibleModel:
                 body = int(model.site_bodyid[geom.objid])
                 moves = bool(self._moves[body])
             if geom.type == _GEOM.mjGEOM_FLEX and scene.flexfaceused[geom.objid] == 0:
-                yield from self._edges(scene, geom, color)
+                rows += [(CAPSULE, *edge, color, -1, True) for edge in self._edges(scene, geom)]
             elif geom.type in (_GEOM.mjGEOM_FLEX, _GEOM.mjGEOM_SKIN):  # they stand in the world
-                mesh, place = self._surface(scene, geom), (np.zeros(3), np.eye(3))
-                yield Shape("mesh", halves, *place, color, moves=True, mesh=mesh)
+                meshes[len(rows)] = self._surface(scene, geom)
+                rows.append((MESH, halves, np.zeros(3), np.eye(3), color, -1, True))
             elif geom.type in _KINDS:
                 kind = _KINDS[geom.type][0]
                 halves[2] += halves[0] if kind == CAPSULE else 0.0
-                yield Shape(KINDS[kind], halves, position, rotation, color, body, moves)
+                rows.append((kind, halves, *place, color, body, moves))
+        columns: Any = zip(*rows, strict=True) if rows else [()] * 7
+        return Shapes.of(*columns)._replace(meshes=meshes)
 
-    def _edges(
-        self, scene: mujoco.MjvScene, geom: mujoco.MjvGeom, color: Floats
-    ) -> Iterator[Shape]:
-        """List the edges of a flex without faces, a cable, as capsules."""
+    def _edges(self, scene: Any, geom: Any) -> Iterator[tuple[Floats, Floats, Floats]]:
+        """Return the edges of a flex without faces, a cable, as capsules."""
         flex, radius = geom.objid, float(self.model.flex_radius[geom.objid])
         first, n = scene.flexvertadr[flex], scene.flexvertnum[flex]
         begin, m = scene.flexedgeadr[flex], scene.flexedgenum[flex]
         vertices = scene.flexvert[3 * first : 3 * (first + n)].reshape(-1, 3).astype(np.float64)
         for start, end in vertices[scene.flexedge[2 * begin : 2 * (begin + m)].reshape(-1, 2)]:
-            turn, length = np.empty(4), float(np.linalg.norm(end - start))
-            rotation = np.empty(9)
+            turn, rotation, length = np.empty(4), np.empty(9), float(np.linalg.norm(end - start))
             mujoco.mju_quatZ2Vec(turn, end - start)
             mujoco.mju_quat2Mat(rotation, turn)
             halves = np.array([radius, radius, radius + length / 2.0])
-            middle = (start + end) / 2.0
-            yield Shape("capsule", halves, middle, rotation.reshape(3, 3), color, moves=True)
+            yield halves, (start + end) / 2.0, rotation.reshape(3, 3)
 
-    def _surface(self, scene: mujoco.MjvScene, geom: mujoco.MjvGeom) -> Mesh:
+    def _surface(self, scene: Any, geom: Any) -> Mesh:
         """Copy the triangles of a flex or of a skin, in the world."""
+        number = geom.objid
         if geom.type == _GEOM.mjGEOM_FLEX:
-            first, n = 9 * scene.flexfaceadr[geom.objid], 9 * scene.flexfaceused[geom.objid]
-            faces = np.arange(n // 3).reshape(-1, 3)
-            vertices = scene.flexface[first : first + n].reshape(-1, 3)
-            normals = scene.flexnormal[first : first + n].reshape(-1, 3)
-            return mesh_of(vertices, faces, normals[faces])
-        first, n = scene.skinvertadr[geom.objid], scene.skinvertnum[geom.objid]
-        begin, m = self.model.skin_faceadr[geom.objid], self.model.skin_facenum[geom.objid]
-        faces = self.model.skin_face[begin : begin + m]
-        vertices = scene.skinvert[3 * first : 3 * (first + n)].reshape(-1, 3)
-        normals = scene.skinnormal[3 * first : 3 * (first + n)].reshape(-1, 3)
-        return mesh_of(vertices, faces, normals[faces])
+            first, n = 3 * scene.flexfaceadr[number], 3 * scene.flexfaceused[number]
+            faces = np.arange(n).reshape(-1, 3)
+            vertices, normals = scene.flexface, scene.flexnormal
+        else:
+            first, n = scene.skinvertadr[number], scene.skinvertnum[number]
+            begin, m = self.model.skin_faceadr[number], self.model.skin_facenum[number]
+            faces = self.model.skin_face[begin : begin + m]
+            vertices, normals = scene.skinvert, scene.skinnormal
+        part = slice(3 * first, 3 * (first + n))
+        return mesh_of(vertices[part].reshape(-1, 3), faces, normals[part].reshape(-1, 3)[faces])
 
 
 @lru_cache(maxsize=MOST_STAGES)

@@ -1,4 +1,4 @@
-"""Solids and planes onto pixels.
+"""Solids, planes and triangles onto pixels.
 
 Every pixel (column u, row v) has a ray ``origin + t * direction``. Both are affine in u and v,
 which covers a pinhole camera (one origin) as well as parallel light (one direction). Directions are
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.models.camera import Camera
-from scm_world.models.shapes import BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, ShapeTable
+from scm_world.models.shapes import BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, Mesh, ShapeTable
 
 Depths = NDArray[np.float32]
 Owners = NDArray[np.int32]
@@ -30,7 +30,7 @@ Hit = tuple[float, float, float, float]
 """The depth at which a ray is seen to meet a surface, and the normal towards the ray; for a plane,
 two coordinates of the point where it is met."""
 
-EDGE = 0.06  # how wide the edge of a silhouette is, in halves of its size
+INNER = 1.0 - 0.06  # where the edge of a silhouette begins, in halves of its size
 SHADOW = 0.45 / 0.7  # how much of the light that is not ambient a full shadow takes away
 TIE = 1e-5  # [m] what lies this close to a silhouette is drawn over it
 
@@ -51,11 +51,11 @@ class View(NamedTuple):
 
 
 class Canvas(NamedTuple):
-    """What has been seen so far, and how large the picture is.
+    """What has been seen so far.
 
     Attributes:
         depth: Shape (h, w).
-        owners: Shape (h, w), or (0, 0) if they are not needed.
+        owners: Bodies, shape (h, w).
         rgb: Shape (3, h, w), or (3, 0, 0) if they are not needed.
     """
 
@@ -64,31 +64,25 @@ class Canvas(NamedTuple):
     rgb: Colors
 
 
-class Ground(NamedTuple):
-    """What lies on a plane.
+class Shadow(NamedTuple):
+    """The shadow on a plane.
 
     Attributes:
-        tiles: Edges of its tiles, shape (2,) [m].
-        other: Red, green, blue in [0, 1] of every other tile, shape (3,).
-        shadow: How dark it is, shape (n, n) in [0, 1]; of shape (0, 0) without shadows.
-        square: First and second coordinate of the middle of the shadow, and half the edge of its
-            square, shape (3,) [m].
+        dark: How dark it is, shape (n, n) in [0, 1]; of shape (0, 0) without a shadow.
+        square: First and second coordinate of its middle, and half the edge of its square,
+            shape (3,) [m].
     """
 
-    tiles: Floats
-    other: Floats
-    shadow: Floats
+    dark: Floats
     square: Floats
 
 
-NO_SHADOW = np.zeros((0, 0)), np.zeros(3)
-NO_GROUND = Ground(np.ones(2), np.zeros(3), *NO_SHADOW)
-NO_OWNERS = np.zeros((0, 0), dtype=np.int32)
+NO_SHADOW = Shadow(np.zeros((0, 0)), np.zeros(3))
 NO_COLORS = np.zeros((3, 0, 0), dtype=np.uint8)
 
 
 @njit(cache=True, error_model="numpy")
-def projected(vertices: Floats, position: Floats, rotation: Floats, view: View) -> Floats:
+def _projected(vertices: Floats, position: Floats, rotation: Floats, view: View) -> Floats:
     """Compute the homogeneous pixels of points, shape (n, 3)."""
     p, r, o = view.projection, rotation, position
     matrix = np.empty((3, 4))
@@ -105,13 +99,10 @@ def projected(vertices: Floats, position: Floats, rotation: Floats, view: View) 
 
 
 @njit(cache=True, error_model="numpy")
-def bounds(corners: Floats, near: float, shape: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Bound the pixels between corners: first and last column plus one, the same for rows.
+def _bounds(corners: Floats, near: float, shape: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Bound the pixels between corners, homogeneous pixels of shape (k, 3).
 
-    Args:
-        corners: Homogeneous pixels, shape (k, 3).
-        near: Smallest depth that is seen. What is partly nearer can cover any pixel.
-        shape: Height and width of the picture.
+    First and last column plus one, the same for rows; what is partly too near can cover any pixel.
     """
     height, width = shape
     left, right, top, bottom, ahead = math.inf, -math.inf, math.inf, -math.inf, 0
@@ -134,7 +125,7 @@ def bounds(corners: Floats, near: float, shape: tuple[int, int]) -> tuple[int, i
 def _rectangle(
     shapes: ShapeTable, n: int, view: View, shape: tuple[int, int]
 ) -> tuple[int, int, int, int]:
-    """Bound the pixels a shape can cover by the box around it; see ``bounds``."""
+    """Bound the pixels a shape can cover by the box around it; see ``_bounds``."""
     halves = shapes.halves[n]
     if shapes.kinds[n] == PLANE and min(halves[0], halves[1]) <= 0.0:
         return 0, shape[1], 0, shape[0]
@@ -142,9 +133,8 @@ def _rectangle(
     for corner in range(8):
         for k in range(3):
             corners[corner, k] = halves[k] if (corner >> k) & 1 else -halves[k]
-    return bounds(
-        projected(corners, shapes.positions[n], shapes.rotations[n], view), view.near, shape
-    )
+    pixels = _projected(corners, shapes.positions[n], shapes.rotations[n], view)
+    return _bounds(pixels, view.near, shape)
 
 
 @njit(cache=True, error_model="numpy")
@@ -190,17 +180,10 @@ def _dot(a: Triple, b: Triple, third: float) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _round_span(rays: Floats, v: int, third: float, left: int, right: int) -> tuple[int, int]:
-    """Bound the columns of a row whose rays can meet a ball or an endless cylinder of radius 1.
+    """Bound the columns of a row whose rays can meet a ball (third 1) or an endless cylinder (0).
 
-    The discriminant of the intersection is a quadratic in the column. One more column on either
-    side makes up for rounding.
-
-    Args:
-        rays: In the frame of the shape, shape (6, 3).
-        v: The row.
-        third: 1 for a ball, 0 for a cylinder along z.
-        left: First column of the rectangle.
-        right: Last column of the rectangle plus one.
+    Both have radius 1, the cylinder lies along z. The discriminant of the intersection is a
+    quadratic in the column; one more column on either side makes up for rounding.
     """
     o, d, step_o, step_d = _along_row(rays, v)
     a0, a1, a2 = _dot(d, d, third), 2.0 * _dot(d, step_d, third), _dot(step_d, step_d, third)
@@ -220,45 +203,32 @@ def _round_span(rays: Floats, v: int, third: float, left: int, right: int) -> tu
 
 
 @njit(cache=True, error_model="numpy")
-def byte(color: float) -> int:
+def _byte(color: float) -> int:
     """Round a color to what a pixel can hold."""
     return int(min(max(color, 0.0), 255.0) + 0.5)
 
 
 @njit(cache=True, error_model="numpy")
-def brightness(cosine: float, ambient: float) -> float:
+def _brightness(cosine: float, ambient: float) -> float:
     """Shade a surface by the cosine to the light; softer than Lambert on the far side."""
     return ambient + (1.0 - ambient) * (0.5 + 0.5 * cosine)
 
 
 @njit(cache=True, error_model="numpy")
-def _shadow_at(ground: Ground, hit: Floats) -> float:
-    """Read the shadow map of a plane between its texels; beside its square there is no shadow."""
-    x, y, half = hit[1] - ground.square[0], hit[2] - ground.square[1], ground.square[2]
-    size, shadow = ground.shadow.shape[0], ground.shadow
+def _shadow_at(shadow: Shadow, hit: Floats) -> float:
+    """Read the shadow on a plane between its texels; beside its square there is none."""
+    dark, square, size = shadow.dark, shadow.square, shadow.dark.shape[0]
+    x, y, half = hit[1] - square[0], hit[2] - square[1], square[2]
     if size == 0 or not (abs(x) < half and abs(y) < half):
         return 0.0
     scale = 0.5 / half * (size - 1.001)  # the last texel has none beyond
     u, v = max(x + half, 0.0) * scale, max(y + half, 0.0) * scale
     i, j = min(int(v), size - 2), min(int(u), size - 2)
     u, v = u - j, v - i
-    upper = shadow[i, j] * (1.0 - u) + shadow[i, j + 1] * u
-    lower = shadow[i + 1, j] * (1.0 - u) + shadow[i + 1, j + 1] * u
+    upper = dark[i, j] * (1.0 - u) + dark[i, j + 1] * u
+    lower = dark[i + 1, j] * (1.0 - u) + dark[i + 1, j + 1] * u
     shade: float = upper * (1.0 - v) + lower * v
     return shade
-
-
-@njit(cache=True, error_model="numpy")
-def _opacity(kind: int, point: Triple) -> float:
-    """Make edges of boxes visible in silhouettes: twice as opaque where sides meet.
-
-    The point is on the cube from -1 to 1.
-    """
-    if kind != BOX:
-        return 1.0
-    x, y, z = point
-    edge = 1.0 - EDGE
-    return 1.0 if (abs(x) > edge) + (abs(y) > edge) + (abs(z) > edge) < 2 else 2.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -277,7 +247,7 @@ def _scale(shapes: ShapeTable, n: int) -> tuple[Floats, float]:
 
 
 @njit(cache=True, error_model="numpy")
-def turned(rotation: Floats, vector: Floats) -> Triple:
+def _turned(rotation: Floats, vector: Floats) -> Triple:
     """Express a direction of the world in the frame of a shape."""
     x = rotation[0, 0] * vector[0] + rotation[1, 0] * vector[1] + rotation[2, 0] * vector[2]
     y = rotation[0, 1] * vector[0] + rotation[1, 1] * vector[1] + rotation[2, 1] * vector[2]
@@ -286,17 +256,11 @@ def turned(rotation: Floats, vector: Floats) -> Triple:
 
 
 @njit(cache=True, error_model="numpy")
-def _cosine(kind: int, n: Triple, scale: Floats, lamp: Triple) -> float:
-    """Compute the cosine between a normal and the light, both in the frame of the shape.
-
-    The normal of a scaled ball, divided by the scale, is normal to the ellipsoid; those of
-    other shapes have unit length as they are.
-    """
-    if kind != ELLIPSOID:
-        return n[0] * lamp[0] + n[1] * lamp[1] + n[2] * lamp[2]
-    x, y, z = n[0] / scale[0], n[1] / scale[1], n[2] / scale[2]
-    product: float = x * lamp[0] + y * lamp[1] + z * lamp[2]
-    return product / math.sqrt(x * x + y * y + z * z)
+def _cosine(x: float, y: float, z: float, lamp: Triple) -> float:
+    """Compute the cosine between a normal of any length and the light."""
+    length = max(math.sqrt(x * x + y * y + z * z), 1e-300)
+    cosine: float = (x * lamp[0] + y * lamp[1] + z * lamp[2]) / length
+    return cosine
 
 
 @njit(cache=True, error_model="numpy")
@@ -341,12 +305,7 @@ def _hit_round(o: Triple, d: Triple, half: float, near: float) -> Hit:
 def _hit_flat(o: Triple, d: Triple, first: int, half: float, near: float) -> Hit:
     """Meet the cube from -1 to 1 (first 0), or the cylinder of radius 1 along z (first 2).
 
-    Args:
-        o: Origin of the ray.
-        d: Its direction.
-        first: The coordinates from this one on are between -half and half.
-        half: See ``first``.
-        near: Smallest depth that is seen.
+    The coordinates from the first one on are between -half and half.
     """
     enter, leave, enter_axis, leave_axis = -math.inf, math.inf, 3, 3
     if first == 2:
@@ -396,111 +355,62 @@ def _meet_row(
     o, d, step_o, step_d = _along_row(rays, v)
     if kind in (ELLIPSOID, CAPSULE):
         for u in range(span[0], span[1]):
-            _write(hits, u, _hit_round(_at(o, step_o, u), _at(d, step_d, u), half, near))
+            hits[u, 0], hits[u, 1], hits[u, 2], hits[u, 3] = _hit_round(
+                _at(o, step_o, u), _at(d, step_d, u), half, near
+            )
     elif kind == BOX:
         for u in range(span[0], span[1]):
-            _write(hits, u, _hit_flat(_at(o, step_o, u), _at(d, step_d, u), 0, 1.0, near))
+            hits[u, 0], hits[u, 1], hits[u, 2], hits[u, 3] = _hit_flat(
+                _at(o, step_o, u), _at(d, step_d, u), 0, 1.0, near
+            )
     elif kind == CYLINDER:
         for u in range(span[0], span[1]):
-            _write(hits, u, _hit_flat(_at(o, step_o, u), _at(d, step_d, u), 2, half, near))
+            hits[u, 0], hits[u, 1], hits[u, 2], hits[u, 3] = _hit_flat(
+                _at(o, step_o, u), _at(d, step_d, u), 2, half, near
+            )
     else:
         for u in range(span[0], span[1]):
-            hit = _hit_plane(_at(o, step_o, u), _at(d, step_d, u), shapes.halves[n], near)
-            _write(hits, u, hit)
+            hits[u, 0], hits[u, 1], hits[u, 2], hits[u, 3] = _hit_plane(
+                _at(o, step_o, u), _at(d, step_d, u), shapes.halves[n], near
+            )
 
 
 @njit(cache=True, error_model="numpy")
-def _write(hits: Floats, u: int, hit: Hit) -> None:
-    """Note one hit."""
-    hits[u, 0], hits[u, 1], hits[u, 2], hits[u, 3] = hit
-
-
-@njit(cache=True, error_model="numpy")
-def _tint(ground: Ground, color: Floats, halves: Floats, hit: Floats, spread: float) -> Triple:
+def _tint(color: Floats, tiles: Floats, halves: Floats, hit: Floats, spread: float) -> Triple:
     """Compute the color, 255 where it is full, of a point of a plane that a pixel spreads over.
 
     Tiles fade into one color where they are smaller than a pixel.
     """
-    left, back, tiles, other = -halves[0], halves[1], ground.tiles, ground.other
+    left, back = -halves[0], halves[1]
     odd = (math.floor((hit[1] - left) / tiles[0]) + math.floor((back - hit[2]) / tiles[1])) % 2.0
     clear = max(1.0 - spread / min(tiles[0], tiles[1]), 0.0)
     share = 0.5 + clear * (odd - 0.5)
     return (
-        255.0 * (color[0] + share * (other[0] - color[0])),
-        255.0 * (color[1] + share * (other[1] - color[1])),
-        255.0 * (color[2] + share * (other[2] - color[2])),
+        255.0 * (color[0] + share * (tiles[2] - color[0])),
+        255.0 * (color[1] + share * (tiles[3] - color[1])),
+        255.0 * (color[2] + share * (tiles[4] - color[2])),
     )
 
 
 @njit(cache=True, error_model="numpy")
-def blend(rgb: Colors, v: int, u: int, color: Triple, light: float, paint: float) -> None:
+def _blend(rgb: Colors, v: int, u: int, color: Triple, light: float, paint: float) -> None:
     """Blend a color, 255 where it is full, with what a pixel shows."""
     if paint == 1.0:
-        rgb[0, v, u] = byte(light * color[0])
-        rgb[1, v, u] = byte(light * color[1])
-        rgb[2, v, u] = byte(light * color[2])
+        rgb[0, v, u] = _byte(light * color[0])
+        rgb[1, v, u] = _byte(light * color[1])
+        rgb[2, v, u] = _byte(light * color[2])
         return
     rest, light = 1.0 - paint, light * paint
-    rgb[0, v, u] = byte(rest * rgb[0, v, u] + light * color[0])
-    rgb[1, v, u] = byte(rest * rgb[1, v, u] + light * color[1])
-    rgb[2, v, u] = byte(rest * rgb[2, v, u] + light * color[2])
-
-
-@njit(cache=True, error_model="numpy")
-def _draw_one(
-    shapes: ShapeTable,
-    n: int,
-    ground: Ground,
-    view: View,
-    light: Floats,
-    alpha: float,
-    canvas: Canvas,
-) -> None:
-    """Draw one shape where it is nearer than what is there; see ``draw``."""
-    depth, owners, rgb = canvas
-    left, right, top, bottom = _rectangle(shapes, n, view, depth.shape)
-    kind, halves, (scale, half) = shapes.kinds[n], shapes.halves[n], _scale(shapes, n)
-    tint = shapes.colors[n]
-    color = (255.0 * tint[0], 255.0 * tint[1], 255.0 * tint[2])
-    solid, behind = alpha == 1.0, 0.0 if alpha == 1.0 else TIE
-    colored, owned = rgb.shape[1] > 0, solid and owners.shape[0] > 0
-    lamp, dark = turned(shapes.rotations[n], light), SHADOW * (1.0 - light[3])
-    rays = _to_frame(shapes.positions[n], shapes.rotations[n], view.rays, scale)
-    pixel = math.sqrt(rays[4, 0] ** 2 + rays[4, 1] ** 2 + rays[4, 2] ** 2)
-    hits = np.empty((depth.shape[1], 4))
-    for v in range(top, bottom):
-        start, stop = left, right
-        if kind in (CAPSULE, CYLINDER, ELLIPSOID):
-            start, stop = _round_span(rays, v, 1.0 if kind == ELLIPSOID else 0.0, left, right)
-        _meet_row(shapes, n, (view.near, half), rays, v, (start, stop), hits)
-        for u in range(start, stop):
-            t = hits[u, 0]
-            if t + behind >= depth[v, u]:
-                continue
-            if colored and kind == PLANE:
-                x, y, z = _ray(rays, 3, u, v)
-                spread = t * pixel * math.sqrt(x * x + y * y + z * z) / -z
-                shade = brightness(lamp[2], light[3]) * (1.0 - dark * _shadow_at(ground, hits[u]))
-                blend(rgb, v, u, _tint(ground, tint, halves, hits[u], spread), shade, alpha)
-            elif colored:
-                normal = (hits[u, 1], hits[u, 2], hits[u, 3])
-                cosine = _cosine(kind, normal, scale, lamp)
-                paint = alpha
-                if not solid:
-                    point = _at(_ray(rays, 0, u, v), _ray(rays, 3, u, v), t)
-                    paint = min(paint * _opacity(kind, point), 1.0)
-                blend(rgb, v, u, color, brightness(cosine, light[3]), paint)
-            if solid:
-                depth[v, u] = t
-            if owned:
-                owners[v, u] = shapes.bodies[n]
+    rgb[0, v, u] = _byte(rest * rgb[0, v, u] + light * color[0])
+    rgb[1, v, u] = _byte(rest * rgb[1, v, u] + light * color[1])
+    rgb[2, v, u] = _byte(rest * rgb[2, v, u] + light * color[2])
 
 
 @njit(cache=True, error_model="numpy")
 def draw(
     shapes: ShapeTable,
     which: Integers,
-    ground: Ground,
+    shadow: Shadow,
     view: View,
     light: Floats,
     alpha: float,
@@ -511,14 +421,126 @@ def draw(
     Args:
         shapes: What there is.
         which: Rows of what to draw, in this order; no meshes.
-        ground: What lies on the planes among them.
+        shadow: On the planes among them.
         view: The rays of the pixels.
         light: Unit vector towards the light, and the ambient brightness, shape (4,).
         alpha: Opacity. Below 1 colors are blended, and depth and owners stay as they are.
         canvas: What to draw on.
     """
+    depth, owners, rgb = canvas
+    colored, solid, dark = rgb.shape[1] > 0, alpha == 1.0, SHADOW * (1.0 - light[3])
+    behind, hits = 0.0 if solid else TIE, np.empty((depth.shape[1], 4))
     for n in which:
-        _draw_one(shapes, n, ground, view, light, alpha, canvas)
+        left, right, top, bottom = _rectangle(shapes, n, view, depth.shape)
+        kind, halves, (scale, half) = shapes.kinds[n], shapes.halves[n], _scale(shapes, n)
+        tint, tiles, lamp = shapes.colors[n], shapes.tiles[n], _turned(shapes.rotations[n], light)
+        color = (255.0 * tint[0], 255.0 * tint[1], 255.0 * tint[2])
+        rays = _to_frame(shapes.positions[n], shapes.rotations[n], view.rays, scale)
+        pixel = math.sqrt(rays[4, 0] ** 2 + rays[4, 1] ** 2 + rays[4, 2] ** 2)
+        for v in range(top, bottom):
+            start, stop = left, right
+            if kind in (CAPSULE, CYLINDER, ELLIPSOID):
+                third = 1.0 if kind == ELLIPSOID else 0.0
+                start, stop = _round_span(rays, v, third, left, right)
+            _meet_row(shapes, n, (view.near, half), rays, v, (start, stop), hits)
+            for u in range(start, stop):
+                t = hits[u, 0]
+                if t + behind >= depth[v, u]:
+                    continue
+                if colored and kind == PLANE:
+                    x, y, z = _ray(rays, 3, u, v)
+                    spread = t * pixel * math.sqrt(x * x + y * y + z * z) / -z
+                    shade = 1.0 - dark * _shadow_at(shadow, hits[u])
+                    shade = _brightness(lamp[2], light[3]) * shade
+                    _blend(rgb, v, u, _tint(tint, tiles, halves, hits[u], spread), shade, alpha)
+                elif colored:
+                    normal, paint = (hits[u, 1], hits[u, 2], hits[u, 3]), alpha
+                    cosine = _dot(normal, lamp, 1.0)
+                    if kind == ELLIPSOID:  # the normal of the scaled ball, divided by the scale
+                        x, y, z = normal[0] / scale[0], normal[1] / scale[1], normal[2] / scale[2]
+                        cosine = _cosine(x, y, z, lamp)
+                    if kind == BOX and not solid:  # twice as opaque where sides meet
+                        x, y, z = _at(_ray(rays, 0, u, v), _ray(rays, 3, u, v), t)
+                        sides = (abs(x) > INNER) + (abs(y) > INNER) + (abs(z) > INNER)
+                        paint = min(alpha * (1.0 if sides < 2 else 2.0), 1.0)
+                    _blend(rgb, v, u, color, _brightness(cosine, light[3]), paint)
+                if solid:
+                    depth[v, u], owners[v, u] = t, shapes.bodies[n]
+
+
+@njit(cache=True, error_model="numpy")
+def _edges(corners: Floats, edges: Floats) -> float:
+    """Write b × c, c × a and a × b of the corners a, b and c, shape (3, 3); return a · (b × c)."""
+    for i in range(3):
+        a0, a1, a2 = corners[(i + 1) % 3]
+        b0, b1, b2 = corners[(i + 2) % 3]
+        edges[i, 0] = a1 * b2 - a2 * b1
+        edges[i, 1] = a2 * b0 - a0 * b2
+        edges[i, 2] = a0 * b1 - a1 * b0
+    x, y, z = corners[0]
+    volume: float = x * edges[0, 0] + y * edges[0, 1] + z * edges[0, 2]
+    return volume
+
+
+@njit(cache=True, error_model="numpy")
+def draw_mesh(
+    mesh: Mesh, shapes: ShapeTable, n: int, view: View, light: Floats, alpha: float, canvas: Canvas
+) -> None:
+    """Draw triangles over what is there, where they are nearer. Both of their sides are seen.
+
+    The triangle with the homogeneous pixels a, b, c covers the pixel q where the products of q
+    with b × c, c × a and a × b have the sign of a · (b × c); it is seen from outside if that is
+    negative.
+
+    Args:
+        mesh: What to draw, in the frame of its shape.
+        shapes: With the shape.
+        n: Its row.
+        view: The rays of the pixels.
+        light: Unit vector towards the light, and the ambient brightness, shape (4,).
+        alpha: Opacity. Below 1, ``canvas.depth`` has to hold the depth of what is nearest, this
+            mesh included; only where the mesh is nearest are colors blended, and the depth there
+            is minus infinity afterwards. Owners stay as they are.
+        canvas: What to draw on.
+
+    Source:
+        Olano and Greer, *Triangle scan conversion using 2D homogeneous coordinates*, 1997.
+    """
+    depth, owners, rgb = canvas
+    colored, solid, tint = rgb.shape[1] > 0, alpha == 1.0, shapes.colors[n]
+    color = (255.0 * tint[0], 255.0 * tint[1], 255.0 * tint[2])
+    lamp = _turned(shapes.rotations[n], light)
+    pixels = _projected(mesh.vertices, shapes.positions[n], shapes.rotations[n], view)
+    corners, edges = np.empty((3, 3)), np.empty((3, 3))
+    for f in range(len(mesh.faces)):
+        for i in range(3):
+            for k in range(3):
+                corners[i, k] = pixels[mesh.faces[f, i], k]
+        left, right, top, bottom = _bounds(corners, view.near, depth.shape)
+        if left >= right or top >= bottom:
+            continue
+        volume = _edges(corners, edges)
+        side = 1.0 if volume > 0.0 else -1.0
+        for v in range(top, bottom):
+            for u in range(left, right):
+                a = side * (u * edges[0, 0] + v * edges[0, 1] + edges[0, 2])
+                b = side * (u * edges[1, 0] + v * edges[1, 1] + edges[1, 2])
+                c = side * (u * edges[2, 0] + v * edges[2, 1] + edges[2, 2])
+                if not min(a, b, c) >= 0.0:
+                    continue
+                t = np.float32(side * volume / (a + b + c))
+                if not (t >= view.near and (t < depth[v, u] if solid else t == depth[v, u])):
+                    continue
+                depth[v, u] = t if solid else -math.inf
+                if colored:
+                    normals = mesh.normals[f]
+                    x = a * normals[0, 0] + b * normals[1, 0] + c * normals[2, 0]
+                    y = a * normals[0, 1] + b * normals[1, 1] + c * normals[2, 1]
+                    z = a * normals[0, 2] + b * normals[1, 2] + c * normals[2, 2]
+                    cosine = -side * _cosine(x, y, z, lamp)
+                    _blend(rgb, v, u, color, _brightness(cosine, light[3]), alpha)
+                if solid:
+                    owners[v, u] = shapes.bodies[n]
 
 
 @lru_cache(maxsize=64)

@@ -81,7 +81,7 @@ def background_of(scene: Scene, *, obstacles: bool = True) -> Shapes:
     views = views_of(scene.structure)
     shown, hidden = (scene, None) if views is None else views.background(scene, obstacles)
     shapes, names = shapes_of(shown), body_names(scene.structure)
-    gone = shapes.moves
+    gone = shapes.table.moves
     if hidden is not None:
         gone = np.isin(shapes.table.bodies, [names.index(name) for name in hidden])
     shapes.table.colors[gone, 3] = 0.0

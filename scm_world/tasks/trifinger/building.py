@@ -144,7 +144,7 @@ class Building(TriFingerTask):
 
     def entities(self) -> Iterable[Entity]:
         """List the blocks, and their places in the building."""
-        airborne, targets = self.conventions.published_spaces, self.targets
+        airborne, targets = self.conventions.published, self.targets
         pieces = [
             bodies(self.piece, name, constants_of(which), airborne) for name, which in self.parts()
         ]
@@ -217,9 +217,6 @@ class Towers(Building):
         tower_dims: Default size of the tower [m].
         tower_center: Default place of the middle of its base, x and y [m].
         common: Options of every task; see ``Common``.
-
-    Raises:
-        UnknownOption: An argument is out of the bounds of its variable.
     """
 
     name = "towers"

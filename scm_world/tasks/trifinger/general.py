@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from functools import lru_cache
-from typing import Unpack, final
+from typing import Any, Unpack, final
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.building import MASS, Building, Part, Piece, blocks_mass
 from scm_world.tasks.trifinger.entities.bodies import lowest_point
-from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.variables import Box, Derived, Function
 
 COUNT = "nums_objects"
@@ -107,7 +106,7 @@ def _dropped(lone: bytes, each: bytes) -> bytes:
     for name, drop in zip(names, drops, strict=True):
         common |= {(name, "size"): [size] * 3, (name, "mass"): mass, (name, "friction"): drop[6]}
     changed = {key: np.asarray(value, dtype=np.float64) for key, value in common.items()}
-    rest = PhysicalState(structure.layout)  # all blocks are in the sky, far from one another
+    rest: Any = structure.empty_state()  # all blocks are in the sky, far from one another
     rest.joint_positions[:] = hardware.RAISED
     rest.positions[:, 0] = 10.0 * np.arange(len(names))
     rest.positions[:, 2] = SKY
@@ -177,9 +176,6 @@ class General(Building):
         tool_block_size: Default edge length of a block [m].
         nums_objects: Default number of blocks.
         common: Options of every task; see ``Common``.
-
-    Raises:
-        UnknownOption: An argument is out of the bounds of its variable.
     """
 
     name = "general"

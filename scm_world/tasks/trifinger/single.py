@@ -18,7 +18,7 @@ from scm_world.tasks.base import checked, finite_numbers
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, Common, weighted
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import kernels, shaping
+from scm_world.tasks.trifinger import kernels
 from scm_world.tasks.trifinger.base import TriFingerTask
 from scm_world.tasks.trifinger.catalogue import Causes
 from scm_world.tasks.trifinger.entities.bodies import (
@@ -36,7 +36,7 @@ from scm_world.tasks.trifinger.entities.bodies import (
     tool,
     turned_on_the_floor,
 )
-from scm_world.tasks.trifinger.shaping import BLOCK, GOAL, TARGET, TIPS, TOOL, TURNED, WAS
+from scm_world.tasks.trifinger.kernels import BLOCK, GOAL, TARGET, TIPS, TOOL, TURNED, WAS
 from scm_world.variables import Box, Fixed, Function, Switch, Variable
 from scm_world.variables.spaces import Bound
 
@@ -128,7 +128,7 @@ class OneBlock(TriFingerTask):
 
     options = Alike
     targets: ClassVar[dict[str, str]] = {GOAL: TOOL}
-    ready_terms = shaping.ONE_BLOCK
+    ready_terms = kernels.ONE_BLOCK
 
     def __init__(self, tool_block_position: Place, **options: Unpack[Alike]) -> None:
         common: Any = dict(options)
@@ -255,7 +255,7 @@ class Pushing(OneBlock):
 
     name = "pushing"
     default_weights, dense_terms = weighted(
-        (750.0, *shaping.TIPS_TO_BLOCK),
+        (750.0, *kernels.TIPS_TO_BLOCK),
         (250.0, "block_to_goal", kernels.block_progress, (BLOCK, WAS, TARGET)),
         (100.0, *TURNED),
         fraction=1.0,
@@ -329,10 +329,10 @@ class Picking(OneBlock):
         (0.0, "height_error", kernels.minus_height_error, (BLOCK, TARGET)),
         (125.0, "block_to_center", kernels.centering_progress, (BLOCK, WAS)),
         (0.0, "center_distance", kernels.minus_eccentricity, (BLOCK,)),
-        (750.0, *shaping.TIPS_TO_BLOCK),
+        (750.0, *kernels.TIPS_TO_BLOCK),
         (0.0, "tips_distance", kernels.minus_tips_distance, (TIPS, BLOCK)),
         (0.0, "grasp", kernels.minus_grasp_distance, (TIPS, BLOCK, f"{TOOL}.size")),
-        (0.005, *shaping.SMOOTHNESS),
+        (0.005, *kernels.SMOOTHNESS),
         fraction=1.0,
     )
     goal_causes = (HEIGHT,)
@@ -350,7 +350,7 @@ class Picking(OneBlock):
 
     def entities(self) -> Iterable[Entity]:
         """A block and its goal."""
-        published, (x, y, z) = self.conventions.published_spaces, self.place
+        published, (x, y, z) = self.conventions.published, self.place
         start = Function(put, constants={"center": (x, y, z + self.below(TOOL))})
         yield self.tool_block(
             spaces=numbers.places(self.level(TOOL), airborne=published),
@@ -369,7 +369,7 @@ class Picking(OneBlock):
         The predecessor publishes wider spaces, and moves every value that is drawn or set above the
         centre of the arena; see ``above_the_center``.
         """
-        if self.conventions.published_spaces:
+        if self.conventions.published:
             return (
                 numbers.cylindrical(numbers.RADIUS_A, *HEIGHT_A),
                 numbers.cylindrical(numbers.RADIUS_B, *HEIGHT_B),
@@ -446,11 +446,11 @@ class PickAndPlace(OneBlock):
 
     name = "pick_and_place"
     default_weights, dense_terms = weighted(
-        (750.0, *shaping.TIPS_TO_BLOCK),
+        (750.0, *kernels.TIPS_TO_BLOCK),
         (50.0, "block_to_goal", kernels.horizontal_progress, (BLOCK, WAS, TARGET)),
         (250.0, "block_to_height", kernels.crossing_progress, (BLOCK, WAS, TARGET, f"{GOAL}.size")),
         (0.0, *TURNED),
-        (0.005, *shaping.SMOOTHNESS),
+        (0.005, *kernels.SMOOTHNESS),
         fraction=0.0,
     )
     paper_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
@@ -481,7 +481,7 @@ class PickAndPlace(OneBlock):
         size = sizes.root(f"{WALL}.size", WALL_SIZE)
         center = (0.0, 0.0, WALL_SIZE[2] / 2.0)
         place = position(WALL, default=center)  # in the predecessor it keeps its center
-        if not self.conventions.published_spaces:
+        if not self.conventions.published:
             doc = "Position of the center; it stands on the floor in the middle."
             follows = (wall_on_the_floor, size.name)
             place = numbers.POSITIONS.derived(f"{WALL}.cartesian_position", follows, doc)

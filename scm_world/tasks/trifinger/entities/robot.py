@@ -21,7 +21,6 @@ from scm_world.tasks.trifinger.hardware import (
     N_JOINTS,
     QUANTITIES,
     RESOLUTIONS,
-    ControllerSpec,
     JointGroup,
     joints_of,
 )
@@ -37,8 +36,6 @@ ACTIONS = {
 }
 """Unit and range of each way to command the robot."""
 
-_SPEC = ControllerSpec()
-
 HIDDEN = (
     numbers.FRICTION.root(
         "finger_friction",
@@ -47,19 +44,23 @@ HIDDEN = (
     ),
     numbers.JOINT_DAMPING.root("joint_damping", 0.0, "Passive damping of every joint."),
     numbers.POSITION_GAINS.root(
-        "position_gains", _SPEC.kp, "Proportional gain of the three joints of a finger."
+        "position_gains",
+        hardware.POSITION_GAINS,
+        "Proportional gain of the three joints of a finger.",
     ),
     numbers.VELOCITY_GAINS.root(
-        "velocity_gains", _SPEC.kd, "Derivative gain of the three joints of a finger."
+        "velocity_gains",
+        hardware.VELOCITY_GAINS,
+        "Derivative gain of the three joints of a finger.",
     ),
     numbers.SAFETY_DAMPING.root(
         "safety_damping",
-        _SPEC.safety,
+        hardware.SAFETY_DAMPING,
         "Damping of the safety filter, for the three joints of a finger.",
     ),
     numbers.TORQUE.root(
         "torque_limit",
-        _SPEC.limit,
+        hardware.TORQUE_LIMIT,
         "Largest torque of a joint. Torques that are commanded end at 0.36 N m for any value.",
     ),
     numbers.NOISE.root(

@@ -10,8 +10,8 @@ from scm_world.models import Light
 from scm_world.models.camera import Camera
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger.cameras import CAMERAS, published_poses
-from scm_world.tasks.trifinger.hardware import PRESET_NAMES, SPINNING_FRICTION
+from scm_world.tasks.trifinger.cameras import CAMERAS, POSES
+from scm_world.tasks.trifinger.hardware import PRESETS, SPINNING_FRICTION
 from scm_world.variables import Box, Variable
 from scm_world.variables.reserved import PRESET, SENSOR_NOISE
 
@@ -45,7 +45,7 @@ def stage(preset: str) -> Entity:
         ),
         numbers.PRESETS.root(
             PRESET,
-            PRESET_NAMES.index(preset),
+            [*PRESETS].index(preset),
             "How finely time is cut: 0 is fast (4 ms), 1 is precise (2 ms).",
         ),
         numbers.NOISE.root(
@@ -88,7 +88,7 @@ def light_and_cameras() -> Entity:
 def _camera(camera: Camera) -> Iterable[Variable]:
     """Declare the pose of a camera, and its opening angle; A and B are near the usual ones."""
     name = f"camera_{camera.name}"
-    position, orientation = (pose.tolist() for pose in published_poses()[camera.name])
+    position, orientation = (pose.tolist() for pose in POSES[camera.name])
     x, y, z = position
     a = Box((x - _NEAR, y - _NEAR, z - _NEAR), (x + _NEAR, y + _NEAR, z + _NEAR))
     b = Box((x - _NEAR, y - _NEAR, z + _NEAR), (x + _NEAR, y + _NEAR, z + _FAR))
