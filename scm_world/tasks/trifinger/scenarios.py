@@ -25,7 +25,7 @@ CLEARANCE = 2e-4  # [m] how far apart bodies are put that are about to touch
 LOOSE = 1.5e-3  # [m] the same for blocks on one another, which do not stand quite straight
 HIGHEST = 6  # blocks that are stacked
 REACH = 0.045  # [m] from here up all three fingers can press on something in the middle
-ORIGIN = np.zeros(2)
+ORIGIN = np.zeros(3)
 PLACES = "obstacle_places"
 
 States = dict[str, Value]
@@ -47,7 +47,7 @@ def around(middle: Floats, radius: float | Floats, angles: Floats, height: float
     """Put three fingertips on a circle, or each at a radius of its own, shape (9,) [m]."""
     ring = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     points = np.full((3, 3), height)
-    points[:, :2] = middle + ring * np.reshape(radius, (-1, 1))
+    points[:, :2] = middle[:2] + ring * np.reshape(radius, (-1, 1))
     return points.ravel()
 
 
@@ -65,7 +65,7 @@ def fingers_at(world: Any, rng: Any, tips: Floats) -> States:
     """Put the fingertips somewhere, and the blocks out of their way, unless it is not free."""
     states: States = {"joint_positions": joints_for(world, tips)}
     if not world.composition.obstacles:  # one may stand in the middle
-        states |= stacked(world, rng, ORIGIN, 0.0)
+        states |= stacked(world, rng, ORIGIN)
     return states
 
 
@@ -78,22 +78,15 @@ def sizes(world: Any) -> Floats:
     return np.array([world[f"{name}.size"] for name in names]).reshape(-1, 3)
 
 
-def above(world: Any, name: str) -> tuple[Floats, float]:
-    """Return x and y of something upright, and the height of its upper face [m]."""
-    center = world[f"{name}.cartesian_position"]
-    return np.array(center[:2]), float(center[2] + world[f"{name}.size"][2] / 2)
+def top(world: Any, name: str) -> Floats:
+    """Return the middle of the upper face of something upright [m]."""
+    up = np.array([0.0, 0.0, world[f"{name}.size"][2] / 2])
+    return np.asarray(world[f"{name}.cartesian_position"] + up)
 
 
-def stacked(
-    world: Any,
-    rng: Any,
-    middle: Floats,
-    bottom: float,
-    yaw: float = 0.0,
-    count: int = HIGHEST,
-) -> States:
-    """Stand the first blocks on one another, not quite straight."""
-    states: States = {}
+def stacked(world: Any, rng: Any, foot: Floats, yaw: float = 0.0, count: int = HIGHEST) -> States:
+    """Stand the first blocks on one another above a point [m], not quite straight."""
+    states, (*middle, bottom) = States(), foot
     for name, size in zip(world.composition.blocks, sizes(world)[:count], strict=False):
         place = middle + rng.uniform(-0.001, 0.001, 2)
         turn = yaw + rng.uniform(-0.05, 0.05)
@@ -103,44 +96,22 @@ def stacked(
     return states
 
 
-def pressed(world: Any, rng: Any, middle: Floats, bottom: float, count: int = HIGHEST) -> Setting:
+def pressed(world: Any, rng: Any, foot: Floats, yaw: float = 0.0, count: int = HIGHEST) -> Setting:
     """Stack the first blocks and let the fingers press on one of them that they reach."""
-    edges = sizes(world)[:count]
-    states = stacked(world, rng, middle, bottom, count=count)
-    middles = bottom + np.cumsum(edges[:, 2]) - edges[:, 2] / 2
+    states, edges = stacked(world, rng, foot, yaw, count), sizes(world)[:count]
+    middles = foot[2] + np.cumsum(edges[:, 2]) - edges[:, 2] / 2
     which = int(np.flatnonzero(middles >= min(REACH, middles[-1]))[0])
     height = float(middles[which]) + rng.uniform(-0.2, 0.2) * edges[which, 2]
     angles = facing(rng)
-    # Just beyond the faces of a block that is hardly turned.
-    across = np.abs(np.stack([np.cos(angles), np.sin(angles)], axis=-1))
+    across = np.abs(np.stack([np.cos(angles - yaw), np.sin(angles - yaw)], axis=-1))
     reach = ((edges[which, :2] / 2 + TIP + LOOSE) / np.maximum(across, 1e-9)).min(axis=-1)
-    states["joint_positions"] = joints_for(world, around(middle, reach, angles, height))
-    return states, around(middle, rng.uniform(0.0, 0.01), angles + 0.4, height - 0.01)
+    states["joint_positions"] = joints_for(world, around(foot, reach, angles, height))
+    return states, around(foot, rng.uniform(0.0, 0.01), angles + 0.4, height - 0.01)
 
 
-def touched(
-    world: Any,
-    rng: Any,
-    middle: Floats,
-    bottom: float,
-    heights: tuple[float, float],
-    yaw: float,
-) -> tuple[States, Floats, float]:
-    """Stand the first block somewhere, with all three fingertips about to touch it.
-
-    The block is turned by up to ``yaw`` [rad], and touched between two parts of its height.
-    Return the states to set, the direction in which each finger stands [rad], and their height [m].
-    """
-    name, size = world.composition.blocks[0], sizes(world)[0]
-    angles = facing(rng)
-    height = bottom + rng.uniform(*heights) * size[2]
-    clear = float(np.hypot(size[0], size[1])) / 2 + TIP + CLEARANCE  # at any yaw
-    states = {
-        f"{name}.cartesian_position": np.array([*middle, bottom + size[2] / 2]),
-        f"{name}.euler_orientation": np.array([0.0, 0.0, rng.uniform(-yaw, yaw)]),
-        "joint_positions": joints_for(world, around(middle, clear, angles, height)),
-    }
-    return states, angles, height
+def somewhere(rng: Any, far: float, foot: Floats = ORIGIN) -> Floats:
+    """Draw a point up to so far from another one along x and y [m]."""
+    return np.array([*rng.uniform(-far, far, 2), 0.0]) + foot
 
 
 # --- the robot, and one block -------------------------------------------------------------------
@@ -167,7 +138,7 @@ def finger_at_wall(world: Any, rng: Any) -> Setting:
 
 def fingers_together(world: Any, rng: Any) -> Setting:
     """Put the fingertips side by side in the middle and let them press on one another."""
-    angles, middle = facing(rng), rng.uniform(-0.02, 0.02, 2)
+    angles, middle = facing(rng), somewhere(rng, 0.02)
     height = rng.uniform(0.05, 0.1)
     states = fingers_at(world, rng, around(middle, 1.3 * TIP, angles, height))
     return states, around(middle, 0.0, angles, height + rng.uniform(-0.02, 0.02))
@@ -175,17 +146,14 @@ def fingers_together(world: Any, rng: Any) -> Setting:
 
 def touch(world: Any, rng: Any) -> Setting:
     """Stand the first block amid the fingers and let all three press on it."""
-    middle = rng.uniform(-0.02, 0.02, 2)
-    states, angles, _ = touched(world, rng, middle, 0.0, (0.3, 0.8), yaw=0.8)
-    drive = around(middle, rng.uniform(0.0, 0.02), angles + 0.4, rng.uniform(0.01, 0.06))
-    return states, drive
+    return pressed(world, rng, somewhere(rng, 0.02), rng.uniform(-0.8, 0.8), count=1)
 
 
 def block_in_air(world: Any, rng: Any) -> Setting:
     """Drop the first block, tumbling."""
     name = world.composition.blocks[0]
     states = {
-        f"{name}.cartesian_position": np.array([*rng.uniform(-0.03, 0.03, 2), 0.06]),
+        f"{name}.cartesian_position": somewhere(rng, 0.03, np.array([0.0, 0.0, 0.06])),
         f"{name}.euler_orientation": rng.uniform(-0.7, 0.7, 3),
         f"{name}.linear_velocity": rng.uniform(-0.3, 0.3, 3),
         f"{name}.angular_velocity": rng.uniform(-8.0, 8.0, 3),
@@ -198,17 +166,13 @@ def block_in_air(world: Any, rng: Any) -> Setting:
 
 def tower(world: Any, rng: Any) -> Setting:
     """Stand the blocks on one another and let the fingers press on one of them."""
-    return pressed(world, rng, rng.uniform(-0.01, 0.01, 2), 0.0)
+    return pressed(world, rng, somewhere(rng, 0.01))
 
 
 def on_obstacle(world: Any, rng: Any) -> Setting:
     """Stand the blocks on the first obstacle and let all three fingers press on one."""
-    center, bottom = above(world, world.composition.obstacles[0])
-    middle = center + rng.uniform(-0.002, 0.002, 2)
-    if len(world.composition.blocks) > 1:
-        return pressed(world, rng, middle, bottom)
-    states, angles, height = touched(world, rng, middle, bottom, (0.4, 0.7), yaw=0.1)
-    return states, around(middle, rng.uniform(0.0, 0.02), angles + 0.4, height - 0.02)
+    foot = top(world, world.composition.obstacles[0])
+    return pressed(world, rng, somewhere(rng, 0.002, foot))
 
 
 def block_at_wall(world: Any, rng: Any) -> Setting:
@@ -219,7 +183,8 @@ def block_at_wall(world: Any, rng: Any) -> Setting:
     radius = np.sqrt((WALL_RADIUS - 3e-3) ** 2 - (size[1] / 2) ** 2) - size[0] / 2
     velocity = 0.6 * out + rng.uniform(0.2, 0.5) * along
     inward = 4e-3 if len(names) > 1 else 0.0  # they are not quite straight
-    states = stacked(world, rng, (radius - inward) * out, CLEARANCE, angle)
+    foot = np.array([*(radius - inward) * out, CLEARANCE])
+    states = stacked(world, rng, foot, angle)
     states |= {f"{name}.linear_velocity": np.array([*velocity, 0.0]) for name in names}
     return states, present_tips(world)
 
@@ -246,42 +211,36 @@ def on_newcomer(world: Any, rng: Any) -> Setting:
 
     High towers may be out of the fingers' reach there, so how many there are is drawn.
     """
-    place = _newcomer(world)
-    if place is None:
-        return tower(world, rng)
-    some = 1 + int(rng.uniform(0.0, min(HIGHEST, len(world.composition.blocks))))
-    return pressed(world, rng, *place, some)
+    some = 1 + int(rng.uniform(0.0, len(sizes(world))))
+    return pressed(world, rng, _newcomer(world), count=some)
 
 
 def all_on_newcomer(world: Any, rng: Any) -> Setting:
     """Stand all blocks where a further one would come into being; the robot stays where it is."""
-    place = _newcomer(world)
-    if place is None:
-        return tower(world, rng)
-    return stacked(world, rng, *place), present_tips(world)
+    return stacked(world, rng, _newcomer(world)), present_tips(world)
 
 
-def _newcomer(world: Any) -> tuple[Floats, float] | None:
-    """Return where a further block or obstacle would be: its middle and its top [m]."""
+def _newcomer(world: Any) -> Floats:
+    """Return the top of a further body that would come into being [m]; if none, of the floor."""
     before = world.snapshot()
     for request in world.task.nearby(world.values()):
         try:
             came = world.do(request).came
         except InterventionError:
             continue
-        found = above(world, came[-1]) if came else None
+        found = top(world, came[-1]) if came else None
         world.restore(before)
         if found is not None:
             return found
-    return None
+    return ORIGIN
 
 
 def on_coming_obstacle(world: Any, rng: Any) -> Setting:
     """Set the next obstacle into the middle, and press on blocks above it."""
-    places, edge = np.array(world[PLACES]), numbers.OBSTACLE_SIZE[2]
-    middle = rng.uniform(-0.01, 0.01, 2)
-    places[len(world.composition.obstacles)] = [*middle, edge / 2]
-    states, drive = pressed(world, rng, middle, edge)
+    places, up = np.array(world[PLACES]), np.array([0.0, 0.0, numbers.OBSTACLE_SIZE[2]])
+    middle = somewhere(rng, 0.01)
+    places[len(world.composition.obstacles)] = middle + up / 2
+    states, drive = pressed(world, rng, middle + up)
     return {PLACES: places, **states}, drive
 
 
