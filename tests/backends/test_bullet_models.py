@@ -644,7 +644,7 @@ def test_all_that_cannot_be_honoured_is_said_at_once(backend: BulletBackend) -> 
         backend.build(model.default_scene())
     said = str(caught.value)
     for what in (
-        "only boxes", "armature of the joint 'j'", "limits of the ball joint 'k'",
+        "which is no box", "armature of the joint 'j'", "limits of the ball joint 'k'",
         "armature of the joint 'l'", "limits of the tendon 't'", "equality constraint 'w'",
         "actuator 'm', which acts by contact",
     ):  # fmt: skip

@@ -11,9 +11,9 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, Capabilities, ContactPoint, EngineSnapshot
-from scm_world.backends.bullet.client import Client, Instant, SavedState, Step, alike
+from scm_world.backends.bullet.client import Client, Instant, SavedState, Step
 from scm_world.backends.bullet.engine import load
-from scm_world.backends.bullet.honoured import accepted, rebuilt, settle, supports
+from scm_world.backends.bullet.honoured import accepted, settle, supports
 from scm_world.errors import EngineFailure, Infeasible
 from scm_world.models.scene import Difference, ParameterKey, Parameters, Scene, complete
 
@@ -29,14 +29,15 @@ class Record:
         past: The last step, or the canonical world if there was none since.
         last: The world after it.
         now: The world with what was changed since.
-        light: Whether the two differ in nothing but parameters that live bodies can take on.
+        world: That from which live bodies come to the present by taking on parameters alone: the
+            past, or a canonical one.
         saved: The engine's own state after the last step, if one was kept.
     """
 
     past: Step | Instant
     last: Instant
     now: Instant
-    light: bool = True
+    world: Step | Instant
     saved: SavedState | None = None
 
 
@@ -76,8 +77,7 @@ class BulletBackend(Backend):
 
     def client(self) -> Client:
         """Return the client that holds the present."""
-        at = self._at
-        return self._holding(at.past if at.light else at.now, at.now.parameters)
+        return self._holding(self._at.world, self._at.now.parameters)
 
     def _holding(self, world: Step | Instant, parameters: Parameters) -> Client:
         """Return a client in a world, with the parameters that its live bodies took on since.
@@ -123,7 +123,7 @@ class BulletBackend(Backend):
         parameters = accepted(structure, scene.parameters, known)
         world = Instant(structure, parameters, settle(structure, scene.state))
         self._holding(world, parameters)
-        self._at = Record(world, world, world)
+        self._at = Record(world, world, world, world)
 
     def apply(self, difference: Difference) -> None:
         """Change structure, parameters and state without advancing time.
@@ -134,7 +134,7 @@ class BulletBackend(Backend):
             NotIntervenable: The engine has no such parameter.
             EngineFailure: A value is not finite, or the engine refused. The world is as it was.
         """
-        now, last, structure = self._at.now, self._at.last, difference.structure
+        now, structure = self._at.now, difference.structure
         state, known = now.structure.empty_state().with_vector(now.state), now.parameters
         given: Parameters = {**known, **difference.parameters}
         if structure is not None:
@@ -145,15 +145,15 @@ class BulletBackend(Backend):
         parameters, vector = accepted(structure, given, known), now.state
         if difference.state is not None:
             vector = settle(structure, difference.state, state)
-        settable = structure.layout.can_be_set
-        light = (
-            structure == last.structure
-            and np.array_equal(vector[settable], last.state[settable])
-            and alike(parameters, last.parameters, rebuilt(structure))
-        )
-        world = Instant(structure, parameters, vector)
-        self._holding(self._at.past if light else world, parameters)
-        self._at = replace(self._at, now=world, light=light)
+        now = Instant(structure, parameters, vector)
+        at = self._at
+        world: Step | Instant = now
+        if now.differs_lightly(at.last):
+            world = at.past
+        elif isinstance(at.world, Instant) and now.differs_lightly(at.world):
+            world = at.world
+        self._holding(world, parameters)
+        self._at = replace(at, now=now, world=world)
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
         """Read parameters back; see ``Realization.parameters``.
@@ -179,8 +179,8 @@ class BulletBackend(Backend):
             raise ValueError(f"a command has {size} numbers, got {len(numbers)}")
         if substeps < 1:
             return
-        at, client = self._at, self.client()
-        past, now = at.past if at.light else at.now, at.now
+        at, client, now = self._at, self.client(), self._at.now
+        past = at.past if at.world is at.past else now
         try:
             client.step(numbers, substeps)
             state = client.read()
@@ -190,12 +190,12 @@ class BulletBackend(Backend):
         total = substeps + (past.total if isinstance(past, Step) else 0)
         client.holds = past = Step(past, now.parameters, numbers, substeps, total)
         last = Instant(now.structure, now.parameters, state)
-        self._at = Record(past, last, last)
+        self._at = Record(past, last, last, past)
 
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step."""
         at = self._at
-        parameters = at.now.parameters if at.light else at.last.parameters
+        parameters = (at.now if at.world is at.past else at.last).parameters
         return self._holding(at.past, parameters).contacts()
 
     def snapshot(self) -> EngineSnapshot:

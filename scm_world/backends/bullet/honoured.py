@@ -45,50 +45,33 @@ def unsupported(model: Model) -> tuple[str, ...]:
     names, trees = fields.element_names(mj), Couplings(mj)
     touching: NDArray[np.bool_] = np.asarray(trees.touches.any(axis=1))
     dynamic: NDArray[np.bool_] = np.asarray(trees.dynamic.any(axis=1))
-    dofs, ball = mj.jnt_dofadr, mj.jnt_type == BALL
+    ball, free, odd = mj.jnt_type == BALL, mj.jnt_type == FREE, ~np.isin(mj.geom_type, [*SHAPES])
+    loss, armature = (a[mj.jnt_dofadr] != 0.0 for a in (mj.dof_frictionloss, mj.dof_armature))
+    tendons = (mj.tendon_frictionloss != 0.0) | (mj.tendon_armature != 0.0) | mj.tendon_limited
     working = np.array([works(mj, actuator) for actuator in range(mj.nactuator)], dtype=np.bool_)
     adhesion = mj.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)
+    surface = (mj.geom_adhesion != 0.0) | (mj.geom_surfacevel != 0.0).any(axis=1)
+    own = dynamic[mj.pair_geom1] | dynamic[mj.pair_geom2] | ~_multiplied(mj)
     follows = (mj.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & (mj.eq_obj2id >= 0)
     follows &= ~mj.eq_data[:, 2:5].any(axis=1)
-    one, other = (ends[follows] for ends in (mj.eq_obj1id, mj.eq_obj2id))
-    tree_of = mj.body_treeid[mj.jnt_bodyid]
-    follows[follows] = tree_of[one] == tree_of[other]
+    one, other = (mj.body_treeid[mj.jnt_bodyid[e[follows]]] for e in (mj.eq_obj1id, mj.eq_obj2id))
+    follows[follows] = one == other
     tables: list[tuple[str, Any, str]] = [
         (
             "joint",
-            (mj.dof_armature[dofs] != 0.0) & ~_hinged(mj)[mj.jnt_bodyid],
+            armature & ~_hinged(mj)[mj.jnt_bodyid],
             "armature of the joint {!r}, which is not a hinge that alone carries a body on the "
             "world",
         ),
         ("joint", ball & (mj.jnt_limited != 0), "limits of the ball joint {!r}"),
-        (
-            "joint",
-            (ball | (mj.jnt_type == FREE)) & (mj.dof_frictionloss[dofs] != 0.0),
-            "frictionloss of the joint {!r}, which is neither a hinge nor a slide",
-        ),
-        (
-            "tendon",
-            (mj.tendon_frictionloss != 0.0) | (mj.tendon_armature != 0.0) | mj.tendon_limited,
-            "frictionloss, armature or limits of the tendon {!r}",
-        ),
+        ("joint", (ball | free) & loss, "frictionloss of the joint {!r}, no hinge or slide"),
+        ("tendon", tendons, "frictionloss, armature or limits of the tendon {!r}"),
         ("actuator", working & adhesion, "the actuator {!r}, which acts by contact"),
         ("actuator", working & (mj.actuator_armature != 0.0), "armature of the actuator {!r}"),
         ("flex", np.ones(mj.nflex), "the flex {!r}"),
-        (
-            "geom",
-            touching & ~np.isin(mj.geom_type, list(SHAPES)),
-            "the geom {!r}: only boxes, spheres, capsules, cylinders, planes and meshes can touch",
-        ),
-        (
-            "geom",
-            touching & ((mj.geom_adhesion != 0.0) | (mj.geom_surfacevel != 0.0).any(axis=1)),
-            "adhesion or moving surface of the geom {!r}",
-        ),
-        (
-            "pair",
-            dynamic[mj.pair_geom1] | dynamic[mj.pair_geom2] | ~_multiplied(mj),
-            "the pair {!r}, whose friction is not the product of those of its shapes",
-        ),
+        ("geom", touching & odd, "the geom {!r}, which is no box, ball, capsule, cylinder or mesh"),
+        ("geom", touching & surface, "adhesion or moving surface of the geom {!r}"),
+        ("pair", own, "the pair {!r}, whose friction is not the product of those of its shapes"),
         ("body", mj.body_mocapid >= 0, "the mocap body {!r}"),
         (
             "equality",

@@ -199,9 +199,8 @@ def _to_centers(
         velocities: ``qvel``.
         starts: Where each body begins in the two, shape (n, 2).
         centers: Centers of mass in the frames of the bodies, shape (n, 3) [m].
-        axes: From principal axes to those frames, as MuJoCo has quaternions, shape (n, 4).
-        into: Position, quaternion (x, y, z, w), velocity and angular velocity in the world,
-            written, shape (n, 13).
+        axes: From principal axes to those frames, quaternions (w, x, y, z), shape (n, 4).
+        into: Position, quaternion (x, y, z, w), velocity and spin in the world, shape (n, 13).
     """
     for i in range(len(into)):
         q, v = starts[i, 0], starts[i, 1]
