@@ -39,7 +39,7 @@ from scm_world.backends.base import Backend, BackendWrapper, EngineSnapshot
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import Difference, Scene
 from scm_world.queries import Verification, World, verify
-from scm_world.tasks.trifinger.pushing import Pushing
+from scm_world.tasks.trifinger.single import Pushing
 from scm_world.variables import Box, Derived, Exogenous, Function, Linear, Measured, Normal
 
 PROBES, HELD_OUT = 32, 8

@@ -14,7 +14,7 @@ import numpy as np
 from scm_world import World
 from scm_world.tasks import Building, Common
 from scm_world.tasks.trifinger.building import Piece, blocks_mass
-from scm_world.tasks.trifinger.entities.blocks import block_size
+from scm_world.tasks.trifinger.entities.bodies import block_size
 from scm_world.variables import Exogenous, Integers
 
 LEVELS, SIZE = "pyramid_levels", "block.size"

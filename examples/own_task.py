@@ -10,10 +10,10 @@ import gymnasium
 import numpy as np
 
 from scm_world.evaluation import Protocol, evaluate
-from scm_world.tasks import TriFingerTask, register, term
-from scm_world.tasks.trifinger.entities.goals import goal_position
+from scm_world.tasks import register, term
+from scm_world.tasks.trifinger.entities.bodies import position
 from scm_world.tasks.trifinger.single import GOAL, TOOL, Alike, OneBlock
-from scm_world.variables import Function, Parent, Variable
+from scm_world.variables import Parent, Variable
 
 
 def middle(size: np.ndarray) -> np.ndarray:
@@ -27,20 +27,19 @@ def nearer(now: np.ndarray, before: np.ndarray) -> float:
 
 
 @register  # at the top level, so that other processes know it, too
-class Centering(TriFingerTask):
+class Centering(OneBlock):
     """One block, and a goal in the middle of the floor."""
 
     name = "centering"
     default_weights: ClassVar = {"reward.nearer": 100.0, "fractional_success": 1.0}
 
     def __init__(self, **options: Unpack[Alike]) -> None:
-        self.block = OneBlock((0.0, 0.1), options)
-        super().__init__(**self.block.common)
+        super().__init__((0.0, 0.1), **options)
 
     def entities(self) -> tuple[Any, ...]:
         """List block and goal."""
-        where = goal_position(GOAL, parents=(f"{GOAL}.size",), mechanism=Function(middle))
-        return self.block.tool(), self.block.goal(where)
+        where = position(GOAL, (middle, f"{GOAL}.size"))
+        return self.tool_block(), self.goal_block(where)
 
     def dense(self) -> tuple[Variable, ...]:
         """Declare what is rewarded besides filling the goal."""

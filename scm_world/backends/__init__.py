@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
 from scm_world._arguments import enter
@@ -18,10 +19,10 @@ from scm_world.errors import MissingEngine, UnknownOption
 from scm_world.models import Model
 
 _CLASSES = {
-    "mujoco": ("scm_world.backends.mujoco", "MujocoBackend", "mujoco>=3.17,<5"),
-    "bullet": ("scm_world.backends.bullet", "BulletBackend", "pybullet==3.2.7"),
-    "step": ("scm_world.backends.step", "StepFunction", "scm-world"),
-    "fake": ("scm_world.backends.fake", "FakeBackend", "scm-world"),
+    "mujoco": ("MujocoBackend", "mujoco>=3.17,<5"),
+    "bullet": ("BulletBackend", "pybullet==3.2.7"),
+    "step": ("StepFunction", "scm-world"),
+    "fake": ("FakeBackend", "scm-world"),
 }
 
 BACKENDS = tuple(_CLASSES)
@@ -36,7 +37,8 @@ def register(kind: Kind) -> Kind:
     """Register a custom backend by its ``name``, for every place that takes the name of a backend.
 
     It can decorate the class. New processes know it if the module that
-    registers it is imported there: put it at the top level of that module.
+    registers it is imported there: put it at the top level of that module. What an installed
+    package declares as an entry point of the group ``scm_world.backends`` is known everywhere.
 
     Args:
         kind: A class that passes ``scm_world.testing.backend.BackendConformance``, or as much of
@@ -49,18 +51,19 @@ def register(kind: Kind) -> Kind:
         ModelError: It is no class of backends, methods are missing, or it has no name.
         UnknownOption: Another one has this name.
     """
-
-    def check(kind: type[Backend]) -> Iterable[str]:
-        if not isinstance(getattr(kind, "capabilities", None), Capabilities):
-            yield f"{kind.__name__} has no capabilities; set capabilities = Capabilities()"
-
-    enter(_REGISTERED, kind, Backend, what="backend", taken=BACKENDS, check=check)
+    enter(_REGISTERED, kind, Backend, what="backend", taken=BACKENDS, check=lambda kind: ())
     return kind
 
 
 def backends() -> tuple[str, ...]:
-    """Name all backends that ``make_backend`` knows: of this package, then those registered."""
-    return (*BACKENDS, *_REGISTERED)
+    """Name all backends that ``make_backend`` knows: of this package, then the others."""
+    return tuple(dict.fromkeys((*BACKENDS, *_REGISTERED, *_declared())))
+
+
+@cache
+def _declared() -> dict[str, EntryPoint]:
+    """Find the entry points of installed packages, by name."""
+    return {entry.name: entry for entry in entry_points(group="scm_world.backends")}
 
 
 def make_backend(name: str) -> Backend:
@@ -75,18 +78,23 @@ def make_backend(name: str) -> Backend:
         >>> make_backend("fake").name
         'fake'
     """
-    if name not in backends():
-        raise UnknownOption("backend", name, backends())
     if name in _REGISTERED:
         return _REGISTERED[name]()
-    module, class_name, requirement = _CLASSES[name]
+    found: type[Backend]
+    if name not in _CLASSES:
+        if name not in _declared():
+            raise UnknownOption("backend", name, backends())
+        found = _declared()[name].load()
+        return found()
+    class_name, requirement = _CLASSES[name]
     try:
-        backend: Backend = getattr(importlib.import_module(module), class_name)()
+        module = importlib.import_module(f"scm_world.backends.{name}")
+        found = getattr(module, class_name)
     except MissingEngine:
         raise
     except ImportError as error:
         raise MissingEngine(name, f"pip install {requirement!r}", str(error)) from error
-    return backend
+    return found()
 
 
 def read_model(source: Any, **options: Any) -> Model:
@@ -102,9 +110,6 @@ def read_model(source: Any, **options: Any) -> Model:
         >>> read_model(f"<mujoco><worldbody>{ball}</worldbody></mujoco>").layout.names[:2]
         ('ball.cartesian_position', 'ball.orientation')
     """
-    from scm_world.backends.mujoco import check_installation
-
-    check_installation()
     from scm_world.backends.mujoco.reading import read_model as read
 
     return read(source, **options)

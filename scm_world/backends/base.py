@@ -155,14 +155,14 @@ class Backend(ABC):
 
     Attributes:
         name: Of the engine.
-        capabilities: What it can do beyond these methods.
+        capabilities: What it can do beyond these methods; what most can if a class says nothing.
         batch: Made of backends of this class and a number of threads, it steps several scenes.
         version: Of the engine.
         structure: What was compiled: it says how large states and commands are.
     """
 
     name: ClassVar[str]
-    capabilities: ClassVar[Capabilities]
+    capabilities: ClassVar[Capabilities] = Capabilities()
     batch: ClassVar[type[EngineBatch]] = EngineBatch
     version: str
     structure: Any
@@ -289,8 +289,8 @@ class BackendWrapper(Backend, ABC):
 class InMemory(Backend, ABC):
     """What keeps a scene in memory: parameters in a dict, the state in a vector.
 
-    Only ``step`` is left to a class that derives from it. Where a model has a ``fake``, that
-    computes moments of inertia.
+    Only ``step`` is left to a class that derives from it. A model may have a method
+    ``inertia(parameters, body)``, which computes moments of inertia.
     """
 
     version = "1"
@@ -303,12 +303,7 @@ class InMemory(Backend, ABC):
         self._place(scene.state)
 
     def apply(self, difference: Difference) -> None:
-        """Change structure, parameters and state without advancing time.
-
-        Raises:
-            UnknownOption: There is no such parameter. Nothing has changed.
-            WrongShape: A parameter has another shape. Nothing has changed.
-        """
+        """Change structure, parameters and state; where a parameter is wrong, nothing changes."""
         structure = difference.structure
         if structure is not None:
             now = Scene(self.structure, self._parameters, self._state)
@@ -326,16 +321,12 @@ class InMemory(Backend, ABC):
             self._place(difference.state)
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Return the parameters that were set.
-
-        Raises:
-            UnknownOption: There is no such parameter.
-        """
-        fake, found = getattr(self.structure, "fake", None), dict[ParameterKey, Floats]()
+        """Return the parameters that were set."""
+        inertia, found = getattr(self.structure, "inertia", None), dict[ParameterKey, Floats]()
         for key in keys:
             body, what = key
-            if what == "inertia" and fake is not None and (body, "mass") in self._parameters:
-                found[key] = np.asarray(fake.inertia(self.structure, self._parameters, body))
+            if what == "inertia" and inertia is not None and (body, "mass") in self._parameters:
+                found[key] = inertia(self._parameters, body)
             else:
                 found[key] = self._known(key).copy()
         return found

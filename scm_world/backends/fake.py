@@ -16,9 +16,8 @@ from scm_world.models.scene import State
 class FakeBackend(InMemory):
     """No forces and no contacts: nothing moves.
 
-    A model can say otherwise. Its ``fake`` has three functions:
-    ``move(structure, state, command, seconds)`` and ``settle(state)``, which change a state in
-    place, and ``inertia(structure, parameters, body)``.
+    A model can say otherwise by two methods that change a state in place:
+    ``move(state, command, seconds)``, and ``settle(state)`` after it was set.
     """
 
     name: ClassVar[str] = "fake"
@@ -30,14 +29,12 @@ class FakeBackend(InMemory):
         Raises:
             EngineFailure: A number is not finite afterwards.
         """
-        custom = getattr(self.structure, "fake", None)
-        if custom is not None:
-            custom.move(self.structure, self._state, command, substeps * self.structure.timestep)
+        if hasattr(self.structure, "move"):
+            self.structure.move(self._state, command, substeps * self.structure.timestep)
         if not np.isfinite(self._state.vector).all():
             raise EngineFailure("a number is not finite", self.name)
 
     def _place(self, state: State) -> None:
         super()._place(state)
-        custom = getattr(self.structure, "fake", None)
-        if custom is not None:
-            custom.settle(self._state)
+        if hasattr(self.structure, "settle"):
+            self.structure.settle(self._state)

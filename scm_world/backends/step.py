@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Floats, Integers, Value
-from scm_world.backends.base import Capabilities, EngineBatch, InMemory
+from scm_world.backends.base import EngineBatch, InMemory
 from scm_world.errors import EngineFailure, ModelError
 from scm_world.models.model import Numbers
 from scm_world.models.scene import ParameterKey, Parameters, Scene, State, StateLayout
@@ -99,18 +99,26 @@ class StepModel:
         """Hash of the function and the tables."""
         return digest(fingerprint({"model": self}, libraries=False))
 
+    @cached_property
+    def _layouts(self) -> dict[str, StateLayout]:
+        """Where each quantity stands among those of its kind."""
+        found = {}
+        for kind in _KINDS:
+            rows: tuple[Quantity, ...] = getattr(self, kind)
+            names, values = tuple(row.name for row in rows), [row.value.ravel() for row in rows]
+            start = np.concatenate([*values, np.empty(0)]).tolist()
+            found[kind] = StateLayout(names, tuple(value.size for value in values), tuple(start))
+        return found
+
     @property
     def n_commands(self) -> int:
         """How many numbers a command has: those of the actions and those of the noise."""
-        return sum(self._pieces[kind][1] for kind in ("actions", "noise"))
+        return self._layouts["actions"].size + self._layouts["noise"].size
 
     @cached_property
     def layout(self) -> StateLayout:
         """Where each state stands in the vector."""
-        pieces, _ = self._pieces["states"]
-        start = [number for quantity, _ in pieces for number in quantity.value.ravel().tolist()]
-        sizes = tuple(where.stop - where.start for _, where in pieces)
-        return StateLayout(tuple(quantity.name for quantity, _ in pieces), sizes, tuple(start))
+        return self._layouts["states"]
 
     def empty_state(self) -> State:
         """Return a state to read into."""
@@ -145,19 +153,17 @@ class StepModel:
         return new
 
     def _call(self, parameters: Floats, states: Floats, commands: Floats) -> Any:
-        split = self._pieces["actions"][1]
+        split = self._layouts["actions"].size
         arrays = [parameters, states, commands[..., :split], commands[..., split:]]
         given: list[Any] = [np.array(array) for array in arrays]  # it may keep them
         if self.signature == "dicts":
-            for array in given:
-                array.flags.writeable = False
             given = [self._named(kind, array) for kind, array in zip(_KINDS, given, strict=True)]
         try:
             result = self.function(*given)
         except Exception as error:
             advice = ""
             if isinstance(error, KeyError):
-                names = {kind: [q.name for q in getattr(self, kind)] for kind in _KINDS}
+                names = {kind: self._layouts[kind].names for kind in _KINDS}
                 known = (f"{kind} {', '.join(named)}" for kind, named in names.items() if named)
                 advice = f"; it is given {'; '.join(known)}"
             elif "read-only" in str(error):
@@ -172,13 +178,14 @@ class StepModel:
         return result
 
     def _failure(self, what: str) -> EngineFailure:
-        """Return an error about the function."""
         return EngineFailure(f"the step function of {self.name!r} {what}", StepFunction.name)
 
     def _named(self, kind: str, numbers: Floats) -> dict[str, Any]:
         """Name the parts of flat numbers, shape (..., size); they cannot be written."""
-        lead, found = numbers.shape[:-1], dict[str, Any]()
-        for quantity, where in self._pieces[kind][0]:
+        numbers.flags.writeable = False
+        lead, found, places = numbers.shape[:-1], dict[str, Any](), self._layouts[kind].slices
+        for quantity in getattr(self, kind):
+            where = places[quantity.name]
             if not lead and not quantity.shape:
                 number = numbers[where.start]
                 found[quantity.name] = np.int64(number) if quantity.integer else number
@@ -192,57 +199,39 @@ class StepModel:
 
     def _checked(self, result: Any, lead: tuple[int, ...]) -> Floats:
         """Put what the function gave into an array, shape (*lead, s), or refuse it."""
-        pieces, size = self._pieces["states"]
-        new, problems = np.empty((*lead, size)), []
+        places, problems = self.layout.slices, list[str]()
+        new = np.empty((*lead, self.layout.size))
+        given: list[tuple[str, Any, slice, tuple[int, ...]]] = []
         if self.signature == "arrays":
-            given = np.asarray(result)
-            if given.shape != new.shape or given.dtype.kind not in "biuf":
-                problems.append(f"it must be an array of numbers of shape {new.shape}: {result!r}")
-            else:
-                new[...] = given
+            given = [("the state", result, slice(None), new.shape)]
         elif not isinstance(result, Mapping):
-            problems.append(f"it must be a dict of the states by name: {result!r}")
+            problems = [f"it must be a dict of the states by name: {result!r}"]
         else:
-            names = self.layout.slices
-            problems += [f"{name!r} is missing" for name in names if name not in result]
-            problems += [f"{name!r} is no state" for name in result if name not in names]
-            for quantity, where in pieces if not problems else ():
-                value, shape = np.asarray(result[quantity.name]), (*lead, *quantity.shape)
-                if value.dtype.kind not in "biuf":
-                    problems.append(f"{quantity.name!r} must be numbers, not {value.dtype}")
-                elif value.shape != shape:
-                    problems.append(f"{quantity.name!r} must have shape {shape}, not {value.shape}")
-                else:
-                    new[..., where] = value.reshape(*lead, -1)
-        if not problems and not np.isfinite(new).all():
-            broken = [q.name for q, where in pieces if not np.isfinite(new[..., where]).all()]
-            problems = [f"{name!r} has a number that is not finite" for name in broken]
-        if not problems:
-            whole = [(q.name, new[..., where]) for q, where in pieces if q.integer]
-            problems = [
-                f"{name!r} must be whole numbers of at most 2**53, not {part.tolist()}"
-                for name, part in whole
-                if (np.rint(part) != part).any() or (np.abs(part) > 2.0**53).any()
+            problems = [f"{name!r} is missing" for name in places if name not in result]
+            problems += [f"{name!r} is no state" for name in result if name not in places]
+            given = [
+                (repr(q.name), result[q.name], places[q.name], (*lead, *q.shape))
+                for q in (self.states if not problems else ())
             ]
+        for name, numbers, where, shape in given:
+            value = np.asarray(numbers)
+            if value.dtype.kind not in "biuf":
+                problems.append(f"{name} must be numbers, not {value.dtype}")
+            elif value.shape != shape:
+                problems.append(f"{name} must have shape {shape}, not {value.shape}")
+            else:
+                new[..., where] = value.reshape(*lead, -1)
+        finite = bool(problems) or np.isfinite(new).all()
+        for q in self.states if not problems else ():
+            part = new[..., places[q.name]]
+            if not finite and not np.isfinite(part).all():
+                problems.append(f"{q.name!r} has a number that is not finite")
+            elif q.integer and ((np.rint(part) != part).any() or (np.abs(part) > 2.0**53).any()):
+                whole = f"whole numbers of at most 2**53, not {part.tolist()}"
+                problems.append(f"{q.name!r} must be {whole}")
         if problems:
-            raise EngineFailure(
-                f"what the step function of {self.name!r} gave is no new state: "
-                f"{'; '.join(problems)}",
-                StepFunction.name,
-            )
+            raise self._failure(f"gave no new state: {'; '.join(problems)}")
         return new
-
-    @cached_property
-    def _pieces(self) -> dict[str, tuple[tuple[tuple[Quantity, slice], ...], int]]:
-        """Lay each kind of quantities out in a row: the places, and how many numbers there are."""
-        found = {}
-        for kind in _KINDS:
-            pieces, end = [], 0
-            for quantity in getattr(self, kind):
-                start, end = end, end + int(np.prod(quantity.shape, dtype=int))
-                pieces.append((quantity, slice(start, end)))
-            found[kind] = tuple(pieces), end
-        return found
 
     def __getstate__(self) -> dict[str, Any]:
         return {f: getattr(self, f) for f in self.__dataclass_fields__}
@@ -262,10 +251,7 @@ class StepBatch(EngineBatch):
         """Hold commands for some steps.
 
         A vectorised function that fails is asked for each system alone, to find out which fail.
-
-        Raises:
-            EngineFailure: As in ``StepFunction.step``; or a row of a vectorised function depends
-                on how many there are, which is asked once for every number of rows.
+        A row of it must not depend on how many there are, which is asked once for every number.
         """
         failed: EngineFailure | None = None
         unmoved: list[int] = []
@@ -284,7 +270,7 @@ class StepBatch(EngineBatch):
             if refused:
                 failed = failed or refused
                 unmoved += rows
-            into[rows, : model.layout.size] = [member.vector for member in members]
+            into[rows, : model.layout.size] = [member._state.vector for member in members]
         try:
             super().step(np.array(alone, dtype=np.int64), commands, substeps, into)
         except EngineFailure as error:
@@ -302,24 +288,23 @@ class StepBatch(EngineBatch):
             EngineFailure: The function fails for one of them; none was stepped.
         """
         commands = commands[:, : model.n_commands]
-        states = np.array([member.vector for member in members])
+        states = np.array([member._state.vector for member in members])
         parameters = np.array([member.numbers for member in members])
         if (model, len(members)) not in self._compared:
             among = model.advance(parameters, states, commands)
             rows = [slice(row, row + 1) for row in range(len(states))]
             alone = [model.advance(parameters[one], states[one], commands[one]) for one in rows]
             if np.concatenate(alone).tobytes() != among.tobytes():
-                return EngineFailure(
-                    f"the vectorised step function of {model.name!r} gives a row other numbers "
-                    f"among {len(states)} rows than alone; write it without matrix products over "
-                    "the rows (np.einsum adds up each row by itself), or set vectorized=False",
-                    StepFunction.name,
+                return model._failure(
+                    f"gives a row other numbers among {len(states)} rows than alone; write it "
+                    "without matrix products over the rows (np.einsum adds up each row by itself), "
+                    "or set vectorized=False"
                 )
             self._compared.add((model, len(members)))
         for _ in range(substeps):
             states = model.advance(parameters, states, commands)
         for member, vector in zip(members, states, strict=True):
-            member.vector[:] = vector
+            member._state.vector[:] = vector
         return None
 
 
@@ -332,23 +317,15 @@ class StepFunction(InMemory):
     """
 
     name: ClassVar[str] = "step"
-    capabilities: ClassVar[Capabilities] = Capabilities()
     batch: ClassVar[type[EngineBatch]] = StepBatch
     numbers: Floats
 
     def build(self, scene: Scene) -> None:
-        """Keep the scene.
-
-        Raises:
-            ModelError: It is not that of a step function.
-        """
+        """Keep the scene, which has to be that of a step function."""
         if not isinstance(scene.structure, StepModel):
-            raise ModelError(
-                [
-                    "the backend 'step' realises step functions only (World.from_step), not a "
-                    f"{type(scene.structure).__name__}; choose 'mujoco' or 'bullet'"
-                ]
-            )
+            kind = type(scene.structure).__name__
+            only = "the backend 'step' realises step functions only (World.from_step)"
+            raise ModelError([f"{only}, not a {kind}; choose 'mujoco' or 'bullet'"])
         super().build(scene)
 
     def step(self, command: Floats, substeps: int) -> None:
@@ -361,12 +338,6 @@ class StepFunction(InMemory):
         for _ in range(substeps):
             states = self.structure.advance(parameters, states, commands)
         self._state.vector[:] = states[0]
-
-    @property
-    def vector(self) -> Floats:
-        """The state itself, flat, shape (s,)."""
-        vector: Floats = self._state.vector
-        return vector
 
     def _keep(self, parameters: Parameters) -> None:
         super()._keep(parameters)

@@ -255,7 +255,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._range = (self._middle, self._half, low, high)
         self.action_space = self._delta.space() if self._delta else box(*bounds)
 
-        self.limit = self.world.max_episode_length + int(self.world.conventions.extra_step)
+        self.limit = self.world.max_episode_length + int(self.world.conventions.published)
         if max_episode_steps not in (None, -1):
             self.limit = min(
                 self.limit, whole_number("max_episode_steps", max_episode_steps, least=1)

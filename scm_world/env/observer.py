@@ -148,7 +148,7 @@ def goal_reward(world: Simulation) -> Callable[[ArrayLike, ArrayLike, Any], Any]
 
 def reward_scale(world: Simulation) -> float:
     """Give what rewards are multiplied by."""
-    return world.control_period if world.conventions.reward_times_dt else 1.0
+    return world.control_period if world.conventions.published else 1.0
 
 
 MODES = ("structured", "full", "pixel", "custom")
@@ -346,7 +346,7 @@ def _parts(
     soft = frozenset[str]()
     if not declaration.task.observation.saturates:
         soft = frozenset(declaration.slices)
-    as_published = world.conventions.published_observation
+    as_published = world.conventions.published
     parts = []
     for name in names:
         low, high = bounds(declaration.model, name)

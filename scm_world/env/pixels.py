@@ -115,7 +115,7 @@ class Pixels:
         size: Size | None,
         stack: str = STACKS[0],
     ) -> None:
-        views, published = views_of(world.structure), world.conventions.published_observation
+        views, published = views_of(world.structure), world.conventions.published
         self._world, self._shows_goals = world, views is not None
         own: tuple[Camera, ...] = ()
         if views is not None:

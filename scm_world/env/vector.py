@@ -226,7 +226,7 @@ class Vector:
                 if part.name != KEYPOINTS
             ]
         )
-        self._published = world.conventions.published_observation
+        self._published = world.conventions.published
         self._turns = [
             place
             for name, place in self._slices.items()

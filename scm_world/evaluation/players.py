@@ -25,12 +25,11 @@ from scm_world.evaluation.recording_files import Recorded, from_parquet
 from scm_world.output.reading import LARGEST_TABLE, read_bytes
 from scm_world.policies import MlpPolicy, OnnxPolicy, PolicyAbout, file_of, load_policy, load_sb2
 from scm_world.policies.cards import FORM
-from scm_world.policies.scripted import NAMED, Policy
+from scm_world.policies.scripted import NAMED, OpenLoopPolicy, Policy
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries.episode_files import load_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.twins import Twins
-from scm_world.tasks.base import OpenLoopPolicy
 from scm_world.variables import Function
 from scm_world.world import Simulation
 
@@ -558,13 +557,13 @@ def _of_network(policy: MlpPolicy | OnnxPolicy, about: About) -> Player:
 
 
 def _of_object(policy: Any, about: About) -> Player:
+    if isinstance(policy, type):
+        return _of_object(policy(), about)
     if isinstance(policy, WorldPolicy) or policy is still or isinstance(policy, OpenLoopPolicy):
         inside = policy.policy if isinstance(policy, WorldPolicy) else policy
         make = inside if isinstance(inside, type) else partial(_itself, inside)
         start = partial(_of_world, make, about["name"])
         return Player({**about, "sees": "world"}, start)
-    if isinstance(policy, type):
-        return _of_object(policy(), about)
     if isinstance(policy, MlpPolicy):
         return _of_network(policy, {**about, "sha256": policy.sha256})
     if hasattr(policy, "predict"):

@@ -12,7 +12,6 @@ from scm_world.models.scene import (
     StateLayout,
     Structure,
     complete,
-    diff,
 )
 
 __all__ = [
@@ -31,5 +30,4 @@ __all__ = [
     "StateRow",
     "Structure",
     "complete",
-    "diff",
 ]

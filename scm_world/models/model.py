@@ -14,6 +14,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
+from scm_world._types import Integers
 from scm_world.models.scene import (
     ParameterKey,
     Scene,
@@ -79,7 +80,7 @@ class Parameter(Row):
     usual: bool = True
     refusal: str = ""
 
-    @property
+    @cached_property
     def key(self) -> ParameterKey:
         """The element and the property, as backends know it."""
         element, _, attribute = self.name.rpartition(".")
@@ -178,7 +179,6 @@ class Model:
         instead: Makes the model that Bullet realises in place of this one, where that is another
             one. It can be pickled.
         views: Its cameras, and what pictures of goals show, where there is more than in its file.
-        fake: What moves without physics; see ``backends.fake``. It can be pickled.
     """
 
     name: str
@@ -197,7 +197,6 @@ class Model:
     owners: tuple[str, ...] = field(default=(), repr=False)
     instead: Callable[[], Model] | None = field(default=None, repr=False)
     views: Any = field(default=None, repr=False)
-    fake: Any = field(default=None, repr=False)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Model) and self.digest == other.digest
@@ -229,9 +228,25 @@ class Model:
         )
 
     @cached_property
+    def rows(self) -> dict[ParameterKey, Parameter]:
+        """The parameters, by key."""
+        return {row.key: row for row in self.parameters}
+
+    @cached_property
     def body_names(self) -> tuple[str, ...]:
         """Names of all bodies; the first is the world."""
         return tuple(body.name for body in self.bodies)
+
+    def places(self, array: str) -> Integers:
+        """Return places in an array of MuJoCo's data, in order, and in the vector, shape (2, n)."""
+        starts = self.layout.slices
+        pairs = sorted(
+            (number, place)
+            for row in self.states
+            if row.array == array
+            for place, number in enumerate(row.numbers, starts[row.name].start)
+        )
+        return np.ascontiguousarray(np.array(pairs, dtype=np.int64).reshape(-1, 2).T)
 
     def empty_state(self) -> State:
         """Return a state to read into."""

@@ -256,32 +256,6 @@ class Difference:
         return self.structure is not None or bool(self.parameters) or self.state is not None
 
 
-def diff(now: Scene, then: Scene) -> Difference:
-    """Compare two scenes, and give the smallest set of changes from one to the other.
-
-    Goals are not compared: no backend knows them. Neither are states that cannot be set.
-
-    Example:
-        >>> from scm_world.tasks.trifinger.system import trifinger
-        >>> from scm_world.models import diff
-        >>> scene = trifinger(blocks=("tool_block",)).default_scene()
-        >>> heavy = {**scene.parameters, ("tool_block", "mass"): np.array(0.05)}
-        >>> diff(scene, scene.with_(parameters=heavy)).parameters
-        {('tool_block', 'mass'): array(0.05)}
-        >>> bool(diff(scene, scene))
-        False
-    """
-    if now.structure != then.structure:
-        return Difference(then.structure, dict(then.parameters), then.state)
-    changed = {
-        key: value
-        for key, value in then.parameters.items()
-        if value is not now.parameters[key] and not np.array_equal(value, now.parameters[key])
-    }
-    same = now.state.coincides(then.state)
-    return Difference(None, changed, None if same else then.state)
-
-
 def complete(now: Scene, structure: Structure, difference: Difference) -> Difference:
     """Fill in what a change of structure leaves unsaid.
 

@@ -5,20 +5,39 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, final
+from typing import Any, Protocol, final, runtime_checkable
 
 import numpy as np
 
 from scm_world._arguments import real_number, real_numbers, whole_number
 from scm_world._types import Floats
 from scm_world.errors import ActionError
-from scm_world.policies.planning import CrossEntropy
+from scm_world.policies.planning import CrossEntropy, action_range
 from scm_world.tasks import TASKS
-from scm_world.tasks.base import OpenLoopPolicy, action_range, kept_rows
 from scm_world.world import Simulation
 
 Policy = Callable[[Any], Any]
 """Looks at a world and gives an action, shape (n_actions,) in the units of its action mode."""
+
+
+@runtime_checkable
+class OpenLoopPolicy(Protocol):
+    """A policy that ignores the state: all its actions are known beforehand."""
+
+    def ahead(self, world: Any, first: int, count: int) -> Floats:
+        """Return the actions of some control steps, shape (count, n_actions).
+
+        Args:
+            world: The present world. A policy asked for the first time may read it.
+            first: The first control step.
+            count: Number of control steps.
+        """
+        ...
+
+    def __call__(self, world: Any) -> Floats:
+        """Return the action of the present step."""
+        action: Floats = self.ahead(world, world.index, 1)[0]
+        return action
 
 
 @final
@@ -82,7 +101,9 @@ class Sequence(OpenLoopPolicy):
             raise ActionError(
                 f"actions have shape ({n},) or (steps, {n}), got {self.actions.shape}", self.actions
             )
-        return kept_rows(self.actions, first, count)
+        rows = np.arange(first, first + count)
+        found: Floats = self.actions[np.minimum(rows, len(self.actions) - 1)]
+        return found
 
 
 ANY: Mapping[str, Callable[[], Policy]] = {"random": Random, "mpc": cache(CrossEntropy)}

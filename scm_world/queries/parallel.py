@@ -18,7 +18,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import EngineFailure, UnknownOption
-from scm_world.policies.scripted import as_policy
+from scm_world.policies.scripted import OpenLoopPolicy, as_policy
 from scm_world.queries.equations import Equations
 from scm_world.queries.plans import GroupedSchedules, Schedule
 from scm_world.queries.rollouts import (
@@ -31,7 +31,6 @@ from scm_world.queries.rollouts import (
 )
 from scm_world.queries.timed import On
 from scm_world.queries.twins import AnyTwins, EquationTwins, Twins, threaded
-from scm_world.tasks.base import OpenLoopPolicy
 from scm_world.work.executors import Executor
 from scm_world.work.processes import cores
 from scm_world.world import Simulation

@@ -14,16 +14,13 @@ from scm_world.tasks.factories import is_model, load_factory
 from scm_world.tasks.model import ModelTask
 from scm_world.tasks.rewards import Common, term
 from scm_world.tasks.step import StepTask
-from scm_world.tasks.trifinger import platform as _platform  # noqa: F401 # registers its backend
-from scm_world.tasks.trifinger.base import HEAD, Building, TriFingerTask
+from scm_world.tasks.trifinger.base import HEAD, TriFingerTask
+from scm_world.tasks.trifinger.building import Building, Towers
 from scm_world.tasks.trifinger.conventions import CONVENTIONS
 from scm_world.tasks.trifinger.general import General
-from scm_world.tasks.trifinger.pick_and_place import PickAndPlace
-from scm_world.tasks.trifinger.picking import Picking
-from scm_world.tasks.trifinger.pushing import Pushing
 from scm_world.tasks.trifinger.reaching import Reaching
+from scm_world.tasks.trifinger.single import PickAndPlace, Picking, Pushing
 from scm_world.tasks.trifinger.stacking2 import Stacking2
-from scm_world.tasks.trifinger.towers import Towers
 from scm_world.tasks.trifinger.walls import CreativeStackedBlocks, StackedBlocks
 
 TASKS: dict[str, type[Task]] = {

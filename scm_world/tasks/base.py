@@ -14,14 +14,13 @@ from scm_world._types import Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
 from scm_world.tasks.composition import Composition
-from scm_world.variables import Box, Draw, Integers, Noise, Variable
+from scm_world.variables import Box, Draw, Integers, Variable
 from scm_world.variables.kinds import SpaceName
 
 TIME = "time_left_for_task"
 OVERLAP = "published_overlap"
 
-Score = tuple[tuple[str, ...], Callable[..., Any]]
-"""Names of variables, and a function of their values, shapes (..., *shape), with values (...)."""
+Scenario = tuple[Callable[..., tuple[dict[str, Value], Any]], Callable[..., Floats], int | None]
 
 
 @final
@@ -82,7 +81,9 @@ class Goal:
         measures: Functions of the two vectors, shapes (..., n), with values of shape (...): the
             reward terms that they decide, such as ``success``, and ``published_overlap``, the
             fractional success of CausalWorld 1.2.
-        closeness: The score that planners maximise; minus the distance of the vectors if None.
+        closeness: The score that planners maximise: names of variables, and a function of their
+            values, shapes (..., *shape), with values (...); minus the distance of the vectors if
+            None.
         tools: Boxes that should be moved.
         targets: Goals, each with the box that its solution puts there.
     """
@@ -91,7 +92,7 @@ class Goal:
     desired: tuple[str, ...] = ()
     causes: tuple[str, ...] = ()
     measures: Mapping[str, Callable[[Floats, Floats], Any]] = field(default_factory=dict)
-    closeness: Score | None = None
+    closeness: tuple[tuple[str, ...], Callable[..., Any]] | None = None
     tools: tuple[str, ...] = ()
     targets: Mapping[str, str] = field(default_factory=dict)
 
@@ -110,16 +111,14 @@ class Conventions:
 
     Attributes:
         name: ``"scm_world"`` or ``"causal_world"``.
-        reward_times_dt: Rewards multiplied by the control period.
-        extra_step: Episodes one step longer than their length.
-        published_observation: The published normalisation of observations, which values may
-            leave, and a time feature in seconds minus steps where a length is given.
+        published: Whether they are those of CausalWorld 1.2: rewards multiplied by the control
+            period, episodes one step longer than their length, the published normalisation of
+            observations, which values may leave, and a time feature in seconds minus steps where a
+            length is given.
     """
 
     name: str = "scm_world"
-    reward_times_dt: bool = False
-    extra_step: bool = False
-    published_observation: bool = False
+    published: bool = False
 
     def adapt(self, variables: Iterable[Variable]) -> Iterable[Variable]:
         """Return the variables with the spaces of these conventions."""
@@ -149,99 +148,6 @@ def checked(
         many = f"{shape[0]} numbers in " if shape else "a number in "
         raise UnknownOption(option, value, (many + allowed.describe(shape, {}),))
     return value
-
-
-_DRAWS = 96
-
-
-@final
-class ProbeGenerator:
-    """The random numbers of one probe state.
-
-    They depend on seed, probe and attempt only, not on earlier draws.
-
-    Args:
-        noise: The seed's noise.
-        probe: Number of the probe state.
-        attempt: Counts up where a choice was not feasible.
-    """
-
-    def __init__(self, noise: Noise, probe: int, attempt: int = 0) -> None:
-        self._noise, self._probe, self._attempt = noise, probe, attempt
-        self._numbers = self.random("probe", _DRAWS)
-        self._used = 0
-
-    def uniform(self, low: float, high: float, n: int | None = None) -> Any:
-        """Draw one number, or an array of ``n``; at most 96 in all."""
-        count = 1 if n is None else n
-        drawn = self._numbers[self._used : self._used + count]
-        self._used += count
-        scaled = low + (high - low) * drawn
-        return float(scaled[0]) if n is None else scaled
-
-    def random(self, stream: str, n: int) -> Floats:
-        """Draw numbers in [0, 1) of a named stream, shape (n,)."""
-        drawn = self._noise.uniforms(stream, n=n, episode=self._probe, step=self._attempt)
-        found: Floats = drawn[0]
-        return found
-
-
-@final
-@dataclass(frozen=True)
-class Scenario:
-    """A kind of probe state.
-
-    Attributes:
-        name: Its name.
-        prepare: Chooses the values to set in a world that has just been reset. It may step the
-            world before. The second value it returns is passed to ``act``.
-        act: Returns an action, shape (n_actions,).
-        steps: Number of control steps before the experiments; drawn from 0 to 2 if None.
-        fresh: Whether the values that were set count as the natural ones: experiments then do not
-            add up with them to one intervention, and are faster.
-    """
-
-    name: str
-    prepare: Callable[[Any, ProbeGenerator], tuple[dict[str, Value], Any]]
-    act: Callable[[Any, Any, ProbeGenerator], Floats]
-    steps: int | None = None
-    fresh: bool = False
-
-
-class OpenLoopPolicy(ABC):
-    """A policy that ignores the state: all its actions are known beforehand."""
-
-    @abstractmethod
-    def ahead(self, world: Any, first: int, count: int) -> Floats:
-        """Return the actions of some control steps, shape (count, n_actions).
-
-        Args:
-            world: The present world. A policy asked for the first time may read it.
-            first: The first control step.
-            count: Number of control steps.
-        """
-
-    def __call__(self, world: Any) -> Floats:
-        """Return the action of the present step."""
-        action: Floats = self.ahead(world, world.index, 1)[0]
-        return action
-
-
-def kept_rows(actions: Floats, first: int, count: int) -> Floats:
-    """Return rows of actions; the last one is repeated."""
-    found: Floats = actions[np.minimum(np.arange(first, first + count), len(actions) - 1)]
-    return found
-
-
-def action_range(world: Any) -> tuple[Floats, Floats]:
-    """Return the lower and upper end of all actions, shape (n_actions,) each.
-
-    An action without an end is drawn from [-1, 1], or as far beyond the end that it has.
-    """
-    low, high = world.action_low, world.action_high
-    low = np.where(np.isfinite(low), low, np.minimum(-1.0, high - 2.0))
-    high = np.where(np.isfinite(high), high, np.maximum(1.0, low + 2.0))
-    return low, high
 
 
 @final
@@ -291,7 +197,6 @@ class Task(ABC):
         policies: Scripted policies of the task, by name.
         training: Fields of its learning recipe, such as ``{"steps": 200_000}``; those of an
             algorithm under its name. The others have their usual values.
-        checks_functions: Whether results of user functions are checked when a world begins.
         backend: Default backend.
         generated_graph: Whether edges follow from structure, so that some may never show.
         given: The arguments of the task.
@@ -307,7 +212,7 @@ class Task(ABC):
         "resolution": ("declared",),
         "conventions": {
             "scm_world": conventions,
-            "causal_world": Conventions("causal_world", True, True, True),
+            "causal_world": Conventions("causal_world", published=True),
         },
     }
     time_unit: float
@@ -320,7 +225,6 @@ class Task(ABC):
     n_actions: ClassVar[int | None] = None
     policies: ClassVar[Mapping[str, Callable[[], Any]]] = {}
     training: ClassVar[Mapping[str, Any]] = {}
-    checks_functions: ClassVar[bool] = False
     backend: ClassVar[str] = "mujoco"
     generated_graph: bool = False
 
@@ -390,7 +294,14 @@ class Task(ABC):
         return np.asarray(np.clip(np.zeros(len(low)), low, high))
 
     def scenarios(self, world: Any) -> Sequence[Scenario]:
-        """List informative kinds of state at the start of an episode; none: those of any system."""
+        """List kinds of states in which causes show; none: those of any system.
+
+        Returns:
+            Of each: ``prepare(world, rng)``, which returns values to set in a world that has just
+            been reset, and something for ``act(world, something, rng)``, which returns an action;
+            and the number of control steps before experiments, drawn from 0 to 2 if None. ``rng``
+            has ``uniform(low, high, n)``.
+        """
         return ()
 
     def nearby(self, values: Values) -> Iterable[dict[str, Value]]:

@@ -15,13 +15,7 @@ from scm_world._types import Floats, Value, Values
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.scalars import scalar
 from scm_world.graph import NoiseKey
-from scm_world.models import (
-    GoalRegion,
-    Light,
-    ParameterKey,
-    Scene,
-    Structure,
-)
+from scm_world.models import GoalRegion, Light, ParameterKey, Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.models.scene import TOLERANCE, Overlap
 from scm_world.variables import Box, Function, Integers, Measured, Parent, Variable
@@ -167,13 +161,9 @@ class Composition:
         names = self.system.body_names
         return {row.name: names[row.body] for row in self.system.parameters if row.body >= 0}
 
-    def goals(self, values: Values) -> tuple[GoalRegion, ...]:
-        """Describe all goals."""
-        return ()
-
-    def light(self, values: Values) -> Light:
-        """Describe the light of pictures."""
-        return Light()
+    def looks(self, values: Values) -> tuple[tuple[GoalRegion, ...], Light]:
+        """Describe all goals, and the light of pictures."""
+        return (), Light()
 
     def cameras(self, values: Values) -> tuple[Camera, ...]:
         """Describe the cameras whose places are variables."""

@@ -15,8 +15,6 @@ from scm_world.graph import SCM
 
 FILES = (".xml", ".mjcf", ".urdf")
 """How the names of files end that are models."""
-OWN_TASKS = ("scm_world.tasks.model:ModelTask",)
-"""What a file may name as its task in addition to registered ones: it reads a model."""
 
 
 def is_model(source: str) -> bool:
@@ -93,7 +91,7 @@ def refuse_untrusted(task: str, trusted: Sequence[str] | None) -> None:
     """Refuse to run a function that a file, not a user, names as its task.
 
     Args:
-        task: The text of the file. Registered tasks and models run no code.
+        task: The text of the file. Registered tasks and models run no code, nor does ``ModelTask``.
         trusted: Packages whose functions may be called, without ``.py``, or whole references; any
             if None.
 
@@ -104,7 +102,7 @@ def refuse_untrusted(task: str, trusted: Sequence[str] | None) -> None:
     package = Path(home).stem if home.endswith(".py") else home.partition(".")[0]
     if trusted is None or not colon or is_model(task):
         return
-    if package in trusted or task in (*OWN_TASKS, *trusted):
+    if package in trusted or task in ("scm_world.tasks.model:ModelTask", *trusted):
         return
     allowed = (f"task={task!r}, or trusted={(package,)}, to run what is in there",)
     raise UnknownOption("task that a file names", task, allowed)

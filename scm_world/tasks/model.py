@@ -7,7 +7,7 @@ import math
 import os
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numba import njit
@@ -88,6 +88,9 @@ class DeclaredTask(Task):
     observe: Iterable[str] | None = None
     goal: Goal = Goal()
 
+    kinds: ClassVar[tuple[tuple[Any, ...], ...]]
+    """Options that are lists, and the types of their members; a member alone is a list of one."""
+
     def __init__(self, kind: type[DeclaredTask], settings: Mapping[str, Any]) -> None:
         allowed = kind.options()
         for option, value in settings.items():
@@ -95,6 +98,15 @@ class DeclaredTask(Task):
                 raise UnknownOption(f"option of {type(self).__name__}", option, allowed)
             if value is not None:
                 setattr(self, option, value)
+        for option, *types in kind.kinds:
+            given = getattr(self, option)
+            if given is not None:
+                single = isinstance(given, (*types, str)) or not isinstance(given, Iterable)
+                setattr(self, option, (given,) if single else tuple(given))
+                if not all(isinstance(one, tuple(types)) for one in getattr(self, option)):
+                    raise UnknownOption(option, given, [one.__name__ for one in types])
+        if not isinstance(self.start, Mapping):
+            raise UnknownOption("start", self.start, ("a dictionary by name",))
         self.weights = {REWARD: 1.0} if self.reward is not None else {}
 
     @classmethod
@@ -118,22 +130,24 @@ class DeclaredTask(Task):
         """Declare the quantities of the system, and what counts.
 
         Raises:
-            UnknownOption: Something that is not a variable is to be observed.
+            UnknownOption: Something that is not a variable is to be observed, or begins.
         """
-        index, _ = clock(timing.steps, timing.control_period)
+        system, (index, _) = self.system, clock(timing.steps, timing.control_period)
         if self.commands is not None:  # noise goes by the control step: setting that is no cause
             index = index.model_copy(update={"settable_state": False, "parents": ()})
         own = (one for one in self.outcomes if not isinstance(one, str))
         counted = {name: getattr(self, name) for name in (REWARD, SUCCESS, TERMINATED)}
         variables = [
-            *(*self.quantities(), index, *map(_readout, self.system.readouts), *own),
+            *(*self.quantities(), index, *map(_readout, system.readouts), *own),
             *(declared(name, given) for name, given in counted.items() if given is not None),
         ]
         known = [variable.name for variable in variables]
-        for name in self.observe or ():
-            if name not in known:
-                raise UnknownOption("observe", name, known)
-        return Composition(self.system, self.commands), variables
+        named = (("observe", self.observe or (), known), ("start", self.start, system.layout.names))
+        for option, names, allowed in named:
+            for name in names:
+                if name not in allowed:
+                    raise UnknownOption(option, name, allowed)
+        return Composition(system, self.commands), variables
 
 
 class ModelTask(DeclaredTask):
@@ -178,8 +192,8 @@ class ModelTask(DeclaredTask):
     """
 
     choices = Task.choices | {"action_mode": ("controls",), "preset": ("model",)}
+    kinds = (("outcomes", str, Measured), ("observe", str), ("expose", str), ("ties", Variable))
     generated_graph = True
-    checks_functions = True
 
     model: Any = None
     expose: Iterable[str] | str | None = None
@@ -193,61 +207,30 @@ class ModelTask(DeclaredTask):
 
     def __init__(self, model: Any = None, **settings: Any) -> None:
         super().__init__(ModelTask, settings)
-        self._check_options()
         source = self.model if model is None else model
         if source is None:
             raise UnknownOption("model", None, ("a path, XML text, an MjSpec or an MjModel",))
         if isinstance(source, str | os.PathLike):  # else it cannot be made again from a file
             found = os.path.abspath(source) if os.path.exists(source) else str(source)
             self.given, self.is_named = {"model": found, **settings}, True
+        reading = {option: getattr(self, option) for option in ("expose", "fixed_base", "keyframe")}
         readouts = tuple(name for name in self.outcomes if isinstance(name, str))
         if isinstance(source, Model):
-            self._check_read(source, readouts)
-        self.system = (
-            source
-            if isinstance(source, Model)
-            else read_model(
-                source,
-                expose=self.expose,
-                readouts=readouts,
-                fixed_base=self.fixed_base,
-                keyframe=self.keyframe,
-            )
-        )
+            for option, value in reading.items():
+                if value != getattr(ModelTask, option):
+                    allowed = ("left out: the model is read already; give it to read_model",)
+                    raise UnknownOption(option, value, allowed)
+            known = [row.name for row in source.readouts]
+            for name in readouts:
+                if name not in known:
+                    raise UnknownOption("outcomes", name, known)
+            self.system = source
+        else:
+            self.system = read_model(source, readouts=readouts, **reading)
         self.name = getattr(self, "name", self.system.name)
         self.time_unit = self.system.timestep
         self.frame_skip = self._steps()
         self._check_names()
-
-    def _check_options(self) -> None:
-        """Check options that are lists or dictionaries; a text alone is a list of one."""
-        names = "names", "or declared variables"
-        for option, kinds, allowed in (
-            ("expose", str, ("patterns such as '*.mass'",)),
-            ("outcomes", (str, Measured), names),
-            ("observe", str, names),
-            ("ties", Variable, names),
-        ):
-            given: Any = getattr(self, option)
-            value = (given,) if isinstance(given, str) or not isinstance(given, Iterable) else given
-            if given is not None:
-                setattr(self, option, tuple(value))
-                if not all(isinstance(one, kinds) for one in getattr(self, option)):
-                    raise UnknownOption(option, given, allowed)
-        for option in ("spaces", "start"):
-            if not isinstance(getattr(self, option), Mapping):
-                raise UnknownOption(option, getattr(self, option), ("a dictionary by name",))
-
-    def _check_read(self, source: Model, readouts: Iterable[str]) -> None:
-        """Refuse what would have to be asked of a file, where the model is read already."""
-        for option in ("expose", "fixed_base", "keyframe"):
-            if getattr(self, option) != getattr(ModelTask, option):
-                allowed = ("left out: the model is read already; give it to read_model",)
-                raise UnknownOption(option, getattr(self, option), allowed)
-        known = [row.name for row in source.readouts]
-        for name in readouts:
-            if name not in known:
-                raise UnknownOption("outcomes", name, known)
 
     def _steps(self) -> int:
         """Return the length of a control step in physics steps."""
@@ -271,16 +254,15 @@ class ModelTask(DeclaredTask):
     def _check_names(self) -> None:
         rows = (*self.system.parameters, *self.system.states, *self.system.inputs)
         known = [row.name for row in rows] + [variable.name for variable in self.ties]
-        for option, names in (("spaces", self.spaces), ("start", self.start)):
-            for name in names:
-                allowed = known if option == "spaces" else self.system.layout.slices
-                if name not in allowed:
-                    raise UnknownOption(option, name, allowed)
+        if not isinstance(self.spaces, Mapping):
+            raise UnknownOption("spaces", self.spaces, ("a dictionary by name",))
         for row in rows:
             tie = next((one for one in self.ties if one.name == row.name), None)
             if tie is not None and tie.shape != row.shape:
                 raise UnknownOption(f"shape of the tie {row.name}", tie.shape, (str(row.shape),))
         for name, given in self.spaces.items():
+            if name not in known:
+                raise UnknownOption("spaces", name, known)
             for what in given:
                 if what not in _OVERRIDES:
                     raise UnknownOption(f"spaces[{name!r}]", what, _OVERRIDES)

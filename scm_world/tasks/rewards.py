@@ -9,6 +9,7 @@ from typing import Any, TypedDict
 import numpy as np
 from numba import njit
 
+from scm_world._arguments import real_number
 from scm_world._types import Value, Values
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.scalars import scalar
@@ -78,7 +79,10 @@ def resolve(
     weights = {**default, **{term.name: 0.0 for term in terms}}
     if isinstance(asked, Mapping):
         known = {**weights, SUCCESS: 0.0}
-        weights |= {name: _weight(name, weight, known) for name, weight in asked.items()}
+        for name, weight in asked.items():
+            if name not in known:
+                raise UnknownOption("reward term", name, known)
+            weights[name] = real_number(f"weight of {name}", weight)
     elif not isinstance(asked, str) or asked not in PRESETS:
         dictionary = () if isinstance(asked, str) else ("a dictionary of terms and numbers",)
         raise UnknownOption("weights", asked, (*PRESETS, *dictionary))
@@ -92,27 +96,14 @@ def resolve(
         dense = [name for name in default if name != FRACTION]
         if np.shape(given) != (len(dense),):
             raise UnknownOption("dense_reward_weights", given, (f"{len(dense)} numbers", *dense))
-        own = {name: _weight(name, weight) for name, weight in zip(dense, given, strict=True)}
+        own = {n: real_number(f"weight of {n}", w) for n, w in zip(dense, given, strict=True)}
     if (fraction := options.get("fractional_reward_weight")) is not None:
-        own[FRACTION] = _weight("fractional_reward_weight", fraction)
+        own[FRACTION] = real_number("fractional_reward_weight", fraction)
     if sparse and any(own.values()):
         named = {name: weight for name, weight in own.items() if weight}
         raise UnknownOption("weights of a sparse reward", named, ("none: it is 1 for success",))
     weights |= own
     return {**weights, SUCCESS: 1.0} if sparse else weights
-
-
-def _weight(name: str, weight: Any, known: Mapping[str, float] | None = None) -> float:
-    """Return the weight of a term, of some known ones if they are given."""
-    if known is not None and name not in known:
-        raise UnknownOption("reward term", name, known)
-    try:
-        number = float(weight)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not math.isfinite(number):
-        raise UnknownOption(f"weight of {name}", weight, ("any finite number",))
-    return number
 
 
 def further_terms(
@@ -237,12 +228,11 @@ def declared(name: str, given: Any) -> Variable:
     return Measured(name=name, parents=tuple(parents), mechanism=function, **form)
 
 
-def succeeded() -> Measured:
+def succeeded() -> Variable:
     """Declare success: more than nine tenths of the fractional success."""
     above_most = Function(above, constants={"threshold": FULFILLED})
     doc = "1 where more than nine tenths of the goal are filled."
-    form: dict[str, Any] = {"dtype": "integer", "bounds": Integers(0, 1), "doc": doc}
-    return Measured(name=SUCCESS, parents=(FRACTION,), mechanism=above_most, **form)
+    return declared(SUCCESS, (above_most, FRACTION)).model_copy(update={"doc": doc})
 
 
 @njit(cache=True)

@@ -94,6 +94,13 @@ class StepTask(DeclaredTask):
     """
 
     choices = DeclaredTask.choices | {"action_mode": ("actions",), "preset": ("default",)}
+    kinds = (
+        ("outcomes", Measured, Derived),
+        ("observe", str),
+        ("parameters", Exogenous, Derived, Fixed),
+        ("states", Measured),
+        ("actions", Action),
+    )
     backend = "step"
     frame_skip = 1
 
@@ -110,8 +117,6 @@ class StepTask(DeclaredTask):
     def __init__(self, step: Callable[..., Any] | None = None, **settings: Any) -> None:
         super().__init__(StepTask, settings)
         function = type(self).step if step is None else step
-        self.parameters, self.actions = tuple(self.parameters), tuple(self.actions)
-        self.states, self.outcomes = tuple(self.states), tuple(self.outcomes)
         problems = [*self._of_another_kind(function)] or [*self._not_fitting()]
         if problems:
             raise ModelError(problems)
@@ -151,17 +156,6 @@ class StepTask(DeclaredTask):
             yield f"control_dt={self.control_dt!r} must be a positive number [s]"
         if not self.states:
             yield "there is no state: give states=[sw.Measured(name=…, parents=…)]"
-        kinds = {
-            "parameters": (Exogenous, Derived, Fixed),
-            "states": (Measured,),
-            "actions": (Action,),
-            "outcomes": (Measured, Derived),
-        }
-        for option, allowed in kinds.items():
-            choices = " or ".join(kind.__name__ for kind in allowed)
-            for given in getattr(self, option):
-                if not isinstance(given, allowed):
-                    yield f"{option}: {getattr(given, 'name', given)!r} must be {choices}"
 
     def _not_fitting(self) -> Iterable[str]:
         """List states, actions and distributions that do not fit to the step function."""
@@ -181,8 +175,6 @@ class StepTask(DeclaredTask):
         for action in self.actions:
             if action.dtype != "real":
                 yield f"{action.name!r}: actions are real numbers; round it in the step function"
-        for name in sorted(set(self.start) - {state.name for state in self.states}):
-            yield f"start: {name!r} is no state"
         for name, source in self.noise.items():
             if not hasattr(source, "n_uniforms"):
                 yield f"noise: {name!r} is no distribution: {source!r}"

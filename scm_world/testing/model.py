@@ -15,22 +15,21 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
+import importlib
 import pickle
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, InterventionError
+from scm_world.policies.planning import action_range
 from scm_world.queries import World
-from scm_world.tasks.base import action_range
 from scm_world.variables import Box, Categories, Draw, Integers, Noise, Rotations, Scale
 from scm_world.variables.reserved import CONTROL_INDEX
+from scm_world.work.processes import Worker
 from scm_world.world import Audit, Batch, Simulation
 
 SEED = 20_26
@@ -126,25 +125,24 @@ def digest(world: Simulation, snapshot: Any) -> str:
     return hashlib.sha256(b"".join(seen)).hexdigest()
 
 
-_CODE = """
-import importlib, pickle, sys
-module, question = pickle.load(sys.stdin.buffer)
-importlib.import_module(module)
-function, arguments = pickle.loads(question)
-print(function(*arguments))
-"""
+@final
+class _Caller:
+    """Calls functions in another process."""
+
+    def load(self, module: str) -> None:
+        importlib.import_module(module)
+
+    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        return function(*arguments)
 
 
-def elsewhere(function: Callable[..., str], *arguments: Any, module: str = __name__) -> str:
-    """Call a function, which returns a word, in a new process that has imported a module."""
-    child = subprocess.run(  # noqa: S603 # our own interpreter, our own code
-        [sys.executable, "-c", _CODE],
-        input=pickle.dumps((module, pickle.dumps((function, arguments)))),
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([os.getcwd(), *sys.path])},
-        capture_output=True,
-        check=True,
-    )
-    return child.stdout.decode().split()[-1]
+_OTHER = Worker(_Caller)
+
+
+def elsewhere(function: Callable[..., Any], *arguments: Any, module: str = __name__) -> Any:
+    """Call a function in another process that has imported a module; it is always the same one."""
+    _OTHER.ask("load", module)
+    return _OTHER.ask("call", function, *arguments)
 
 
 # --- checks -----------------------------------------------------------------------------------

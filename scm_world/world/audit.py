@@ -106,7 +106,7 @@ def report(
     """
     model, keys = plan.compiled.model, plan.compiled.parameter_keys
     wanted = {keys[t] for name in plan.asked for t in model.targets(name) if t in keys}
-    reported = {**reported, **backend.parameters(wanted - reported.keys())}
+    reported = {**reported, **backend.parameters([*(wanted - reported.keys()), *inertia])}
     targets = {}
     for name in plan.asked:
         applied, read_back = _asked(plan, now, reported, name)
@@ -128,8 +128,7 @@ def report(
             old, new = before.compiled.view(name, before.state), now.values[name]
             if not same(old, new):
                 followed[name] = (_typed(old, new), np.array(new))
-    moments = backend.parameters(inertia)
-    engine = {".".join(key): (old, moments[key]) for key, old in inertia.items()}
+    engine = {".".join(key): (old, reported[key]) for key, old in inertia.items()}
     there, were = ({*one.compiled.composition.bodies} for one in (now, before))
     came, went = sorted(there - were), sorted(were - there)
     remarks: tuple[str, ...] = ()

@@ -325,8 +325,7 @@ class CompiledTask(ActionVector):
         parameters = dict(self._constants[structure])
         for name, key in self.parameter_keys.items():
             parameters[key] = values[name]
-        made = self.composition
-        return Scene(structure, parameters, state, made.goals(values), made.light(values))
+        return Scene(structure, parameters, state, *self.composition.looks(values))
 
 
 def _computed(model: SCM) -> tuple[str, ...]:

@@ -71,8 +71,8 @@ class Present:
         if change.structure is not None:
             now = self.compiled.describe(self.values, self.state)
             return Difference(now.structure, now.parameters, self.state)
-        names = {key: name for name, key in self.compiled.parameter_keys.items()}
-        old = {key: np.asarray(self.values[names[key]]) for key in change.parameters}
+        keys, changed = self.compiled.parameter_keys.items(), change.parameters
+        old = {key: np.asarray(self.values[name]) for name, key in keys if key in changed}
         return Difference(None, old, None if change.state is None else self.state)
 
     def overlaps(self, base: StepBase, plan: InterventionPlan, change: Difference) -> list[Overlap]:
@@ -202,7 +202,8 @@ def feasible_plan(
         attempts = promising(base, known, None, key, range(ATTEMPTS))
     while (drawn := next(attempts, None)) is not None:
         attempt, where = drawn
-        key, last = replace(key, attempt=attempt), made.get(where, start)
+        key = replace(key, attempt=attempt) if attempt != key.attempt else key
+        last = made.get(where, start)
         plan = plan_intervention(structures, base, request, space, key, last, found)
         if len(made) < REMEMBERED:
             made.setdefault(plan.compiled.plan, plan)

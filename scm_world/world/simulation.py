@@ -266,7 +266,7 @@ class Simulation(WorldAttributes):
         self._adopt(origin, origin.model, self._origin_static, 0)
         self._draw_nature()
         self._forget()
-        if self.task.checks_functions and not self._checked:
+        if not self._checked:
             self._values.compute()
             check_functions(self.compiled, self._values.now)
             self._checked = True
@@ -545,10 +545,13 @@ class Simulation(WorldAttributes):
             raise
 
     def _inertia(self, change: Difference) -> Parameters:
-        if change.structure is not None or not self.composition.movers():
-            return {}
         bodies = {body for body, what in change.parameters if what in ("mass", "size")}
-        bodies -= {*self.composition.bodies}.difference(self.composition.movers())
+        if change.structure is not None or not bodies:
+            return {}
+        movers = self.composition.movers()
+        if not movers:
+            return {}
+        bodies -= {*self.composition.bodies}.difference(movers)
         return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
     def _applied(self, change: Difference) -> Parameters:

@@ -188,11 +188,11 @@ def test_replay_and_saved_state_agree_for_long(backend: BulletBackend, quantity:
     snapshot = backend.snapshot()
     expected = play(backend, LONG, seed=7)
 
+    steps = watched.calls["stepSimulation"]
     backend.restore(snapshot)
-    assert watched.calls["restoreState"] == 1
+    assert watched.calls["stepSimulation"] == steps
     np.testing.assert_array_equal(play(backend, LONG, seed=7), expected)
     backend.restore(pickle.loads(pickle.dumps(snapshot)))  # noqa: S301
-    assert watched.calls["restoreState"] == 1
     np.testing.assert_array_equal(play(backend, LONG, seed=7), expected)
 
 

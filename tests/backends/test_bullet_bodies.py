@@ -20,8 +20,7 @@ from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
 from scm_world.models import Difference, Scene
 from scm_world.models.scene import ParameterKey
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.system import trifinger
+from scm_world.tasks.trifinger.system import PhysicalState, trifinger
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="needs pybullet"
@@ -287,7 +286,7 @@ def test_every_body_takes_part_in_contacts(backend: BulletBackend, early: bool) 
     mj = compiled(backend.structure)
     moves = mj.body_treeid[mj.geom_bodyid] >= 0
     free = mj.geom_bodyid >= mj.nbody - len(busy_scene().structure.blocks)
-    found = {geom: info(*place) for geom, place in client._built.geoms.items()}
+    found = {geom: info(*place) for geom, place in client.geoms.items()}
     for geom, one in found.items():
         if moves[geom]:  # the engine does not tell it of the others
             assert one[5] == pytest.approx(0.3**0.5)

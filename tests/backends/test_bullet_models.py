@@ -24,7 +24,7 @@ from scm_world.backends.bullet import BulletBackend
 from scm_world.backends.bullet.client import shares, usual_friction
 from scm_world.backends.bullet.honoured import supports, unsupported
 from scm_world.backends.mujoco.fields import element_names
-from scm_world.backends.mujoco.reading import compiled, permutation
+from scm_world.backends.mujoco.reading import compiled
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
 from scm_world.models import Difference, Model, Parameter
@@ -240,13 +240,13 @@ def touching(model: Model) -> list[tuple[int, int]]:
 
 def placed(backend: BulletBackend, model: Model, data: mujoco.MjData) -> Any:
     """Put a model into MuJoCo's state, with contacts switched off; return the client."""
-    state, places = model.empty_state(), permutation(model)
-    state.vector[places.positions] = data.qpos
-    state.vector[places.velocities] = data.qvel
+    state = model.empty_state()
+    state.vector[model.places("qpos")[1]] = data.qpos
+    state.vector[model.places("qvel")[1]] = data.qvel
     backend.build(model.default_scene().with_(state=state))
-    client = backend.base()
+    client = backend.client()
     for first, second in touching(model):
-        one, other = client._built.geoms[first], client._built.geoms[second]
+        one, other = client.geoms[first], client.geoms[second]
         client.engine.setCollisionFilterPair(
             one[0], other[0], one[1], other[1], 0, physicsClientId=client.engine.handle
         )
@@ -268,7 +268,7 @@ def placed(backend: BulletBackend, model: Model, data: mujoco.MjData) -> Any:
 def test_one_step_is_that_of_mujoco(backend: BulletBackend, name: str) -> None:
     """Joints, springs, dampers and actuators of all kinds accelerate as in MuJoCo."""
     model = described(name)
-    velocities = permutation(model).velocities
+    velocities = model.places("qvel")[1]
     for seed in range(3):
         mj, data = moved(model, seed)
         before, h = data.qvel.copy(), mj.opt.timestep
@@ -287,7 +287,7 @@ def test_bodies_are_where_mujoco_has_them(backend: BulletBackend, name: str) -> 
     mj, data = moved(model, 0)
     client = placed(backend, model, data)
     mujoco.mj_kinematics(mj, data)
-    for body, (multibody, link) in client._built.bodies.items():
+    for body, (multibody, link) in client.bodies.items():
         if link < 0:
             pose = client.engine.getBasePositionAndOrientation(
                 multibody, physicsClientId=client.engine.handle
@@ -465,14 +465,14 @@ def test_friction_of_pairs() -> None:
     mj, pairs = copy.copy(compiled(described("pile"))), touching(described("pile"))
     names, geoms = element_names(mj)["geom"], {geom for pair in pairs for geom in pair}
     usual = usual_friction(mj)
-    numbers = shares(mj, geoms, usual)
+    numbers = dict(zip(geoms, shares(mj, [*geoms], usual), strict=True))
     for first, second in pairs:
         if "cube" in (names[first], names[second]) and names[first] != "floor":
             continue  # softer than usual: the floor's coefficient stands in for its own
         wanted = max(mj.geom_friction[first, 0], mj.geom_friction[second, 0])
         assert numbers[first] * numbers[second] == pytest.approx(wanted)
     mj.geom_friction[names.index("sphere"), 0] = 1.5
-    changed = shares(mj, geoms, usual)
+    changed = dict(zip(geoms, shares(mj, [*geoms], usual), strict=True))
     assert [names[geom] for geom in geoms if changed[geom] != numbers[geom]] == ["sphere"]
 
 
@@ -644,13 +644,13 @@ def test_all_that_cannot_be_honoured_is_said_at_once(backend: BulletBackend) -> 
         backend.build(model.default_scene())
     said = str(caught.value)
     for what in (
-        "ellipsoid", "armature of the joint 'j'", "limits of the ball joint 'k'",
-        "armature of the joint 'l'", "limits of the tendon 't'",
-        "equality constraint 'w' (weld)", "actuator 'm', which acts by contact",
+        "which is no box", "armature of the joint 'j'", "limits of the ball joint 'k'",
+        "armature of the joint 'l'", "limits of the tendon 't'", "equality constraint 'w'",
+        "actuator 'm', which acts by contact",
     ):  # fmt: skip
         assert what in said, what
     assert len(unsupported(model)) == said.count("Bullet cannot honour")
-    assert backend._spare is None
+    assert not backend._clients
     backend.build(described("cartpole").default_scene())
 
 

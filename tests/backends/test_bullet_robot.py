@@ -40,7 +40,7 @@ def backend() -> Iterator[BulletBackend]:
 
 def robot(backend: BulletBackend) -> tuple[Any, Any, tuple[str, ...]]:
     """Give the engine, the client that holds the last step, and the names of the bodies."""
-    client = backend.base()
+    client = backend.client()
     return backend._engine, client, backend.structure.body_names
 
 
@@ -53,7 +53,7 @@ def test_links_are_where_kinematics_has_them(backend: BulletBackend) -> None:
     positions, _ = robot_scenes.link_frames(scene.state.joint_positions)
     for finger, places in zip(hardware.FINGERS, positions.reshape(3, -1, 3), strict=True):
         for link in (1, 2, 3):
-            place = client._built.bodies[names.index(hardware.link_name(finger, link))]
+            place = client.bodies[names.index(hardware.link_name(finger, link))]
             state = engine.getLinkState(
                 *place, computeForwardKinematics=1, physicsClientId=client.engine.handle
             )
@@ -67,7 +67,7 @@ def test_every_link_has_its_inertia(backend: BulletBackend) -> None:
     engine, client, names = robot(backend)
     for finger in hardware.FINGERS:
         for link in (1, 2, 3):
-            place = client._built.bodies[names.index(hardware.link_name(finger, link))]
+            place = client.bodies[names.index(hardware.link_name(finger, link))]
             info = engine.getDynamicsInfo(*place, physicsClientId=client.engine.handle)
             inertial, mass = hardware.INERTIAL[link], hardware.LINK_MASS[link]
             np.testing.assert_allclose(info[3], inertial.center, atol=1e-12)
@@ -81,8 +81,8 @@ def test_frictions_reach_the_shapes(backend: BulletBackend) -> None:
     backend.apply(Difference(parameters={("robot", "friction"): np.array(0.37)}))
     engine, client, _ = robot(backend)
     mj = compiled(backend.structure)
-    owners = {geom: mj.geom(geom).name for geom in client._built.geoms}
-    places = [client._built.geoms[g] for g, name in owners.items() if name[:2].isdigit()]
+    owners = {geom: mj.geom(geom).name for geom in client.geoms}
+    places = [client.geoms[g] for g, name in owners.items() if name[:2].isdigit()]
     assert len(places) == 12
     for place in places:  # compound shapes would make saved states inexact
         shapes = engine.getCollisionShapeData(*place, physicsClientId=client.engine.handle)
@@ -152,7 +152,7 @@ def test_clients_are_given_back() -> None:
     backend = BulletBackend()
     engine = backend._engine
     backend.build(busy_scene())
-    handle = backend.base().engine.handle
+    handle = backend.client().engine.handle
     assert engine.isConnected(handle)
     del backend
     assert not engine.isConnected(handle)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -69,7 +70,7 @@ def test_what_is_registered_is_known_by_its_name(registry: dict[str, type[Backen
     """Environments and evaluations take the name, and it does what the engine inside does."""
     assert register(Twin) is Twin
     assert register(Twin) is Twin  # a second time, as when a module is run again
-    assert backends() == (*BACKENDS, "twin")
+    assert backends()[: len(BACKENDS) + 1] == (*BACKENDS, "twin")
     seen = []
     for engine in ("fake", "twin"):
         env: Any = gymnasium.make("scm_world/Pushing-v0", backend=engine)
@@ -135,3 +136,11 @@ def test_the_example_moves_more_slowly(registry: dict[str, type[Backend]]) -> No
     slow.restore(kept)
     play(slow, 1)
     assert same(play(slow, 5), once)
+
+
+def test_installed_packages_declare_backends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An entry point makes a name known before any module of its package is imported."""
+    entry = EntryPoint("declared", f"{__name__}:Twin", "scm_world.backends")
+    monkeypatch.setattr("scm_world.backends._declared", lambda: {"declared": entry})
+    assert backends()[-1] == "declared"
+    assert isinstance(make_backend("declared"), Twin)

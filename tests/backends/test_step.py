@@ -367,7 +367,7 @@ def shortens(parameters: Any, state: Any, action: Any, noise: Any) -> Any:
     ("function", "message"),
     [
         (overwrites, "changed the state it was given"),
-        (shortens, r"numbers of shape \(2,\)"),
+        (shortens, r"the state must have shape \(2,\), not \(1,\)"),
     ],
 )
 def test_a_function_of_arrays_is_held_to_the_same(function: Any, message: str) -> None:

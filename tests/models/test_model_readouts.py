@@ -16,7 +16,7 @@ from model_files import GYMNASIUM, PENDULUM, SUITE, model_file
 
 from scm_world.backends import read_model
 from scm_world.backends.mujoco.fields import element_names
-from scm_world.backends.mujoco.reading import compiled, permutation
+from scm_world.backends.mujoco.reading import compiled
 from scm_world.errors import ModelError
 from scm_world.models import Model, Readout
 from scm_world.queries import World
@@ -55,12 +55,12 @@ def test_readouts_are_what_the_engine_computes(name: str) -> None:
     model = read_model(model_file(name), readouts=[*wanted, *(f"{s}.value" for s in sensors)])
     model = pickle.loads(pickle.dumps(model))  # noqa: S301 # our own
     mj = compiled(model)
-    data, places, rng = mujoco.MjData(mj), permutation(model), np.random.default_rng(0)
+    data, rng = mujoco.MjData(mj), np.random.default_rng(0)
     mujoco.mj_integratePos(mj, data.qpos, rng.normal(size=mj.nv), 0.1)
     data.qvel[:] = rng.normal(size=mj.nv)
     mujoco.mj_forward(mj, data)
     vector = np.empty(model.layout.size)
-    vector[places.positions], vector[places.velocities] = data.qpos, data.qvel
+    vector[model.places("qpos")[1]], vector[model.places("qvel")[1]] = data.qpos, data.qvel
     given: dict[str, Any] = {
         row.name: np.array(row.default).reshape(row.shape) for row in model.parameters
     }
@@ -294,7 +294,8 @@ def test_a_sensor_has_the_value_that_mj_forward_gives_it(kinds: tuple[str, ...])
     world = World.from_mjcf(sensed(*kinds), outcomes=[f"{kind}.value" for kind in kinds])
     world.reset(seed=0)
     mj, rng = copy.copy(compiled(world.task.system)), np.random.default_rng(3)
-    places, layout = permutation(world.task.system), world.task.system.layout
+    system, layout = world.task.system, world.task.system.layout
+    qpos, qvel, act = (system.places(array)[1] for array in ("qpos", "qvel", "act"))
     seen = set()
     for _ in range(48):
         turn = rng.normal(size=4)
@@ -318,8 +319,8 @@ def test_a_sensor_has_the_value_that_mj_forward_gives_it(kinds: tuple[str, ...])
         mujoco.mj_setConst(mj, mujoco.MjData(mj))
         vector = np.concatenate([np.atleast_1d(world[name]) for name in layout.names])
         data = mujoco.MjData(mj)
-        data.qpos[:], data.qvel[:] = vector[places.positions], vector[places.velocities]
-        data.act[:] = vector[places.activations]
+        data.qpos[:], data.qvel[:] = vector[qpos], vector[qvel]
+        data.act[:] = vector[act]
         mujoco.mj_forward(mj, data)
         for kind in rng.permutation(kinds):
             found = world[f"{kind}.value"]

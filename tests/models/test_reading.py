@@ -15,7 +15,7 @@ import pytest
 from model_files import LONG, PENDULUM, QUICK, SUITE, URDFS, arrays, model_file, pile
 
 from scm_world.backends import read_model
-from scm_world.backends.mujoco.reading import compiled, permutation
+from scm_world.backends.mujoco.reading import compiled
 from scm_world.backends.mujoco.sources import realized
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.models import Model
@@ -79,12 +79,14 @@ def test_writing_and_undoing_leaves_no_trace(model: Model) -> None:
 
 def test_the_state_vector_is_a_permutation(model: Model) -> None:
     """Every number of MuJoCo's state stands in exactly one place of the vector."""
-    mj, places = compiled(model), permutation(model)
+    mj = compiled(model)
+    positions, velocities, activations = (model.places(a)[1] for a in ("qpos", "qvel", "act"))
     data, start = mujoco.MjData(mj), model.empty_state().vector
-    assert sorted(np.concatenate(places).tolist()) == list(range(mj.nq + mj.nv + mj.na))
-    assert np.array_equal(start[places.positions], data.qpos)
-    assert np.array_equal(start[places.velocities], data.qvel)
-    assert np.array_equal(start[places.activations], data.act)
+    places = np.concatenate([positions, velocities, activations])
+    assert sorted(places.tolist()) == list(range(mj.nq + mj.nv + mj.na))
+    assert np.array_equal(start[positions], data.qpos)
+    assert np.array_equal(start[velocities], data.qvel)
+    assert np.array_equal(start[activations], data.act)
 
 
 def test_a_model_goes_to_another_process(model: Model) -> None:

@@ -11,7 +11,7 @@ import pytest
 from model_files import GYMNASIUM, SUITE, TRANSMISSIONS, URDFS, driven, model_file, pile
 
 from scm_world.backends import read_model
-from scm_world.backends.mujoco.reading import compiled, permutation
+from scm_world.backends.mujoco.reading import compiled
 from scm_world.models import Model
 
 INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -112,7 +112,8 @@ class Physics:
         self.model, self.mj = model, copy.copy(compiled(model))
         self.data, self.scratch = mujoco.MjData(self.mj), mujoco.MjData(self.mj)
         self.slots = model.slots(self.mj, self.data)
-        self.places = permutation(model)
+        arrays = ("qpos", "qvel", "act")
+        self.places = {array: model.places(array)[1] for array in arrays}
         self.data.warning.number[:] = 1
         self.tree = np.empty(model.layout.size, dtype=int)
         for row in model.states:
@@ -123,9 +124,9 @@ class Physics:
     def vector(self) -> Any:
         """Read the state."""
         found = np.empty(self.model.layout.size)
-        found[self.places.positions] = self.data.qpos
-        found[self.places.velocities] = self.data.qvel
-        found[self.places.activations] = self.data.act
+        found[self.places["qpos"]] = self.data.qpos
+        found[self.places["qvel"]] = self.data.qvel
+        found[self.places["act"]] = self.data.act
         return found
 
     def random_states(self, rng: np.random.Generator, n: int) -> list[Any]:
@@ -143,9 +144,9 @@ class Physics:
     def run(self, vector: Any, control: Any) -> Any:
         """Make some steps from a state."""
         mujoco.mj_setState(self.mj, self.data, self.start, INTEGRATION)
-        self.data.qpos[:] = vector[self.places.positions]
-        self.data.qvel[:] = vector[self.places.velocities]
-        self.data.act[:] = vector[self.places.activations]
+        self.data.qpos[:] = vector[self.places["qpos"]]
+        self.data.qvel[:] = vector[self.places["qvel"]]
+        self.data.act[:] = vector[self.places["act"]]
         self.data.ctrl[:] = control
         mujoco.mj_step(self.mj, self.data, STEPS)
         return self.vector()

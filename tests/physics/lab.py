@@ -11,8 +11,7 @@ from scm_world.backends.base import BackendWrapper
 from scm_world.models import Difference
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import PRECISE, Preset
-from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.system import trifinger
+from scm_world.tasks.trifinger.system import PhysicalState, trifinger
 
 ENGINES = [
     name

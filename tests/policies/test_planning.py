@@ -20,7 +20,7 @@ from scm_world.policies.planning.model import as_score
 from scm_world.policies.scripted import NAMED
 from scm_world.queries import World
 from scm_world.tasks import Pushing, Reaching
-from scm_world.tasks.trifinger.building import corners
+from scm_world.tasks.trifinger.views import corners
 from scm_world.variables import Noise
 from scm_world.world import Simulation
 

@@ -18,11 +18,10 @@ from scm_world.queries import World
 from scm_world.tasks import Picking
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping import Feedback
-from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, body_of, smallest, turns
-from scm_world.tasks.trifinger.grasping.choice import Choice
+from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, body_of
+from scm_world.tasks.trifinger.grasping.choice import Choice, gripped
 from scm_world.tasks.trifinger.grasping.feedback import TOUCHING, held
-from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand, poses, torques
-from scm_world.tasks.trifinger.grasping.ways import gripped
+from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, poses, torques
 from scm_world.training.imitation import lesson
 
 MODE = "end_effector_positions"
@@ -235,34 +234,33 @@ def test_it_has_a_name() -> None:
 def test_fingertips_come_where_they_are_told() -> None:
     """With what carries them, and nothing to press, they hang within 0.3 mm."""
     world = world_of("picking", "mujoco", "joint_positions")
-    hand = Hand(world.evaluate(()))
-    joints = np.array(hardware.REST) + 0.1
-    tips = hand.tips(joints)
+    sight = Sight(world)
+    tips = sight.tips_at(np.array(hardware.REST) + 0.1)
     for _ in range(60):
-        joints = hand.solve(tips, world["joint_positions"])
-        world.step(hand.bounded(joints + hand.more(joints, np.zeros((3, 3)))))
-    np.testing.assert_allclose(world["end_effector_positions"], tips, atol=3e-4)
+        sight.look(world)
+        world.step(sight.command(tips, sight.more(np.zeros((3, 3)))))
+    np.testing.assert_allclose(world["end_effector_positions"], tips.ravel(), atol=3e-4)
 
 
 def test_strength_ends_where_a_joint_does_all_it_can() -> None:
     """Forces of that strength need the largest torque at one joint, and more at none."""
-    hand = Hand(world_of("picking", "fake").evaluate(()))
-    joints, forces = np.array([hardware.REST]), hand.weights.copy()
-    (strength,) = hand.strengths(joints, np.eye(3)[None])
+    sight = Sight(world_of("picking", "fake"))
+    joints, forces = np.array([hardware.REST]), sight.weights.copy()
+    (strength,) = sight.strengths(joints, np.eye(3)[None])
     forces[:, 2] += strength * np.eye(3)
-    found = torques(joints, hand.height, forces[None])
+    found = torques(joints, sight.height, forces[None])
     assert np.abs(found).max() == pytest.approx(0.97 * 0.36)
 
 
 def test_legs_lie_in_what_their_tips_are_in() -> None:
     """A box about a fingertip, and one that the tip has just left."""
-    hand = Hand(world_of("picking", "fake").evaluate(()))
-    tips, axes = hand.tips(np.array(hardware.REST)), np.eye(3)[None]
+    sight = Sight(world_of("picking", "fake"))
+    tips = sight.tips_at(np.array(hardware.REST)).ravel()
     for below, depth in ((0.0, 0.01 + TIP_RADIUS), (0.011 + TIP_RADIUS, -0.001)):
         center = tips[:3] - [0.0, 0.0, below]
-        boxes = np.full((1, 3), 0.01), center[None], axes
+        boxes = np.c_[np.full(3, 0.01), center, np.eye(3)][None]
         near = np.array([hardware.REST])
-        _, reached, depths = poses(tips[None], near, hand.height, *boxes)
+        _, reached, depths = poses(tips[None], near, sight.height, boxes)
         assert reached.all()
         assert depths[0] == pytest.approx(depth, abs=1e-6)
 
@@ -300,10 +298,9 @@ def test_a_cube_has_four_ways_to_stand() -> None:
         return body_of("b", {f"b.{name}": np.array(value) for name, value in values})
 
     cube, bar = [0.06, 0.06, 0.06], [0.06, 0.08, 0.06]
-    assert len(turns(box(cube, 0.0), box(cube, 1.0))) == 4
-    assert abs(turns(box(cube, 0.0), box(cube, 1.0))[0]) == pytest.approx(math.pi / 2 - 1.0)
-    assert sorted(turns(box(bar, 0.0), box(bar, 1.0))) == pytest.approx([1.0 - math.pi, 1.0])
-    assert smallest(3.0, math.pi) == pytest.approx(3.0 - math.pi)
+    assert len(box(cube, 0.0).turns(box(cube, 1.0))) == 4
+    assert abs(box(cube, 0.0).turns(box(cube, 1.0))[0]) == pytest.approx(math.pi / 2 - 1.0)
+    assert sorted(box(bar, 0.0).turns(box(bar, 1.0))) == pytest.approx([1.0 - math.pi, 1.0])
 
 
 def test_a_block_on_another_face_is_seen() -> None:

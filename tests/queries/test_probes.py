@@ -28,7 +28,7 @@ def test_every_scenario_is_feasible(task: str) -> None:
     """Of each kind of probe that there is room for, one can be prepared in two rounds."""
     world = Simulation(make_task(task, **SMALL.get(task, {})), backend="fake")
     world.reset(seed=0)
-    kinds = [scenario.name for scenario in world.task.scenarios(world)]
+    kinds = [prepare.__name__ for prepare, *_ in world.task.scenarios(world)]
     seen = {probe.kind for probe in probes(world, 2 * len(kinds), 0)}
     assert seen - {"start"} == {*kinds} - NO_ROOM.get(task, set())
 

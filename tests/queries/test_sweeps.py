@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from scm_world._types import Floats
-from scm_world.errors import ActionError, UnknownOption
+from scm_world.errors import ActionError
 from scm_world.graph import SCM, episode_outcome
 from scm_world.policies.scripted import NAMED, as_policy
 from scm_world.queries import World, nature_graph
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import forward
-from scm_world.tasks.trifinger.policies import Sweep
 from scm_world.variables import Box, Draw, Exogenous, Measured, Mechanism, Parent
 
 MODES = ("joint_positions", "end_effector_positions")
@@ -107,15 +106,6 @@ def test_every_episode_has_the_same_sweep(policy: str) -> None:
     other = world.rollout(policy, seed=5, episode=3, steps=6, do={"tool_block.mass": 0.09})
     np.testing.assert_array_equal(one.actions, other.actions)
     np.testing.assert_array_equal(one.actions, way(policy, MODES[0], 6))
-
-
-def test_a_sweep_may_be_longer() -> None:
-    """It reaches the same end, later."""
-    slow: Any = Sweep(steps=40)
-    np.testing.assert_allclose(slow(Blind(39, MODES[1])), way("sweep", MODES[1])[-1])
-    assert not np.allclose(slow(Blind(13, MODES[1])), way("sweep", MODES[1])[13])
-    with pytest.raises(UnknownOption, match="steps"):
-        Sweep(steps=0)
 
 
 @pytest.mark.parametrize("policy", ["sweep", "across"])

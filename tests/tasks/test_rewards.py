@@ -87,7 +87,7 @@ def test_the_filled_fraction_of_a_unit_cube(
     one = np.ones(3)
     turn = np.array([0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)])
     straight = np.array([0.0, 0.0, 0.0, 1.0])
-    found = kernels.filled(one, np.array(offset), turn, one, np.zeros(3), straight)
+    found = kernels.filled(one, np.array(offset), turn, one, np.zeros(3), straight, tools=1.0)
     assert found == pytest.approx(expected, abs=1e-9)
 
 
@@ -95,14 +95,15 @@ def test_a_larger_block_fills_no_more_than_the_goal() -> None:
     """The fraction is capped at one, and a small block in a large goal fills its own volume."""
     small, large, straight = np.ones(3), np.full(3, 2.0), np.array([0.0, 0.0, 0.0, 1.0])
     at = np.zeros(3)
-    assert kernels.filled(large, at, straight, small, at, straight) == 1.0
-    assert kernels.filled(small, at, straight, large, at, straight) == pytest.approx(0.125)
+    assert kernels.filled(large, at, straight, small, at, straight, tools=1.0) == 1.0
+    eighth = kernels.filled(small, at, straight, large, at, straight, tools=1.0)
+    assert eighth == pytest.approx(0.125)
 
 
 def test_distances_to_three_goals() -> None:
     """Nine offsets of 1, 2, …: Euclidean for the reward, mean absolute for success."""
     goals = np.arange(1.0, 10.0).reshape(3, 3)
-    assert kernels.reach_distance(np.zeros(9), *goals) == pytest.approx(np.sqrt(285.0))
+    assert kernels.reach_distance(np.zeros(9), goals.ravel()) == pytest.approx(np.sqrt(285.0))
     assert kernels.reach_error(np.zeros(9), *goals) == pytest.approx(5.0)
     half = goals.ravel() / 2.0
     assert kernels.reach_progress(half, np.zeros(9), *goals) == pytest.approx(np.sqrt(285.0) / 2)

@@ -18,8 +18,7 @@ from scm_world.geometry.rotations import from_rotation_vector, quaternion_produc
 from scm_world.models.scene import Difference, ParameterKey, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import FAST, PRECISE, Preset
-from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.system import tip_name, trifinger
+from scm_world.tasks.trifinger.system import PhysicalState, tip_name, trifinger
 
 SUBSTEPS = 10
 SEED = 20_26

@@ -7,7 +7,7 @@ import pytest
 
 from scm_world.geometry import rotation_matrix
 from scm_world.models.camera import Camera, camera_from
-from scm_world.tasks.trifinger.cameras import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW, published_poses
+from scm_world.tasks.trifinger.cameras import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW, POSES
 from scm_world.tasks.trifinger.hardware import TABLE_OFFSET
 
 EVERY = [*CAMERAS, *ORIGINAL_CAMERAS, OVERVIEW]
@@ -62,7 +62,7 @@ def test_up_along_the_axis_is_refused() -> None:
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)
 def test_camera_from_numbers_is_the_published_one(camera: Camera) -> None:
     """Pose and quaternion of a published camera, of any length and sign, make that camera."""
-    position, orientation = published_poses()[camera.name]
+    position, orientation = POSES[camera.name]
     assert camera_from(camera.name, position, orientation) == camera
     for factor in (-1.0, 3.0):
         made = camera_from(camera.name, position, factor * orientation)
@@ -75,12 +75,10 @@ def test_camera_from_numbers_is_the_published_one(camera: Camera) -> None:
 
 def test_published_poses_are_those_of_the_predecessor() -> None:
     """Positions are published from the plane below the table top, and ours from the table top."""
-    poses = published_poses()
-
-    assert list(poses) == ["60", "120", "300"]
-    np.testing.assert_allclose(poses["60"][0], [0.2496, 0.2458, 0.58 - TABLE_OFFSET])
+    assert list(POSES) == ["60", "120", "300"]
+    np.testing.assert_allclose(POSES["60"][0], [0.2496, 0.2458, 0.58 - TABLE_OFFSET])
     quaternion = np.array([0.9655, -0.0098, -0.0065, -0.2603])
-    np.testing.assert_allclose(poses["120"][1], quaternion / np.linalg.norm(quaternion))
+    np.testing.assert_allclose(POSES["120"][1], quaternion / np.linalg.norm(quaternion))
 
 
 def test_quaternion_turns_the_axes_of_the_camera() -> None:

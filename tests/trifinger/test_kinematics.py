@@ -201,5 +201,5 @@ def test_any_target_gives_joints_within_bounds(targets: list[float]) -> None:
 
 def test_wrong_shape_is_refused() -> None:
     """Three numbers are not nine."""
-    with pytest.raises(ValueError, match=r"targets: expected shape \(9,\), got \(3,\)"):
+    with pytest.raises(ValueError, match=r"size 3 into shape \(9,\)"):
         inverse(np.zeros(3), HEIGHT, hardware.REST)

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from scm_world import World
-from scm_world.backends import make_backend
 from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
 from scm_world.tasks.trifinger.grasping import Feedback
 from scm_world.tasks.trifinger.kinematics import forward
-from scm_world.tasks.trifinger.platform import turned
+from scm_world.tasks.trifinger.platform import TriFingerPlatform, turned
 
 HERE = importlib.util.find_spec("trifinger_simulation") is not None
 pytestmark = pytest.mark.filterwarnings("ignore")  # of gym and pinocchio, which it imports
@@ -26,7 +25,7 @@ def test_what_is_missing_is_said() -> None:
         "^the trifinger_platform engine is not installed; try: pip install 'scm-world.trifinger.'$"
     )
     with pytest.raises(MissingEngine, match=said):
-        make_backend("trifinger_platform")
+        TriFingerPlatform()
 
 
 @needed

@@ -18,8 +18,7 @@ from scm_world.models import Difference, ParameterKey, Parameters, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import FAST, PRECISE, Preset
 from scm_world.tasks.trifinger.kinematics import forward, inverse
-from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.system import trifinger
+from scm_world.tasks.trifinger.system import PhysicalState, trifinger
 from scm_world.testing.backend import BackendConformance, same
 
 HALF = 0.0325  # [m] of the default cube

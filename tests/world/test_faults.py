@@ -13,7 +13,7 @@ from scm_world._types import Floats
 from scm_world.backends.fake import FakeBackend
 from scm_world.errors import EngineError, EngineFailure
 from scm_world.models import Difference, ParameterKey, Parameters
-from scm_world.tasks.trifinger.state import PhysicalState
+from scm_world.tasks.trifinger.system import PhysicalState
 from scm_world.world import Simulation
 
 

@@ -459,8 +459,6 @@ PLACE = Measured(name="place", shape=(2,))
     ("options", "message"),
     [
         ({"states": []}, "there is no state"),
-        ({"states": [Exogenous(name="x")]}, "states: 'x' must be Measured"),
-        ({"parameters": [PLACE]}, "parameters: 'place' must be Exogenous or Derived or Fixed"),
         ({"control_dt": 0.0}, "control_dt=0.0 must be a positive number"),
         ({"signature": "lists"}, "signature='lists' must be"),
         (
@@ -468,7 +466,6 @@ PLACE = Measured(name="place", shape=(2,))
             "has a mechanism",
         ),
         ({"states": [Measured(name="place", parents=("wind",))]}, "'wind', a parent of 'place'"),
-        ({"start": {"velocity": 1.0}}, "start: 'velocity' is no state"),
         ({"noise": {"place": 0.1}}, "'place' is no distribution: 0.1"),
         (
             {"noise": {"place": Box(0.0, Affine(parent="drift", scale=1.0))}},
@@ -485,7 +482,14 @@ def test_a_declaration_that_cannot_be_meant(options: dict[str, Any], message: st
 
 
 def test_what_does_not_exist_is_refused() -> None:
-    """Options, engines of bodies, and control steps of several calls."""
+    """Options, variables of another kind, engines of bodies, control steps of several calls."""
+    for options, message in (
+        ({"states": [Exogenous(name="x")]}, "it can be: Measured"),
+        ({"parameters": [PLACE]}, "it can be: Exogenous, Derived, Fixed"),
+        ({"start": {"velocity": 1.0}}, "no start is named 'velocity'"),
+    ):
+        with pytest.raises(UnknownOption, match=message):
+            walk(**options)
     with pytest.raises(UnknownOption, match="control_dt"):
         walk(control_period=0.1)
     with pytest.raises(UnknownOption, match="step"):

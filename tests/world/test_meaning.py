@@ -28,7 +28,7 @@ from scm_world.errors import (
 from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.rotations import from_rotation_vector
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.entities.blocks import lowest_point
+from scm_world.tasks.trifinger.entities.bodies import lowest_point
 from scm_world.variables import Affine, Box, Draw, Scale, Shift
 from scm_world.world import Simulation
 

@@ -13,7 +13,7 @@ from numba.extending import is_jitted
 from scm_world import World
 from scm_world.env import ScmWorldEnv
 from scm_world.tasks import TASKS
-from scm_world.tasks.trifinger.building import filled
+from scm_world.tasks.trifinger.kernels import filled
 from scm_world.tasks.trifinger.reaching import minus_norm
 from scm_world.variables import Concatenation, Linear
 from scm_world.variables.mechanisms import Stacked

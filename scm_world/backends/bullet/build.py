@@ -15,6 +15,7 @@ from typing import Any, final
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._types import Floats
 
@@ -29,35 +30,19 @@ STRONGEST = 1e9  # [N m] or [N] of a coupling
 
 FREE, BALL, SLIDE, HINGE = range(4)
 """Kinds of joints, as MuJoCo numbers them (``mjtJoint``)."""
-JOINTS = {HINGE: "JOINT_REVOLUTE", SLIDE: "JOINT_PRISMATIC", BALL: "JOINT_SPHERICAL"}
-"""Their names in the engine."""
+REVOLUTE, PRISMATIC, SPHERICAL, FIXED = 0, 1, 2, 4
+"""Kinds of joints, as the engine numbers them. Source: SharedMemoryPublic.h, ``JointType``."""
+JOINTS = {HINGE: REVOLUTE, SLIDE: PRISMATIC, BALL: SPHERICAL}
 
-MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
-SHAPES = {
-    int(mujoco.mjtGeom.mjGEOM_PLANE): "GEOM_PLANE",
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): "GEOM_SPHERE",
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE): "GEOM_CAPSULE",
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "GEOM_CYLINDER",
-    int(mujoco.mjtGeom.mjGEOM_BOX): "GEOM_BOX",
-    MESH: "GEOM_MESH",
-}
-"""The shapes that the engine has, by the kinds of MuJoCo's."""
+PLANE, SPHERE, CAPSULE, CYLINDER, BOX, MESH = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"))
+    for kind in ("PLANE", "SPHERE", "CAPSULE", "CYLINDER", "BOX", "MESH")
+)
+SHAPES = {PLANE: 6, SPHERE: 2, CAPSULE: 7, CYLINDER: 4, BOX: 3, MESH: 5}
+"""The shapes that the engine has, as it numbers them, by MuJoCo's kind. Source:
+SharedMemoryPublic.h, ``eUrdfGeomTypes``."""
 
 ORIGIN, UNTURNED = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
-
-LINK = (
-    "linkMasses",
-    "linkCollisionShapeIndices",
-    "linkVisualShapeIndices",
-    "linkPositions",
-    "linkOrientations",
-    "linkInertialFramePositions",
-    "linkInertialFrameOrientations",
-    "linkParentIndices",
-    "linkJointTypes",
-    "linkJointAxis",
-)
-"""Arguments of ``createMultiBody`` for every link."""
 
 
 @final
@@ -66,26 +51,23 @@ class EngineBody:
     """A multibody, or a body that cannot move. Equal ones need not be made again.
 
     Attributes:
-        bodies: The numbers of its bodies in the compiled model.
-        joints: The numbers of its joints.
-        geoms: The numbers of those of its shapes that can touch something.
+        bodies: The link that carries the mass of each body, by its number in the compiled model.
+        joints: The link of each joint; -1, the base, of a free one.
+        geoms: The link of each shape that can touch something.
         multibody: Its number in the engine.
-        links: The links of each body, of each joint and of each shape, in the order above; that of
-            a body carries its mass, and that of a free joint is -1.
         base: Arguments of ``createMultiBody`` for the base.
-        rows: Those for each link, see ``LINK``. Masses are 1 or 0 until they are set.
+        links: Those for the links. Masses are 1 or 0 until they are set.
         shapes: Of each shape, the arguments of ``createCollisionShape`` and its margin [m].
         gears: Of each coupling, two joints, an offset and a ratio.
         rest: What else cannot be changed while it is there.
     """
 
-    bodies: list[int] = field(compare=False)
-    joints: list[int] = field(compare=False)
-    geoms: list[int] = field(compare=False)
+    bodies: dict[int, int] = field(default_factory=dict, compare=False)
+    joints: dict[int, int] = field(default_factory=dict, compare=False)
+    geoms: dict[int, int] = field(default_factory=dict, compare=False)
     multibody: int = field(default=-1, compare=False)
-    links: tuple[list[int], list[int], list[int]] = ([], [], [])
     base: dict[str, Any] = field(default_factory=dict)
-    rows: list[list[Any]] = field(default_factory=list)
+    links: dict[str, list[Any]] = field(default_factory=dict)
     shapes: list[tuple[dict[str, Any], float]] = field(default_factory=list)
     gears: list[tuple[int, int, float, float]] = field(default_factory=list)
     rest: tuple[Any, ...] = ()
@@ -95,135 +77,108 @@ class EngineBody:
         parent: int,
         position: Floats,
         turn: Floats,
-        kind: str = "JOINT_FIXED",
+        kind: int = FIXED,
         axis: Sequence[float] = (0.0, 0.0, 1.0),
     ) -> int:
         """Add a link without mass whose frame is given in that of its parent."""
-        frame = [position.tolist(), plain(turn), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-        # The engine counts parents from the base.
-        self.rows.append([0.0, -1, -1, *frame, parent + 1, kind, list(axis)])
-        return len(self.rows) - 1
+        link = {
+            "linkMasses": 0.0,
+            "linkCollisionShapeIndices": -1,
+            "linkVisualShapeIndices": -1,
+            "linkPositions": position.tolist(),
+            "linkOrientations": plain(turn),
+            "linkInertialFramePositions": [0.0, 0.0, 0.0],
+            "linkInertialFrameOrientations": [0.0, 0.0, 0.0, 1.0],
+            "linkParentIndices": parent + 1,  # the engine counts them from the base
+            "linkJointTypes": kind,
+            "linkJointAxis": list(axis),
+        }
+        for name, value in link.items():
+            self.links.setdefault(name, []).append(value)
+        return len(self.links["linkMasses"]) - 1
 
 
-@final
-class Built:
-    """Everything that a compiled model has in the engine.
+def renewed(
+    engine: Any, before: list[EngineBody], mj: mujoco.MjModel, touching: list[int]
+) -> list[EngineBody]:
+    """Make what is missing, remove what is not needed, and return all units.
+
+    Everything stays in one order: what comes after something new is new, too.
 
     Args:
         engine: The functions of a physics client.
-
-    Attributes:
-        bodies: The link that carries the mass of each body that can move, by its number.
-        joints: The link of each joint, by its number; the base of a free body.
-        geoms: The link of each shape that can touch something, by its number.
+        before: The units in it.
+        mj: With the parameters in force.
+        touching: The shapes that can touch something.
     """
+    data, kept = mujoco.MjData(mj), 0
+    mujoco.mj_kinematics(mj, data)
+    units = list(_units(mj, touching))
+    paired = {*mj.pair_geom1.tolist(), *mj.pair_geom2.tolist()}
+    for unit in units:
+        _describe(unit, mj, data, paired)
+    for old, new in zip(before, units, strict=False):
+        if old != new:
+            break
+        new.multibody, kept = old.multibody, kept + 1
+    for unit in reversed(before[kept:]):
+        engine.removeBody(unit.multibody)
+    for unit in units[kept:]:
+        _create(engine, unit, custom(mj, "bullet_damping", -1 in unit.joints.values()))
+    return units
 
-    def __init__(self, engine: Any) -> None:
-        self._engine = engine
-        self._units: list[EngineBody] = []
-        self.bodies: dict[int, Handle] = {}
-        self.joints: dict[int, Handle] = {}
-        self.geoms: dict[int, Handle] = {}
 
-    def make(self, mj: mujoco.MjModel, touching: list[int]) -> set[int]:
-        """Make what is missing. Everything stays in one order: what comes later is new, too.
-
-        Args:
-            mj: With the parameters in force.
-            touching: The shapes that can touch something.
-
-        Returns:
-            The multibodies that are gone.
-        """
-        data, engine, kept = mujoco.MjData(mj), self._engine, 0
-        mujoco.mj_kinematics(mj, data)
-        units = list(_units(mj, touching))
-        paired = {*mj.pair_geom1.tolist(), *mj.pair_geom2.tolist()}
-        for unit in units:
-            _describe(unit, mj, data, paired)
-        for old, new in zip(self._units, units, strict=False):
-            if old != new:
-                break
-            new.multibody, kept = old.multibody, kept + 1
-        gone = [unit.multibody for unit in self._units[kept:]]
-        for multibody in reversed(gone):
-            engine.removeBody(multibody)
-        self._units = units[:kept]
-        for unit in units[kept:]:
-            self._create(unit, custom(mj, "bullet_damping", -1 in unit.links[1]))
-            self._units.append(unit)
-        numbers = [(unit, (unit.bodies, unit.joints, unit.geoms)) for unit in units]
-        self.bodies, self.joints, self.geoms = (
-            {
-                number: (unit.multibody, link)
-                for unit, own in numbers
-                for number, link in zip(own[kind], unit.links[kind], strict=True)
-            }
-            for kind in range(3)
-        )
-        return set(gone)
-
-    def _create(self, unit: EngineBody, damping: float) -> None:
-        """Make a unit, without what the engine does by itself: motors, sleep, a highest speed."""
-        engine, base, rows = self._engine, dict(unit.base), [list(row) for row in unit.rows]
-        for (shape, _), link in zip(unit.shapes, unit.links[2], strict=True):
-            kind = getattr(engine, shape["shapeType"])
-            number = engine.createCollisionShape(**{**shape, "shapeType": kind})
-            if link < 0:
-                base["baseCollisionShapeIndex"] = number
-            else:
-                rows[link][1] = number
-        for row in rows:
-            row[8] = getattr(engine, row[8])
-        # Pairs of shapes alone decide what touches, also within the multibody.
-        flags = engine.URDF_USE_SELF_COLLISION | engine.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
-        columns = dict(zip(LINK, map(list, zip(*rows, strict=True)), strict=bool(rows)))
-        made = engine.createMultiBody(flags=flags if unit.bodies else 0, **base, **columns)
-        unit.multibody = made
-        if unit.bodies:
-            # One property a call: beside damping or maxJointVelocity, others land on the base.
-            awake = engine.ACTIVATION_STATE_DISABLE_SLEEPING
-            engine.changeDynamics(made, -1, linearDamping=damping)
-            engine.changeDynamics(made, -1, angularDamping=damping)
-            engine.changeDynamics(made, -1, maxJointVelocity=FASTEST)
-            engine.changeDynamics(made, -1, activationState=awake)
-        for link in unit.links[1]:
-            if link < 0:
-                continue
-            if unit.rows[link][8] == "JOINT_SPHERICAL":
-                engine.setJointMotorControlMultiDof(
-                    made,
-                    link,
-                    engine.POSITION_CONTROL,
-                    targetPosition=[0.0, 0.0, 0.0, 1.0],
-                    positionGain=0.0,
-                    velocityGain=0.0,
-                    force=[0.0, 0.0, 0.0],
-                )
-            else:
-                engine.setJointMotorControl2(made, link, engine.VELOCITY_CONTROL, force=0.0)
-        zero = [0.0, 0.0, 0.0]
-        for first, other, offset, ratio in unit.gears:
-            ends, axis = (made, first, made, other), [1.0, 0.0, 0.0]
-            gear = engine.createConstraint(*ends, engine.JOINT_GEAR, axis, zero, zero)
-            engine.changeConstraint(
-                gear,
-                gearRatio=-ratio,
-                relativePositionTarget=offset,
-                erp=GEAR_ERP,
-                maxForce=STRONGEST,
+def _create(engine: Any, unit: EngineBody, damping: float) -> None:
+    """Make a unit, without what the engine does by itself: motors, sleep, a highest speed."""
+    base, shapes = dict(unit.base), [-1] * len(unit.links.get("linkMasses", ()))
+    for (shape, _), link in zip(unit.shapes, unit.geoms.values(), strict=True):
+        number = engine.createCollisionShape(**shape)
+        if link < 0:
+            base["baseCollisionShapeIndex"] = number
+        else:
+            shapes[link] = number
+    links = {**unit.links, "linkCollisionShapeIndices": shapes} if shapes else {}
+    # Pairs of shapes alone decide what touches, also within the multibody.
+    flags = engine.URDF_USE_SELF_COLLISION | engine.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
+    made = engine.createMultiBody(flags=flags if unit.bodies else 0, **base, **links)
+    unit.multibody = made
+    if unit.bodies:
+        # One property a call: beside damping or maxJointVelocity, others land on the base.
+        awake = engine.ACTIVATION_STATE_DISABLE_SLEEPING
+        engine.changeDynamics(made, -1, linearDamping=damping)
+        engine.changeDynamics(made, -1, angularDamping=damping)
+        engine.changeDynamics(made, -1, maxJointVelocity=FASTEST)
+        engine.changeDynamics(made, -1, activationState=awake)
+    for link in unit.joints.values():
+        if link >= 0 and unit.links["linkJointTypes"][link] == SPHERICAL:
+            engine.setJointMotorControlMultiDof(
+                made,
+                link,
+                engine.POSITION_CONTROL,
+                targetPosition=[0.0, 0.0, 0.0, 1.0],
+                positionGain=0.0,
+                velocityGain=0.0,
+                force=[0.0, 0.0, 0.0],
             )
-        for (shape, margin), link in zip(unit.shapes, unit.links[2], strict=True):
-            if shape["shapeType"] == "GEOM_MESH":
-                engine.changeDynamics(made, link, collisionMargin=max(HULL_MARGIN, margin))
+    zero = [0.0, 0.0, 0.0]
+    for first, other, offset, ratio in unit.gears:
+        ends, axis = (made, first, made, other), [1.0, 0.0, 0.0]
+        gear = engine.createConstraint(*ends, engine.JOINT_GEAR, axis, zero, zero)
+        engine.changeConstraint(
+            gear,
+            gearRatio=-ratio,
+            relativePositionTarget=offset,
+            erp=GEAR_ERP,
+            maxForce=STRONGEST,
+        )
+    for (shape, margin), link in zip(unit.shapes, unit.geoms.values(), strict=True):
+        if shape["shapeType"] == SHAPES[MESH]:
+            engine.changeDynamics(made, link, collisionMargin=max(HULL_MARGIN, margin))
 
 
 def _describe(unit: EngineBody, mj: mujoco.MjModel, data: mujoco.MjData, paired: set[int]) -> None:
     """Fill in what a unit is made of."""
-    carrier: dict[int, int] = {}  # the link whose frame moves with a body
-    origin: dict[int, Floats | None] = {}  # of that frame, in the frame of the body
-    hinges: dict[int, int] = {}
-    shapes: dict[int, int] = {}
+    origin: dict[int, Floats | None] = {}  # of the frame of its link, in the frame of a body
     for body in unit.bodies:
         joints, parent = joints_of(mj, body), int(mj.body_parentid[body])
         mass, center = float(mj.body_mass[body] > 0.0), mj.body_ipos[body]
@@ -232,11 +187,11 @@ def _describe(unit: EngineBody, mj: mujoco.MjModel, data: mujoco.MjData, paired:
             unit.base["baseMass"] = mass
             unit.base["baseInertialFramePosition"] = center.tolist()
             unit.base["baseInertialFrameOrientation"] = axes
-            carrier[body], origin[body], hinges[joints[0]] = -1, ORIGIN, -1
+            origin[body] = ORIGIN
         else:
             start, turn = mj.body_pos[body], mj.body_quat[body]
-            if parent in carrier:
-                link, start = carrier[parent], start - origin[parent]
+            if parent in unit.bodies:
+                link, start = unit.bodies[parent], start - origin[parent]
             else:  # the parent cannot move
                 link, start = -1, data.xpos[parent] + rotated(data.xquat[parent], start)
                 turn = composed(data.xquat[parent], turn)
@@ -245,38 +200,38 @@ def _describe(unit: EngineBody, mj: mujoco.MjModel, data: mujoco.MjData, paired:
                 anchor, axis = mj.jnt_pos[joint], mj.jnt_axis[joint].tolist()
                 position = start + rotated(turn, anchor - at)
                 link = unit.add(link, position, turn, JOINTS[int(mj.jnt_type[joint])], axis)
-                hinges[joint], start, turn, at = link, ORIGIN, UNTURNED, anchor
+                unit.joints[joint], start, turn, at = link, ORIGIN, UNTURNED, anchor
             if not joints:
                 link = unit.add(link, start, turn)
-            unit.rows[link][0], unit.rows[link][5:7] = mass, ((center - at).tolist(), axes)
-            carrier[body], origin[body] = link, at
+            unit.links["linkMasses"][link] = mass
+            unit.links["linkInertialFramePositions"][link] = (center - at).tolist()
+            unit.links["linkInertialFrameOrientations"][link] = axes
+            unit.bodies[body], origin[body] = link, at
         own = [geom for geom in unit.geoms if mj.geom_bodyid[geom] == body]
         for number, geom in enumerate(own):
-            link = unit.add(carrier[body], ORIGIN, UNTURNED) if number else carrier[body]
-            shapes[geom] = link
+            carrier = unit.bodies[body]
+            unit.geoms[geom] = unit.add(carrier, ORIGIN, UNTURNED) if number else carrier
     if not unit.bodies:
-        (geom,), place, turn = unit.geoms, data.geom_xpos[unit.geoms[0]], np.empty(4)
+        (geom,), turn = unit.geoms, np.empty(4)
+        place = data.geom_xpos[geom]
         mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
-        body, shapes[geom] = int(mj.geom_bodyid[geom]), -1
+        body = int(mj.geom_bodyid[geom])
         origin[body] = None
         if mj.geom_type[geom] == MESH:  # in the frame of the body, as it was drawn
             place, turn, origin[body] = data.xpos[body], data.xquat[body], ORIGIN
         unit.base = {"baseMass": 0.0, "useMaximalCoordinates": True}
         unit.base |= {"basePosition": place.tolist(), "baseOrientation": plain(turn)}
-    unit.links = (
-        [carrier[body] for body in unit.bodies],
-        [hinges[joint] for joint in unit.joints],
-        [shapes[geom] for geom in unit.geoms],
-    )
     for geom in unit.geoms:
         shape = _shape(mj, geom, origin[int(mj.geom_bodyid[geom])])
         unit.shapes.append((shape, float(mj.geom_margin[geom])))
-    for equality in couplings(mj, unit.joints) if unit.joints else ():
-        ends = hinges[int(mj.eq_obj1id[equality])], hinges[int(mj.eq_obj2id[equality])]
-        unit.gears.append((*ends, *mj.eq_data[equality, :2].tolist()))
+    for equality in np.flatnonzero(coupled(mj)).tolist():
+        if int(mj.eq_obj1id[equality]) in unit.joints:
+            ends = (unit.joints[int(end[equality])] for end in (mj.eq_obj1id, mj.eq_obj2id))
+            unit.gears.append((*ends, *mj.eq_data[equality, :2].tolist()))
     unit.rest = (
-        *(mj.jnt_limited[unit.joints].tobytes(), mj.numeric_data.tobytes(), mj.opt.disableflags),
-        *(geom in paired for geom in unit.geoms),
+        *(tuple(links.values()) for links in (unit.bodies, unit.joints, unit.geoms)),
+        *(mj.jnt_limited[[*unit.joints]].tobytes(), mj.numeric_data.tobytes()),
+        *(mj.opt.disableflags, [geom in paired for geom in unit.geoms]),
     )
 
 
@@ -290,18 +245,16 @@ def _shape(mj: mujoco.MjModel, geom: int, origin: Floats | None) -> dict[str, An
             body [m]; in its own frame if None.
     """
     radius, half, _ = size = mj.geom_size[geom].tolist()
-    found: dict[str, Any] = {"shapeType": SHAPES[int(mj.geom_type[geom])]}
-    match found["shapeType"]:
-        case "GEOM_PLANE":
-            found["planeNormal"] = [0.0, 0.0, 1.0]
-        case "GEOM_SPHERE":
-            found["radius"] = radius
-        case "GEOM_CAPSULE" | "GEOM_CYLINDER":
-            found |= {"radius": radius, "height": 2.0 * half}
-        case "GEOM_BOX":
-            found["halfExtents"] = size
-        case _:
-            return found | {"vertices": _kept(_corners(mj, geom, origin))}
+    kind = int(mj.geom_type[geom])
+    found: dict[str, Any] = {"shapeType": SHAPES[kind]}
+    if kind == MESH:
+        return found | {"vertices": _kept(_corners(mj, geom, origin))}
+    if kind == PLANE:
+        found["planeNormal"] = [0.0, 0.0, 1.0]
+    elif kind == BOX:
+        found["halfExtents"] = size
+    else:
+        found |= {"radius": radius} | ({"height": 2.0 * half} if kind != SPHERE else {})
     if origin is not None:
         place, turn = mj.geom_pos[geom] - origin, mj.geom_quat[geom]
         if place.any() or turn[0] != 1.0:  # a frame of its own, which has a price
@@ -316,22 +269,22 @@ def _units(mj: mujoco.MjModel, touching: list[int]) -> Iterator[EngineBody]:
     They meet in this order. Kinematic trees that hang on the world share a multibody, as far as
     there is room: the engine is asked and told of all of them at once, and solves each by itself.
     """
-    free, hanging, room = list[EngineBody](), EngineBody([], [], []), MOST_LINKS
+    free, hanging, room = list[EngineBody](), EngineBody(), MOST_LINKS
     for tree in range(mj.ntree):
         unit = unit_of(mj, tree, touching)
-        if mj.jnt_type[unit.joints[0]] == FREE:
+        if mj.jnt_type[min(unit.joints)] == FREE:
             free.append(unit)
             continue
         if links(mj, unit) > room:
             yield hanging
-            hanging, room = EngineBody([], [], []), MOST_LINKS
+            hanging, room = EngineBody(), MOST_LINKS
         room -= links(mj, unit)
-        hanging.bodies += unit.bodies
-        hanging.joints += unit.joints
-        hanging.geoms += unit.geoms
+        hanging.bodies |= unit.bodies
+        hanging.joints |= unit.joints
+        hanging.geoms |= unit.geoms
     yield from ([hanging] if hanging.bodies else [])
     still = mj.body_treeid[mj.geom_bodyid] < 0
-    yield from (EngineBody([], [], [geom]) for geom in touching if still[geom])
+    yield from (EngineBody(geoms={geom: -1}) for geom in touching if still[geom])
     yield from free
 
 
@@ -340,12 +293,15 @@ def unit_of(mj: mujoco.MjModel, tree: int, touching: list[int]) -> EngineBody:
     bodies = np.flatnonzero(mj.body_treeid == tree).tolist()
     joints = [joint for body in bodies for joint in joints_of(mj, body)]
     own = mj.body_treeid[mj.geom_bodyid] == tree
-    return EngineBody(bodies, joints, [geom for geom in touching if own[geom]])
+    geoms = [geom for geom in touching if own[geom]]
+    return EngineBody(
+        dict.fromkeys(bodies, -1), dict.fromkeys(joints, -1), dict.fromkeys(geoms, -1)
+    )
 
 
 def links(mj: mujoco.MjModel, unit: EngineBody) -> int:
     """Count the links that a tree needs."""
-    free = mj.jnt_type[unit.joints[0]] == FREE
+    free = mj.jnt_type[min(unit.joints)] == FREE
     jointless = sum(not joints_of(mj, body) for body in unit.bodies)
     return len(unit.geoms) + len(unit.joints) + jointless - int(free)
 
@@ -376,12 +332,10 @@ def joints_of(mj: mujoco.MjModel, body: int) -> range:
     return range(first, first + int(mj.body_jntnum[body]))
 
 
-def couplings(mj: mujoco.MjModel, joints: Sequence[int]) -> Iterator[int]:
-    """List the equality constraints in force that begin at some joints."""
+def coupled(mj: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Return which equality constraints are in force, shape (neq,)."""
     off = mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    for equality in np.flatnonzero(mj.eq_active0).tolist():
-        if not mj.opt.disableflags & int(off) and int(mj.eq_obj1id[equality]) in joints:
-            yield equality
+    return np.asarray(mj.eq_active0, dtype=np.bool_) & (not mj.opt.disableflags & int(off))
 
 
 def _corners(mj: mujoco.MjModel, geom: int, origin: Floats | None) -> bytes:

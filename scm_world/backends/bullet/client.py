@@ -5,23 +5,31 @@ from __future__ import annotations
 import math
 import statistics
 import weakref
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, final
 
 import mujoco
 import numpy as np
 
-from scm_world._types import Floats, Integers
+from scm_world._types import Floats
 from scm_world.backends.base import ContactPoint
-from scm_world.backends.bullet.build import BALL, FREE, Built, custom, solid
+from scm_world.backends.bullet.build import (
+    BALL,
+    FREE,
+    EngineBody,
+    custom,
+    renewed,
+    solid,
+    takes_armature,
+)
 from scm_world.backends.bullet.engine import Connection
-from scm_world.backends.bullet.honoured import realized, rebuilt, rotations
+from scm_world.backends.bullet.honoured import realized, rebuilt
 from scm_world.backends.bullet.joints import JointSet, parts
 from scm_world.backends.mujoco import reading
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.backends.mujoco.trees import Couplings, disabled
-from scm_world.errors import EngineFailure
 from scm_world.models.model import Model
 from scm_world.models.scene import ParameterKey, Parameters
 
@@ -30,16 +38,12 @@ SMOOTH = int(_OFF.mjDSBL_CONSTRAINT) | int(_OFF.mjDSBL_AUTORESET)
 """What is switched off while MuJoCo computes smooth forces."""
 
 SOLVER_ITERATIONS = 50  # with 20, towers spike at 40 mm/s
-TOLERANCE = 1e-6  # how far a state that was set may read back from what was asked
-
-Setting = tuple[str, tuple[int, ...], str]
-"""A function of the engine, the body and the link that it is called with, and what it sets."""
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Instant:
-    """A moment, without the caches of the engine.
+    """A canonical world: a function of these three, without the caches of the engine.
 
     Attributes:
         structure: The bodies.
@@ -51,13 +55,74 @@ class Instant:
     parameters: Parameters
     state: Floats
 
+    def differs_lightly(self, other: Instant) -> bool:
+        """Return whether it is another one but for parameters that live bodies can take on."""
+        settable = self.structure.layout.can_be_set
+        return (
+            self.structure == other.structure
+            and np.array_equal(self.state[settable], other.state[settable])
+            and alike(self.parameters, other.parameters, rebuilt(self.structure))
+        )
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A control step, and through ``before`` all those since the last canonical world.
+
+    Attributes:
+        before: The world that it started from.
+        parameters: All that were in force.
+        command: That was held.
+        substeps: For how many physics steps.
+        total: How many there were since the canonical world.
+    """
+
+    before: Step | Instant
+    parameters: Parameters
+    command: list[float]
+    substeps: int
+    total: int
+
+    def __reduce__(self) -> Any:
+        first, steps = since(self)
+        return _chain, (first, [(one.parameters, one.command, one.substeps) for one in steps])
+
+
+def since(world: Step | Instant) -> tuple[Instant, list[Step]]:
+    """Return the last canonical world, and the steps since."""
+    steps = []
+    while isinstance(world, Step):
+        steps.append(world)
+        world = world.before
+    return world, steps[::-1]
+
+
+def _chain(world: Any, rows: list[tuple[Parameters, list[float], int]]) -> Any:
+    total = 0
+    for parameters, command, substeps in rows:
+        total += substeps
+        world = Step(world, parameters, command, substeps, total)
+    return world
+
+
+@final
+class SavedState:
+    """A state that a client keeps as long as this is held. It is pickled as None."""
+
+    def __init__(self, number: int, activations: Floats) -> None:
+        self.number, self.activations = number, activations
+
+    def __reduce__(self) -> Any:
+        return type(None), ()
+
 
 def alike(one: Parameters, other: Parameters, keys: Iterable[ParameterKey]) -> bool:
     """Return whether some parameters have the same bits."""
     return all(one[k] is other[k] or one[k].tobytes() == other[k].tobytes() for k in keys)
 
 
-def shares(mj: mujoco.MjModel, geoms: Iterable[int], usual: float) -> dict[int, float]:
+def shares(mj: mujoco.MjModel, shapes: list[int], usual: float) -> Floats:
     """Compute a number for each shape, so that a contact has the product of two as its friction.
 
     A model says the larger of two coefficients. The product is that wherever a moving shape
@@ -68,23 +133,22 @@ def shares(mj: mujoco.MjModel, geoms: Iterable[int], usual: float) -> dict[int, 
 
     Args:
         mj: With the coefficients in force.
-        geoms: The shapes.
+        shapes: Their numbers.
         usual: See ``usual_friction``.
 
     Returns:
         The number of each shape.
     """
-    shapes = list(geoms)
     still = mj.body_treeid[mj.geom_bodyid[shapes]] < 0
-    found = np.where(mj.geom_condim[shapes] == 1, 0.0, mj.geom_friction[shapes, 0])
+    found: Floats = np.where(mj.geom_condim[shapes] == 1, 0.0, mj.geom_friction[shapes, 0])
     measure = found[still][0] if still.any() else None
     if not measure:  # nothing is fixed, or it is smooth: the other shape decides
         scale = math.sqrt(usual) if measure is None and usual else 1.0
-        found = np.where(still, np.where(found == 0.0, 1.0, found), found / scale)
+        numbers = np.where(still, np.where(found == 0.0, 1.0, found), found / scale)
     else:
         scale = math.sqrt(max(measure, usual))
-        found = np.where(still, found / measure * scale, np.maximum(found, measure) / scale)
-    return dict(zip(shapes, found.tolist(), strict=True))
+        numbers = np.where(still, found / measure * scale, np.maximum(found, measure) / scale)
+    return np.asarray(numbers, dtype=np.float64)
 
 
 def usual_friction(mj: mujoco.MjModel) -> float:
@@ -94,21 +158,18 @@ def usual_friction(mj: mujoco.MjModel) -> float:
     return float(statistics.median_low(found.tolist() or [0.0]))
 
 
-def spinning_shares(mj: mujoco.MjModel) -> dict[int, float]:
-    """Compute the share of each shape in the spinning friction of its pairs.
+def spinning_shares(mj: mujoco.MjModel, shapes: list[int]) -> Floats:
+    """Compute the share of each shape of a pair in the spinning friction of its pairs.
 
     The engine combines two shapes to ``s1 f2 + s2 f1`` with the factors f of sliding friction. With
     these shares that is the spinning friction of the pair where one of the two has the largest
     factor, at the factors of the compiled model.
     """
-    shapes = {*mj.pair_geom1.tolist(), *mj.pair_geom2.tolist()}
-    largest = max((float(mj.geom_friction[geom, 0]) for geom in shapes), default=0.0)
+    factors: Floats = mj.geom_friction[shapes, 0]
+    largest = float(factors.max(initial=0.0))
     if largest == 0.0:
-        return dict.fromkeys(shapes, 0.0)
-    return {
-        geom: (1.0 - float(mj.geom_friction[geom, 0]) / (2.0 * largest)) / largest
-        for geom in sorted(shapes)
-    }
+        return np.zeros(len(shapes))
+    return (1.0 - factors / (2.0 * largest)) / largest
 
 
 def restitution(damping: float) -> float:
@@ -118,21 +179,6 @@ def restitution(damping: float) -> float:
     return math.exp(-math.pi * damping / math.sqrt(1.0 - damping * damping))
 
 
-def _pulled(mj: mujoco.MjModel) -> Integers:
-    """List the bodies of trees that actuators or tendons reach."""
-    trees = Couplings(mj)
-    effects = [trees.actuator(i) for i in range(mj.nactuator)]
-    effects += [trees.tendon(i) for i in range(mj.ntendon)]
-    reached = frozenset[int]().union(*(always for always, _ in effects))
-    bodies = [body for body in range(mj.nbody) if trees.tree(body) in reached]
-    return np.array(bodies, dtype=np.int64)
-
-
-@final
-class SavedState:
-    """Stands for a state that a client keeps; the client forgets it when nobody holds this."""
-
-
 @final
 class Client:
     """A physics client with a model in it, and MuJoCo's own model beside it.
@@ -140,101 +186,105 @@ class Client:
     MuJoCo takes the parameters, has what follows from them, gives the forces of actuators,
     springs, dampers and media, and converts states. Nothing moves there: each of its numbers that
     concerns the engine is told to the engine when it differs from what that was told before.
+    After an error other than ``Infeasible`` a client is of no use.
 
     Args:
         engine: The module ``pybullet``.
 
     Attributes:
         engine: Its functions for this client.
-        holds: The history or the instant that it is in; set by the caller.
+        holds: The world that it is in, with the parameters in force.
+        twin: MuJoCo's model.
+        bodies: The link that carries the mass of each body that can move, by its number.
+        joints: The link of each joint, by its number; the base of a free body.
+        geoms: The link of each shape that can touch something, by its number.
     """
 
     def __init__(self, engine: Any) -> None:
         self.engine = engine = Connection(engine)
-        self.holds: Any = None
+        self.holds: Step | Instant | None = None
         self._model: Model | None = None
-        self._told: dict[Setting, Any] = {}  # settings of the engine that are in force
-        self._inside: Parameters | None = None  # parameters that were built into the bodies
-        self._ruled: set[tuple[int, int, int, int]] = set()  # pairs of links with a rule
-        self._saved: list[
-            tuple[weakref.ref[SavedState], int, Floats]
-        ] = []  # number and activations
-        self._built = Built(engine)
+        self._parameters: Parameters = {}  # in force
+        self._told: list[Floats] = []  # rows of settings that are in force
+        self._units: list[EngineBody] = []
+        self._enabled: set[tuple[int, int, int, int]] = set()  # pairs of links that may touch
+        self._saved: dict[int, weakref.ref[SavedState]] = {}
         engine.setPhysicsEngineParameter(
             numSolverIterations=SOLVER_ITERATIONS, deterministicOverlappingPairs=1
         )
 
     # --- bodies ----------------------------------------------------------------------------------
 
-    def canonicalize(self, instant: Instant) -> None:
-        """Build the one world with these parameters and this state, independently of the past.
+    def replay(self, world: Step | Instant) -> None:
+        """Bring about a world, independently of what was here before.
 
         Bodies stay where all their shapes stay; all else that depends on the past, the contact
         caches, is cleared by entering the collision objects again, always in one order.
         """
-        self.holds = None
-        self._forget(everything=True)
-        self._construct(instant.structure, instant.parameters)
-        self._twin.reset()  # what the last step left there must not matter
-        self._twin.place(instant.state)
+        self.holds, (first, steps) = None, since(world)
+        self._free(self._saved)  # beyond a canonical world they are not exact
+        self._construct(realized(first.structure), first.parameters)
+        self.twin.reset()  # what the last step left there must not matter
+        self.twin.place(first.state)
         for part in self._parts:
-            part.put(self._twin.data)
-        for place in self._built.geoms.values():  # pairs decide what touches
+            part.put(self.twin.data)
+        for place in self.geoms.values():  # pairs decide what touches
             self.engine.setCollisionFilterGroupMask(*place, 0, 0)
-        self._check(instant.state)
+        for one in steps:
+            self.edit(one.parameters)
+            self.step(one.command, one.substeps)
+        self.holds = world
 
     def _construct(self, model: Model, parameters: Parameters) -> None:
         """Make what differs from what is there, and what live bodies cannot take on."""
-        model = realized(model)
+        stays = self._model == model and alike(self._parameters, parameters, rebuilt(model))
         if self._model != model:
-            compiled = reading.compiled(model)
-            self._model, self._inside = None, None
-            self._twin, self._given = Realization(model, parameters), dict(parameters)
-            self._pulled = _pulled(compiled)
-            self._usual, self._spinning = usual_friction(compiled), spinning_shares(compiled)
-            trees = Couplings(compiled)
-            self._dynamic = np.flatnonzero(trees.dynamic.any(axis=1)).tolist()
-            self._touching = np.argwhere(np.triu(trees.touches)).tolist()
-            self._shapes = np.flatnonzero(trees.touches.any(axis=1)).tolist()
-            ends = zip(compiled.pair_geom1.tolist(), compiled.pair_geom2.tolist(), strict=True)
-            self._paired = {geom: pair for pair, both in enumerate(ends) for geom in both}
-            self._model = model
-        self._take(parameters)
-        if self._inside is None or not alike(self._inside, parameters, rebuilt(model)):
-            self._inside, mj = None, self._twin.model
-            gone = self._built.make(mj, self._shapes)
-            self._told = {what: v for what, v in self._told.items() if gone.isdisjoint(what[1][:1])}
-            self._connect()
-            self._parts = parts(self.engine, mj, self._built.joints, range(mj.ntree))
-            self._trees, self._driven = set[int](), list[JointSet]()
-            self._inside, self._changed = parameters, True
-        self._tell_all()
+            self.twin = Realization(model, parameters)
+            self._model, self._parameters = model, parameters
+            self._read_tables(reading.compiled(model))
+        if stays:
+            self.edit(parameters)
+            return
+        self.twin.edit(parameters)
+        self._parameters, mj = parameters, self.twin.model
+        self._units = renewed(self.engine, self._units, mj, self._shapes)
+        self.bodies, self.joints, self.geoms = (
+            {
+                number: (unit.multibody, link)
+                for unit in self._units
+                for number, link in getattr(unit, kind).items()
+            }
+            for kind in ("bodies", "joints", "geoms")
+        )
+        # The engine has one rule for two links, in whichever order they are named, and keeps it.
+        pairs = (sorted((self.geoms[one], self.geoms[two])) for one, two in self._touching)
+        enabled = {(*first, *second) for first, second in pairs}
+        for pair in sorted(self._enabled ^ enabled):
+            body, link, other, its = pair
+            self.engine.setCollisionFilterPair(body, other, link, its, int(pair in enabled))
+        self._enabled = enabled
+        self._parts = parts(self.engine, mj, self.joints, range(mj.ntree))
+        self._scalar = [joint for joint in self.joints if mj.jnt_type[joint] not in (FREE, BALL)]
+        armed = [(r, body) for r, body in enumerate(self.bodies) if takes_armature(mj, body)]
+        self._moments = {row: solid(mj, body)[0].copy() for row, body in armed}
+        self._told, self._trees, self._driven = [], set[int](), list[JointSet]()
+        self._tell()
 
-    def _connect(self) -> None:
-        """Set which shapes may touch, pair by pair."""
-        geoms = self._built.geoms
-        # The engine has one rule for two links, in whichever order they are named.
-        pairs = (sorted((geoms[one], geoms[two])) for one, two in self._touching)
-        wanted = {(*first, *second) for first, second in pairs}
-        self._ruled |= wanted  # this holds as long as the client
-        for body, link, other, its in sorted(self._ruled):
-            enabled = int((body, link, other, its) in wanted)
-            self.engine.setCollisionFilterPair(body, other, link, its, enabled)
-
-    def _check(self, state: Floats) -> None:
-        """Check that the engine took the state, up to rounding and the sign of a quaternion.
-
-        Raises:
-            EngineFailure: It did not.
-        """
-        actual, model = self.read(), self._twin.structure
-        for start in rotations(model):
-            where = slice(start, start + 4)
-            if actual[where] @ state[where] < 0.0:
-                actual[where] *= -1.0
-        near = abs(actual - state) <= TOLERANCE * (1.0 + abs(state))
-        if not near[model.layout.can_be_set].all():
-            raise EngineFailure("Bullet did not take the state that was set", "bullet")
+    def _read_tables(self, mj: mujoco.MjModel) -> None:
+        """Read from a compiled model what no parameter changes."""
+        trees = Couplings(mj)
+        effects = [trees.actuator(i) for i in range(mj.nactuator)]
+        effects += [trees.tendon(i) for i in range(mj.ntendon)]
+        reached = frozenset[int]().union(*(always for always, _ in effects))
+        bodies = [body for body in range(mj.nbody) if trees.tree(body) in reached]
+        self._pulled = set(mj.body_treeid[bodies].tolist())
+        self._dynamic = np.flatnonzero(trees.dynamic.any(axis=1)).tolist()
+        self._touching = np.argwhere(np.triu(trees.touches)).tolist()
+        self._shapes = np.flatnonzero(trees.touches.any(axis=1)).tolist()
+        ends = zip(mj.pair_geom1.tolist(), mj.pair_geom2.tolist(), strict=True)
+        pair_of = {geom: pair for pair, both in enumerate(ends) for geom in both}
+        self._paired, self._pair = list(pair_of), list(pair_of.values())
+        self._usual, self._spinning = usual_friction(mj), spinning_shares(mj, self._paired)
 
     # --- parameters ------------------------------------------------------------------------------
 
@@ -244,104 +294,101 @@ class Client:
         Raises:
             Infeasible: Nothing can move with them. Nothing has changed.
         """
-        self._take(parameters)
-        self._tell_all()
-
-    def _take(self, parameters: Parameters) -> None:
-        """Write the parameters that are new to MuJoCo's model."""
-        fresh = {k: v for k, v in parameters.items() if self._given.get(k) is not v}
-        if fresh:
-            self._twin.edit(fresh)
-            self._given, self._changed = {**self._given, **fresh}, True
-
-    def _tell_all(self) -> None:
-        """Set in the engine whatever differs from its last setting."""
-        if not self._changed:
+        if parameters is self._parameters:
             return
-        for what, value in self._settings():
-            if self._told.get(what) != value:
-                self._told.pop(what, None)  # unknown, should the engine fail
-                getattr(self.engine, what[0])(*what[1], **value[0])
-                self._told[what] = value
+        fresh = {k: v for k, v in parameters.items() if self._parameters.get(k) is not v}
+        if fresh:
+            self.twin.edit(fresh)
+        self._parameters = parameters
+        if fresh:
+            self._tell()
+
+    def _tell(self) -> None:
+        """Set in the engine whatever differs from its last setting."""
+        told = list[Floats]()
+        for number, (tell, places, keys, names, rows) in enumerate(self._settings()):
+            told.append(rows)
+            known = self._told[number] if self._told else np.full_like(rows, np.nan)
+            if rows.tobytes() != known.tobytes():
+                for index in np.flatnonzero((rows != known).any(axis=1)).tolist():
+                    values = dict(zip(names, rows[index].tolist(), strict=False))
+                    tell(*places[keys[index]], **values)
+        self._told = told
         moved = self._moved()
         if self._trees != moved:
             self._trees = moved
-            self._driven = parts(self.engine, self._twin.model, self._built.joints, moved)
-        self._changed = False
+            self._driven = parts(self.engine, self.twin.model, self.joints, moved)
 
-    def _settings(self) -> Iterator[tuple[Setting, tuple[dict[str, Any], Any]]]:
-        """List the settings of bodies: arguments, and what else their effect depends on."""
-        mj, built = self._twin.model, self._built
-        off = disabled(mj, _OFF.mjDSBL_GRAVITY)
-        gravity = dict(zip(("gravX", "gravY", "gravZ"), mj.opt.gravity.tolist(), strict=True))
-        yield ("setGravity", (), ""), (dict.fromkeys(gravity, 0.0) if off else gravity, None)
+    def _settings(
+        self,
+    ) -> Iterator[
+        tuple[Callable[..., Any], Mapping[int, tuple[int, ...]], list[int], tuple[str, ...], Floats]
+    ]:
+        """List functions of the engine: places by number, numbers, arguments, a row for each."""
+        mj, engine = self.twin.model, self.engine
+
+        def inertia(body: int, link: int, mass: float, **moments: float) -> None:
+            engine.changeDynamics(body, link, mass=mass, localInertiaDiagonal=[*moments.values()])
+
+        gravity = np.zeros(3) if disabled(mj, _OFF.mjDSBL_GRAVITY) else mj.opt.gravity.copy()
+        yield engine.setGravity, {0: ()}, [0], ("gravX", "gravY", "gravZ"), gravity[None]
         # An early end, decided for all bodies together, lets bodies act on each other without
         # touching: only a model that asks for it has one.
-        early = custom(mj, "bullet_early_end")
-        for name, number in (
-            ("fixedTimeStep", mj.opt.timestep),
-            ("solverResidualThreshold", early),
-        ):
-            yield ("setPhysicsEngineParameter", (), name), ({name: number}, None)
-        for body, place in built.bodies.items():
-            moments = solid(mj, body)[0].tolist()
-            inertia = {"mass": float(mj.body_mass[body]), "localInertiaDiagonal": moments}
-            yield ("changeDynamics", place, "inertia"), (inertia, None)
+        rows = np.array([[mj.opt.timestep, custom(mj, "bullet_early_end")]])
+        names = "fixedTimeStep", "solverResidualThreshold"
+        yield engine.setPhysicsEngineParameter, {0: ()}, [0], names, rows
+        bodies = list(self.bodies)
+        rows = np.column_stack([mj.body_mass[bodies], mj.body_inertia[bodies]])
+        for row, moments in self._moments.items():
+            rows[row, 1:] = moments
+        yield inertia, self.bodies, bodies, ("mass", "x", "y", "z"), rows
+        scalar = self._scalar
         rigid = not disabled(mj, _OFF.mjDSBL_CONSTRAINT)
-        dry = rigid and not disabled(mj, _OFF.mjDSBL_FRICTIONLOSS)
-        ends = rigid and not disabled(mj, _OFF.mjDSBL_LIMIT)
-        for joint, place in built.joints.items():
-            if mj.jnt_type[joint] in (FREE, BALL):
-                continue
-            if ends and mj.jnt_limited[joint]:
-                low, high = (mj.jnt_range[joint] - mj.qpos0[mj.jnt_qposadr[joint]]).tolist()
-                limits = {"jointLowerLimit": low, "jointUpperLimit": high}
-                yield ("changeDynamics", place, "limits"), (limits, None)
-            loss = float(mj.dof_frictionloss[mj.jnt_dofadr[joint]]) if dry else 0.0
-            brake = {"controlMode": self.engine.VELOCITY_CONTROL, "targetVelocity": 0.0}
-            held = loss and mj.opt.timestep  # the engine keeps it as an impulse of a step
-            yield ("setJointMotorControl2", place, ""), ({**brake, "force": loss}, held)
-        frictions = [
-            (geom, "lateralFriction", share)
-            for geom, share in shares(mj, self._dynamic, self._usual).items()
-        ]
-        for geom, pair in self._paired.items():
-            slides, spins, _ = mj.geom_friction[geom].tolist()
-            bounce = math.sqrt(restitution(float(mj.pair_solref[pair, 1])))
-            frictions += [
-                (geom, "lateralFriction", slides),
-                (geom, "spinningFriction", spins * self._spinning[geom]),
-                (geom, "restitution", bounce),
-            ]
-        for geom, name, number in frictions:
-            yield ("changeDynamics", built.geoms[geom], name), ({name: number}, None)
+        if rigid and not disabled(mj, _OFF.mjDSBL_LIMIT):
+            ended = [joint for joint in scalar if mj.jnt_limited[joint]]
+            rows = mj.jnt_range[ended] - mj.qpos0[mj.jnt_qposadr[ended], None]
+            names = "jointLowerLimit", "jointUpperLimit"
+            yield engine.changeDynamics, self.joints, ended, names, rows
+        loss = mj.dof_frictionloss[mj.jnt_dofadr[scalar]]
+        if not rigid or disabled(mj, _OFF.mjDSBL_FRICTIONLOSS):
+            loss = np.zeros(len(scalar))
+        # The engine keeps it as an impulse of a step.
+        rows = np.column_stack([loss, np.where(loss, mj.opt.timestep, 0.0)])
+        brake = partial(
+            engine.setJointMotorControl2, controlMode=engine.VELOCITY_CONTROL, targetVelocity=0.0
+        )
+        yield brake, self.joints, scalar, ("force",), rows
+        surfaces = "lateralFriction", "spinningFriction", "restitution"
+        if self._dynamic:
+            rows = shares(mj, self._dynamic, self._usual)[:, None]
+            yield engine.changeDynamics, self.geoms, self._dynamic, surfaces, rows
+        slides, spins, _ = mj.geom_friction[self._paired].T
+        damping = mj.pair_solref[self._pair, 1].tolist()
+        bounces = {ratio: math.sqrt(restitution(ratio)) for ratio in {*damping}}
+        rows = np.column_stack([slides, spins * self._spinning, [bounces[i] for i in damping]])
+        yield engine.changeDynamics, self.geoms, self._paired, surfaces, rows
 
     def _moved(self) -> set[int]:
         """List the trees on which smooth forces act, other than weight."""
-        mj = self._twin.model
+        mj = self.twin.model
         if mj.opt.density > 0.0 or mj.opt.viscosity > 0.0:
             return set(range(mj.ntree))
         bodies = (
             mj.dof_bodyid[mj.dof_damping != 0.0],
             mj.jnt_bodyid[mj.jnt_stiffness != 0.0],
             np.flatnonzero(mj.body_gravcomp),
-            self._pulled,
         )
-        return set(mj.body_treeid[np.concatenate(bodies)].tolist())
-
-    def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Read parameters from the arrays that the engine's numbers are made of."""
-        return self._twin.parameters(keys)
+        return self._pulled.union(mj.body_treeid[np.concatenate(bodies)].tolist())
 
     def remarks(self, before: Parameters) -> tuple[str, ...]:
         """List which frictions were changed without an effect; see ``shares``."""
-        twin, found = self._twin, list[str]()
+        twin, found = self.twin, list[str]()
         now = shares(twin.model, self._dynamic, self._usual)
         for key, old in before.items():
             if key[1] == "friction":
                 present = twin.kept[key]
                 twin.edit({key: old})
-                if shares(twin.model, self._dynamic, self._usual) == now:
+                if np.array_equal(shares(twin.model, self._dynamic, self._usual), now):
                     found.append(
                         f"{'.'.join(key)} has no effect: the larger coefficient of two shapes "
                         "counts, and those of the others are larger"
@@ -360,15 +407,15 @@ class Client:
         ``a = (M + h D)^-1 (f - b)``, and ``Euler`` has the slopes of passive dampers alone; the
         forces ``M a + b`` let the engine's explicit step have it.
         """
-        self._twin.forget()
-        mj, data, options = self._twin.model, self._twin.data, self._twin.model.opt
+        self.twin.forget()
+        mj, data, options = self.twin.model, self.twin.data, self.twin.model.opt
         asked = options.disableflags, options.integrator
         options.disableflags |= SMOOTH
         if options.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             options.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         if custom(mj, "bullet_explicit_servos"):
             options.integrator = mujoco.mjtIntegrator.mjINT_EULER
-        self._twin.command[:] = command
+        self.twin.command[:] = command
         forces, rates, step = np.empty(mj.nv), np.empty(mj.nv), options.timestep
         advance = self.engine.stepSimulation
         for _ in range(substeps):
@@ -389,9 +436,9 @@ class Client:
     def read(self) -> Floats:
         """Ask the engine for the state."""
         for part in self._parts:
-            part.take(self._twin.data)
-        vector = np.empty(self._twin.structure.layout.size)
-        self._twin.read(vector)
+            part.take(self.twin.data)
+        vector = np.empty(self.twin.structure.layout.size)
+        self.twin.read(vector)
         return vector
 
     def contacts(self) -> tuple[ContactPoint, ...]:
@@ -399,7 +446,7 @@ class Client:
 
         The engine also keeps points of bodies that only came near; they are left out.
         """
-        names = {h: self._twin.owners[geom] for geom, h in self._built.geoms.items()}
+        names = {h: self.twin.structure.owners[geom] for geom, h in self.geoms.items()}
         return tuple(
             ContactPoint(
                 bodies=(names[point[1], point[3]], names[point[2], point[4]]),
@@ -416,27 +463,20 @@ class Client:
 
     def save(self) -> SavedState:
         """Keep the engine's own state in this process as long as what is returned is held."""
-        self._forget()
-        saved = SavedState()
-        number, activations = self.engine.saveState(), self._twin.data.act.copy()
-        self._saved.append((weakref.ref(saved), number, activations))
+        self._free(number for number, saved in self._saved.items() if saved() is None)
+        saved = SavedState(self.engine.saveState(), self.twin.data.act.copy())
+        self._saved[saved.number] = weakref.ref(saved)
         return saved
 
     def load(self, saved: SavedState) -> bool:
         """Go back to a state if it is kept here. Parameters are not part of it."""
-        for reference, number, activations in self._saved:
-            if reference() is saved:
-                self._twin.data.act[:] = activations
-                self.engine.restoreState(stateId=number)
-                return True
-        return False
+        if all(kept() is not saved for kept in self._saved.values()):
+            return False
+        self.twin.data.act[:] = saved.activations
+        self.engine.restoreState(stateId=saved.number)
+        return True
 
-    def _forget(self, *, everything: bool = False) -> None:
-        """Free states that nobody holds, or all: beyond a canonical state they are not exact."""
-        kept = []
-        for entry in self._saved:
-            if everything or entry[0]() is None:
-                self.engine.removeState(entry[1])
-            else:
-                kept.append(entry)
-        self._saved = kept
+    def _free(self, numbers: Iterable[int]) -> None:
+        for number in [*numbers]:
+            self.engine.removeState(number)
+            del self._saved[number]

@@ -54,7 +54,10 @@ class Connection:
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(self._engine, name)
-        return partial(found, physicsClientId=self.handle) if callable(found) else found
+        if callable(found):
+            found = partial(found, physicsClientId=self.handle)
+        setattr(self, name, found)
+        return found
 
 
 def _disconnect(engine: Any, handle: int) -> None:
@@ -64,9 +67,9 @@ def _disconnect(engine: Any, handle: int) -> None:
 
 @contextmanager
 def silence() -> Iterator[None]:
-    """Discard what is written to the file descriptors of stdout and stderr."""
-    saved: dict[int, int] = {}
-    _flush()
+    """Discard what the C library writes to the file descriptors of stdout and stderr."""
+    flush, saved = ctypes.CDLL(None).fflush, dict[int, int]()
+    flush(None)
     with open(os.devnull, "w") as nowhere:
         for stream in (1, 2):
             with suppress(OSError):  # a daemon may have closed it
@@ -75,16 +78,7 @@ def silence() -> Iterator[None]:
     try:
         yield
     finally:
-        _flush()
+        flush(None)
         for stream, copy in saved.items():
             os.dup2(copy, stream)
             os.close(copy)
-
-
-def _flush() -> None:
-    """Empty the buffers of Python and of C, so that nothing crosses the border late."""
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(AttributeError, OSError, ValueError):
-            stream.flush()
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).fflush(None)

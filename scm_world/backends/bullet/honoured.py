@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -18,14 +18,14 @@ from scm_world.backends.bullet.build import (
     FREE,
     MOST_LINKS,
     SHAPES,
-    couplings,
+    coupled,
     links,
     takes_armature,
     unit_of,
 )
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.trees import Couplings, works
-from scm_world.errors import EngineFailure, ModelError, NotIntervenable
+from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
 from scm_world.models.model import Model, Parameter
 from scm_world.models.scene import ParameterKey, Parameters, State
 
@@ -42,79 +42,57 @@ def realized(model: Model) -> Model:
 def unsupported(model: Model) -> tuple[str, ...]:
     """List everything in a model that the engine cannot honour."""
     mj = reading.compiled(realized(model))
-    names, trees, tables = fields.element_names(mj), Couplings(mj), list[tuple[str, Any, str]]()
+    names, trees = fields.element_names(mj), Couplings(mj)
     touching: NDArray[np.bool_] = np.asarray(trees.touches.any(axis=1))
     dynamic: NDArray[np.bool_] = np.asarray(trees.dynamic.any(axis=1))
-    kinds, dofs = mj.jnt_type, mj.jnt_dofadr
-    loss, odd = mj.dof_frictionloss[dofs] != 0.0, ~np.isin(mj.geom_type, list(SHAPES))
+    ball, free, odd = mj.jnt_type == BALL, mj.jnt_type == FREE, ~np.isin(mj.geom_type, [*SHAPES])
+    loss, armature = (a[mj.jnt_dofadr] != 0.0 for a in (mj.dof_frictionloss, mj.dof_armature))
+    tendons = (mj.tendon_frictionloss != 0.0) | (mj.tendon_armature != 0.0) | mj.tendon_limited
     working = np.array([works(mj, actuator) for actuator in range(mj.nactuator)], dtype=np.bool_)
     adhesion = mj.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)
-    tables += [
+    surface = (mj.geom_adhesion != 0.0) | (mj.geom_surfacevel != 0.0).any(axis=1)
+    own = dynamic[mj.pair_geom1] | dynamic[mj.pair_geom2] | ~_multiplied(mj)
+    follows = (mj.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & (mj.eq_obj2id >= 0)
+    follows &= ~mj.eq_data[:, 2:5].any(axis=1)
+    one, other = (mj.body_treeid[mj.jnt_bodyid[e[follows]]] for e in (mj.eq_obj1id, mj.eq_obj2id))
+    follows[follows] = one == other
+    tables: list[tuple[str, Any, str]] = [
         (
             "joint",
-            (mj.dof_armature[dofs] != 0.0) & ~_hinged(mj)[mj.jnt_bodyid],
+            armature & ~_hinged(mj)[mj.jnt_bodyid],
             "armature of the joint {!r}, which is not a hinge that alone carries a body on the "
             "world",
         ),
-        ("joint", (kinds == BALL) & (mj.jnt_limited != 0), "limits of the ball joint {!r}"),
-        ("joint", (kinds == FREE) & loss, "frictionloss of the free joint {!r}"),
-        ("joint", (kinds == BALL) & loss, "frictionloss of the ball joint {!r}"),
-        (
-            "tendon",
-            (mj.tendon_frictionloss != 0.0) | (mj.tendon_armature != 0.0) | mj.tendon_limited,
-            "frictionloss, armature or limits of the tendon {!r}",
-        ),
+        ("joint", ball & (mj.jnt_limited != 0), "limits of the ball joint {!r}"),
+        ("joint", (ball | free) & loss, "frictionloss of the joint {!r}, no hinge or slide"),
+        ("tendon", tendons, "frictionloss, armature or limits of the tendon {!r}"),
         ("actuator", working & adhesion, "the actuator {!r}, which acts by contact"),
-        (
-            "actuator",
-            working & ~adhesion & (mj.actuator_armature != 0.0),
-            "the actuator {!r}, which adds armature of its own",
-        ),
+        ("actuator", working & (mj.actuator_armature != 0.0), "armature of the actuator {!r}"),
         ("flex", np.ones(mj.nflex), "the flex {!r}"),
-        ("geom", touching & odd, "the {kind} {!r}"),
-        (
-            "geom",
-            touching & ((mj.geom_adhesion != 0.0) | (mj.geom_surfacevel != 0.0).any(axis=1)),
-            "adhesion or moving surface of the geom {!r}",
-        ),
-        (
-            "pair",
-            dynamic[mj.pair_geom1] | dynamic[mj.pair_geom2] | ~_multiplied(mj),
-            "the pair {!r}, whose friction is not the product of those of its shapes",
-        ),
+        ("geom", touching & odd, "the geom {!r}, which is no box, ball, capsule, cylinder or mesh"),
+        ("geom", touching & surface, "adhesion or moving surface of the geom {!r}"),
+        ("pair", own, "the pair {!r}, whose friction is not the product of those of its shapes"),
         ("body", mj.body_mocapid >= 0, "the mocap body {!r}"),
+        (
+            "equality",
+            coupled(mj) & ~follows,
+            "the equality constraint {!r}: only joints of one tree can follow one another, in "
+            "proportion",
+        ),
     ]
-    found = []
-    for element, which, sentence in tables:
-        for number in np.flatnonzero(which).tolist():
-            kind = mujoco.mjtGeom(mj.geom_type[number]).name if element == "geom" else ""
-            kind = kind.removeprefix("mjGEOM_").lower()
-            found.append(sentence.format(names[element][number], kind=kind))
-    found += _of_couplings(mj, names)
+    found = [
+        sentence.format(names[element][number])
+        for element, which, sentence in tables
+        for number in np.flatnonzero(which).tolist()
+    ]
     for tree in range(mj.ntree):
         unit = unit_of(mj, tree, np.flatnonzero(touching).tolist())
-        count = links(mj, unit)
-        if count > MOST_LINKS:
+        if links(mj, unit) > MOST_LINKS:
             found.append(
-                f"the {count} links that {names['body'][unit.bodies[0]]!r} and all that hangs on "
-                f"it need: there is room for {MOST_LINKS}"
+                f"{names['body'][unit.bodies[0]]!r} and all that hangs on it, which need "
+                f"{links(mj, unit)} links: there is room for {MOST_LINKS}"
             )
     return tuple(found)
-
-
-def _of_couplings(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
-    """List the equality constraints that are not joints which follow one another in proportion."""
-    for equality in couplings(mj, range(mj.njnt)):
-        kind = int(mj.eq_type[equality])
-        ends = int(mj.eq_obj1id[equality]), int(mj.eq_obj2id[equality])
-        what = f"the equality constraint {names['equality'][equality]!r}"
-        joints = kind == int(mujoco.mjtEq.mjEQ_JOINT) and ends[1] >= 0
-        if not joints or mj.eq_data[equality, 2:5].any():
-            word = mujoco.mjtEq(kind).name.removeprefix("mjEQ_").lower()
-            yield f"{what} ({word})"
-        elif len({int(mj.body_treeid[mj.jnt_bodyid[end]]) for end in ends}) > 1:
-            one, other = (names["joint"][end] for end in ends)
-            yield f"{what}, which joins {one!r} and {other!r} of two trees"
 
 
 def _multiplied(mj: mujoco.MjModel) -> NDArray[np.bool_]:
@@ -131,46 +109,57 @@ def _hinged(mj: mujoco.MjModel) -> NDArray[np.bool_]:
     return np.array([takes_armature(mj, body) for body in range(mj.nbody)], dtype=np.bool_)
 
 
-def check(model: Model, parameters: Parameters) -> None:
-    """Refuse what the engine cannot honour, before anything is made.
+def accepted(structure: Any, given: Parameters, known: Parameters) -> Parameters:
+    """Check what is to be built, before anything is made.
 
     Args:
-        model: What is to be built.
-        parameters: Those that are given.
+        structure: The bodies.
+        given: All parameters.
+        known: Those in force, if the structure stays.
+
+    Returns:
+        The parameters; those that do not change are the same arrays.
 
     Raises:
-        ModelError: All of it that is in the model.
+        ModelError: The engine cannot honour the structure; all of it that it cannot.
+        UnknownOption: There is no such parameter, or there is one that is not given.
         NotIntervenable: A parameter that the engine lacks is not as in the model.
         EngineFailure: A number is not finite, or a rotation has no direction.
     """
-    problems = unsupported(model)
+    if not isinstance(structure, Model):
+        name = type(structure).__name__
+        raise ModelError([f"Bullet cannot realise a {name}; it takes models"])
+    problems = unsupported(structure)
     if problems:
         advice = "take it out of the model, or use backend='mujoco'"
         raise ModelError([f"Bullet cannot honour {what}; {advice}" for what in problems])
-    known, rows = changes(model), {row.key: row for row in model.parameters}
-    for key, value in parameters.items():
-        row = rows[key]
-        if not np.isfinite(value).all():
-            name, found = ".".join(key), value.tolist()
-            raise EngineFailure(f"{name} must be finite, got {found}", "bullet")
-        if row.kind == "rotation" and not value.any():
-            found = value.tolist()
-            raise EngineFailure(f"{row.name} must be a quaternion, got {found}", "bullet")
-        if row.visual or key in known:
-            continue
-        if not np.array_equal(np.broadcast_to(np.array(row.default), row.shape), value):
-            raise NotIntervenable(
-                row.name,
-                f"is no parameter on Bullet: there it keeps its default {row.default}; use "
-                "backend='mujoco'",
-            )
+    rows, honoured = structure.rows, changes(structure)
+    for key in rows.keys() ^ given.keys():
+        raise UnknownOption("parameter", ".".join(key), map(".".join, known or given))
+    found = dict[ParameterKey, Floats]()
+    for key, value in given.items():
+        old = known.get(key)
+        if old is None or value is not old:
+            new = np.array(value, dtype=np.float64)
+            if old is None or old.tobytes() != new.tobytes():
+                _check(rows[key], key in honoured, new)
+                old = new
+        found[key] = old
+    return found
 
 
-@lru_cache(maxsize=64)
-def rotations(model: Model) -> tuple[int, ...]:
-    """List where in the state the quaternions begin."""
-    slices = model.layout.slices
-    return tuple(slices[row.name].start for row in model.states if row.kind == "rotation")
+def _check(row: Parameter, honoured: bool, value: Floats) -> None:
+    """Refuse a value that the engine cannot honour."""
+    if not np.isfinite(value).all():
+        raise EngineFailure(f"{row.name} must be finite, got {value.tolist()}", "bullet")
+    if row.kind == "rotation" and not value.any():
+        raise EngineFailure(f"{row.name} must be a quaternion, got {value.tolist()}", "bullet")
+    if not honoured and not np.array_equal(np.broadcast_to(row.default, row.shape), value):
+        raise NotIntervenable(
+            row.name,
+            f"is no parameter on Bullet: there it keeps its default {row.default}; use "
+            "backend='mujoco'",
+        )
 
 
 def settle(model: Model, given: State, last: State | None = None) -> Floats:
@@ -219,38 +208,6 @@ REBUILT = (
 """What only new bodies take on."""
 
 
-def _honoured(mj: mujoco.MjModel) -> list[tuple[str, bool, Any]]:
-    """List arrays, whether they need new bodies, and which of their rows or numbers count."""
-    hinged, scalar = _hinged(mj), ~np.isin(mj.jnt_type, (FREE, BALL))
-    dynamic = Couplings(mj).dynamic.any(axis=1)
-    return [
-        *((name, False, True) for name in LIVE),
-        *((name, True, True) for name in REBUILT),
-        ("body_inertia", False, ~hinged[:, None]),
-        ("body_inertia", True, hinged[:, None]),
-        ("dof_armature", True, hinged[mj.dof_bodyid]),
-        ("jnt_range", False, scalar[:, None]),
-        ("dof_frictionloss", False, scalar[mj.dof_jntid]),
-        ("geom_friction", False, np.stack([dynamic | True, ~dynamic, ~dynamic], axis=1)),
-        ("pair_friction", False, np.arange(5) < 3),
-    ]
-
-
-def _read(mj: mujoco.MjModel, name: str) -> Floats:
-    """Copy an array of the model, or an option."""
-    of, _, option = name.rpartition(".")
-    return np.array(getattr(getattr(mj, of) if of else mj, option), dtype=np.float64)
-
-
-def _write(mj: mujoco.MjModel, name: str, value: Floats) -> None:
-    """Write what ``_read`` has copied."""
-    of, _, option = name.rpartition(".")
-    if value.ndim:
-        getattr(getattr(mj, of) if of else mj, option)[...] = value
-    else:
-        setattr(mj.opt, option, float(value))
-
-
 def _saved(mj: mujoco.MjModel) -> NDArray[np.uint8]:
     """Copy everything in a model."""
     buffer = np.empty(mujoco.mj_sizeModel(mj), np.uint8)
@@ -258,46 +215,63 @@ def _saved(mj: mujoco.MjModel) -> NDArray[np.uint8]:
     return buffer
 
 
-def _other(row: Parameter) -> Floats:
-    """Return another value of a parameter."""
-    value = np.array(np.broadcast_to(row.default, row.shape), dtype=np.float64)
-    if row.kind == "switch":
-        return 1.0 - value
-    near = np.where(value == 0.0, 0.01, 1.1 * value)
-    return np.where((near >= row.low) & (near <= row.high), near, 0.9 * value)
+def _bytes(mj: mujoco.MjModel, arrays: Mapping[str, Any]) -> NDArray[np.bool_]:
+    """Return which bytes of a saved model hold some arrays or options, where a mask is true."""
+    mj, before = copy.copy(mj), _saved(mj)
+    for path, mask in arrays.items():
+        of, _, name = path.rpartition(".")
+        owner = getattr(mj, of) if of else mj
+        value = np.array(getattr(owner, name), dtype=np.float64)
+        inverted = np.where(mask, (~value.view(np.int64)).view(np.float64), value)
+        if value.ndim:
+            getattr(owner, name)[...] = inverted
+        else:
+            setattr(owner, name, float(inverted))
+    found: NDArray[np.bool_] = _saved(mj) != before
+    return found
 
 
 @lru_cache(maxsize=64)
 def changes(model: Model) -> Mapping[ParameterKey, bool]:
-    """Map the parameters that the engine has to whether a change of them needs new bodies.
+    """Map the parameters that can be set to whether a change of them needs new bodies.
 
     Each is tried on a copy of the compiled model: the engine has a parameter if nothing is written
-    but what it honours.
+    but what it honours, or if only pictures have it.
     """
-    model = realized(model)
-    mj = copy.copy(reading.compiled(model))
-    slots = model.slots(mj, mujoco.MjData(mj))
-    untouched, found = _saved(mj), dict[ParameterKey, bool]()
-    rows = [(name, new, which, _read(mj, name)) for name, new, which in _honoured(mj)]
-    for row in model.parameters:
+    mj = copy.copy(reading.compiled(realized(model)))
+    hinged, scalar = _hinged(mj), ~np.isin(mj.jnt_type, (FREE, BALL))
+    dynamic = Couplings(mj).dynamic.any(axis=1)
+    live = {
+        **dict.fromkeys(LIVE, True),
+        "body_inertia": ~hinged[:, None],
+        "jnt_range": scalar[:, None],
+        "dof_frictionloss": scalar[mj.dof_jntid],
+        "geom_friction": np.stack([dynamic | True, ~dynamic, ~dynamic], axis=1),
+        "pair_friction": np.arange(5) < 3,
+    }
+    new = {
+        **dict.fromkeys(REBUILT, True),
+        "body_inertia": hinged[:, None],
+        "dof_armature": hinged[mj.dof_bodyid],
+    }
+    before, taken, built = _saved(mj), _bytes(mj, live), _bytes(mj, new)
+    slots = realized(model).slots(mj, mujoco.MjData(mj))
+    needs = dict[ParameterKey, bool]()
+    for row in realized(model).parameters:
         slot = slots[row.key]
-        before = slot.read()
-        slot.write(_other(row))
-        if slot.follow_up:
-            slot.follow_up(mj)
-        takes, multiplied = set[bool](), _multiplied(mj).all()
-        for name, new, which, was in rows:
-            now = _read(mj, name)
-            changed = (now != was) & which
-            if changed.any():
-                takes.add(new)
-                _write(mj, name, np.where(changed, was, now))
-        if takes and multiplied and np.array_equal(_saved(mj), untouched):
-            found[row.key] = any(takes)
-        for name, _, _, was in rows:
-            _write(mj, name, was)
-        slot.write(before)
-    return found
+        value = np.array(np.broadcast_to(row.default, row.shape), dtype=np.float64)
+        near = np.where(value == 0.0, 0.01, 1.1 * value)
+        other = np.where((near >= row.low) & (near <= row.high), near, 0.9 * value)
+        present, follow_up = slot.read(), slot.follow_up or (lambda mj: None)
+        slot.write(1.0 - value if row.kind == "switch" else other)
+        follow_up(mj)
+        changed = np.flatnonzero(_saved(mj) != before)
+        honoured = (taken[changed] | built[changed]).all() and _multiplied(mj).all()
+        if len(changed) and honoured:
+            needs[row.key] = bool(built[changed].any())
+        slot.write(present)
+        follow_up(mj)
+    return needs | {row.key: False for row in model.parameters if row.visual}
 
 
 @lru_cache(maxsize=64)
@@ -307,7 +281,5 @@ def rebuilt(model: Model) -> tuple[ParameterKey, ...]:
 
 
 def supports(model: Any, key: ParameterKey) -> bool:
-    """Return whether a parameter of a model can be set: the engine has it, or only pictures do."""
-    if not isinstance(model, Model):
-        return False
-    return key in changes(model) or any(row.key == key and row.visual for row in model.parameters)
+    """Return whether a parameter of a model can be set."""
+    return isinstance(model, Model) and key in changes(model)

@@ -13,34 +13,23 @@ from scm_world._types import Floats, Integers
 from scm_world.backends.bullet.build import BALL, FREE, UNTURNED, Handle, composed, plain, rotated
 
 
-class _Joints:
-    """Joints that are read and set in one call of the engine.
-
-    Args:
-        engine: The functions of a physics client.
-        mj: The model.
-        places: The link of each joint, by the number of the joint.
-    """
-
-    def __init__(self, engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle]) -> None:
-        self._engine, joints = engine, list(places)
-        self._starts = np.stack([mj.jnt_qposadr[joints], mj.jnt_dofadr[joints]], axis=1)
-
-
 @final
-class Scalars(_Joints):
-    """Hinges and slides."""
+class Scalars:
+    """Hinges and slides, in one call of the engine for each multibody."""
 
     def __init__(self, engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle]) -> None:
-        order = dict.fromkeys(multibody for multibody, _ in places.values())
-        rank = {multibody: index for index, multibody in enumerate(order)}
-        places = dict(sorted(places.items(), key=lambda item: rank[item[1][0]]))
-        super().__init__(engine, mj, places)
+        groups: dict[int, dict[int, int]] = {}
+        for joint, (multibody, link) in places.items():
+            groups.setdefault(multibody, {})[joint] = link
+        joints = [joint for group in groups.values() for joint in group]
+        self._places = [places[joint] for joint in joints]
+        self._links = [(multibody, list(group.values())) for multibody, group in groups.items()]
         self._ask, self._tell = engine.getJointStates, engine.setJointMotorControlArray
-        self._mode = engine.TORQUE_CONTROL
-        self._places = list(places.values())
-        self._links = [(m, [link for body, link in self._places if body == m]) for m in order]
-        self._positions, self._velocities = (_run(starts) for starts in self._starts.T)
+        self._put, self._mode = engine.resetJointState, engine.TORQUE_CONTROL
+        self._positions, self._velocities = (
+            _run(mj.jnt_qposadr[joints]),
+            _run(mj.jnt_dofadr[joints]),
+        )
         self._references = mj.qpos0[self._positions]
         self._shifted = bool(self._references.any())
 
@@ -48,9 +37,8 @@ class Scalars(_Joints):
         """Set the state in the engine to that of MuJoCo."""
         values = (data.qpos[self._positions] - self._references).tolist()
         speeds = data.qvel[self._velocities].tolist()
-        tell = self._engine.resetJointState
         for place, value, speed in zip(self._places, values, speeds, strict=True):
-            tell(*place, value, speed)
+            self._put(*place, value, speed)
 
     def take(self, data: mujoco.MjData) -> None:
         """Set the state of MuJoCo to that in the engine."""
@@ -76,15 +64,13 @@ def _run(numbers: Integers) -> Any:
 
 
 @final
-class Ball(_Joints):
+class Ball:
     """A ball joint. The engine has it about the principal axes of the body."""
 
-    def __init__(self, engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle]) -> None:
-        super().__init__(engine, mj, places)
-        ((joint, self._place),) = places.items()
-        q, v = self._starts[0].tolist()
+    def __init__(self, engine: Any, mj: mujoco.MjModel, joint: int, place: Handle) -> None:
+        self._engine, self._place = engine, place
+        q, v, body = (int(a[joint]) for a in (mj.jnt_qposadr, mj.jnt_dofadr, mj.jnt_bodyid))
         self._turn, self._spin = slice(q, q + 4), slice(v, v + 3)
-        body = int(mj.jnt_bodyid[joint])
         last = mj.body_jntadr[body] + mj.body_jntnum[body] - 1 == joint  # others have no mass
         self._axes = mj.body_iquat[body].copy() if last else UNTURNED
         self._back = np.array([1.0, -1.0, -1.0, -1.0]) * self._axes
@@ -109,16 +95,17 @@ class Ball(_Joints):
 
 
 @final
-class Free(_Joints):
+class Free:
     """Free bodies. The engine has the motion of their centers, and turns of their principal axes.
 
     Their coordinates in MuJoCo are positions of their frames.
     """
 
     def __init__(self, engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle]) -> None:
-        super().__init__(engine, mj, places)
+        self._engine, joints = engine, list(places)
+        self._starts = np.stack([mj.jnt_qposadr[joints], mj.jnt_dofadr[joints]], axis=1)
         self._multibodies = [multibody for multibody, _ in places.values()]
-        self._bodies = mj.jnt_bodyid[list(places)].tolist()
+        self._bodies = mj.jnt_bodyid[joints].tolist()
         self._centers, self._axes = mj.body_ipos[self._bodies], mj.body_iquat[self._bodies]
         self._pose, self._velocity = engine.getBasePositionAndOrientation, engine.getBaseVelocity
 
@@ -160,17 +147,14 @@ def parts(
     engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle], trees: Collection[int]
 ) -> list[JointSet]:
     """List what can move in some kinematic trees, as few parts as there can be."""
-    tree_of, found = mj.body_treeid[mj.jnt_bodyid].tolist(), list[JointSet]()
+    own = [j for j in sorted(places) if mj.body_treeid[mj.jnt_bodyid[j]] in trees]
     together: dict[type[Scalars | Free], dict[int, Handle]] = {}
-    for joint, place in sorted(places.items()):
-        kind = int(mj.jnt_type[joint])
-        if tree_of[joint] not in trees:
-            continue
-        if kind == BALL:
-            found.append(Ball(engine, mj, {joint: place}))
-        else:
-            together.setdefault(Free if kind == FREE else Scalars, {})[joint] = place
-    return found + [kind(engine, mj, own) for kind, own in together.items()]
+    for joint in own:
+        if mj.jnt_type[joint] != BALL:
+            kind = Free if mj.jnt_type[joint] == FREE else Scalars
+            together.setdefault(kind, {})[joint] = places[joint]
+    balls = [Ball(engine, mj, j, places[j]) for j in own if mj.jnt_type[j] == BALL]
+    return [*balls, *(kind(engine, mj, joints) for kind, joints in together.items())]
 
 
 @njit(cache=True)
@@ -215,9 +199,8 @@ def _to_centers(
         velocities: ``qvel``.
         starts: Where each body begins in the two, shape (n, 2).
         centers: Centers of mass in the frames of the bodies, shape (n, 3) [m].
-        axes: From principal axes to those frames, as MuJoCo has quaternions, shape (n, 4).
-        into: Position, quaternion (x, y, z, w), velocity and angular velocity in the world,
-            written, shape (n, 13).
+        axes: From principal axes to those frames, quaternions (w, x, y, z), shape (n, 4).
+        into: Position, quaternion (x, y, z, w), velocity and spin in the world, shape (n, 13).
     """
     for i in range(len(into)):
         q, v = starts[i, 0], starts[i, 1]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any, ClassVar, final
 
 import mujoco
@@ -18,45 +17,26 @@ from scm_world.backends.base import (
 )
 from scm_world.backends.mujoco.batch import MujocoBatch, Slot
 from scm_world.backends.mujoco.contacts import Touches
-from scm_world.backends.mujoco.realization import Realization, refuse_callbacks
+from scm_world.backends.mujoco.reading import callbacks
+from scm_world.backends.mujoco.realization import Realization
 from scm_world.errors import EngineFailure
 from scm_world.models.scene import (
     Difference,
     ParameterKey,
     Parameters,
     Scene,
-    Structure,
     complete,
 )
 
 
 @final
-@dataclass(frozen=True)
-class Payload:
-    """What a snapshot of MuJoCo holds.
+class MujocoBackend(Backend):
+    """MuJoCo, with one compiled model per structure and everything else edited in place.
 
     Attributes:
-        structure: Of the scene.
-        parameters: All of them, as they were applied.
-        revision: Theirs; see ``Realization``.
-        numbers: ``mjSTATE_INTEGRATION``.
-        memory: What the realization keeps.
-        touches: The contacts of the last physics step.
-        replay: What takes that step again if they are not known: see ``Realization``.
+        realization: The compiled model, with parameters and state of the scene.
+        slot: Where the state is instead, while a batch steps the scene.
     """
-
-    structure: Structure
-    parameters: Parameters
-    revision: object
-    numbers: Floats
-    memory: Any
-    touches: Touches | None
-    replay: tuple[Floats, int] | None = None
-
-
-@final
-class MujocoBackend(Backend):
-    """MuJoCo, with one compiled model per structure and everything else edited in place."""
 
     name: ClassVar[str] = "mujoco"
     capabilities: ClassVar[Capabilities] = Capabilities(
@@ -65,15 +45,15 @@ class MujocoBackend(Backend):
     batch: ClassVar[type[EngineBatch]] = MujocoBatch
     version = str(mujoco.__version__)
 
-    _now: Realization
+    realization: Realization
     _touches: Touches | None
     slot: Slot | None = None
 
     def __getattr__(self, name: str) -> Any:
-        if name == "_now":
+        if name == "realization":
             raise EngineFailure("there is no scene; call build() first", self.name)
         if name == "structure":
-            return self._now.structure
+            return self.realization.structure
         raise AttributeError(name)
 
     def build(self, scene: Scene) -> None:
@@ -81,7 +61,7 @@ class MujocoBackend(Backend):
         now = self._realized(scene.structure, scene.parameters)
         now.reset()
         now.place(scene.state.vector)
-        self._now, self.slot, self._touches = now, None, None
+        self.realization, self.slot, self._touches = now, None, None
 
     def apply(self, difference: Difference) -> None:
         """Change structure, parameters and state without advancing time.
@@ -91,7 +71,7 @@ class MujocoBackend(Backend):
             Infeasible: MuJoCo could not continue with these parameters. Nothing has changed.
         """
         self._return()
-        now, structure = self._now, difference.structure
+        now, structure = self.realization, difference.structure
         if now.replay is not None and (difference.parameters or structure is not None):
             self._last_touches()  # later, this would be another step
         if structure is None:
@@ -100,51 +80,37 @@ class MujocoBackend(Backend):
             record = self._last_touches()
             scene = Scene(now.structure, now.kept, self.read())
             difference = complete(scene, structure, difference)
-            self._now = self._realized(structure, difference.parameters)
-            if self._now is not now:
-                self._now.follow(now)
+            self.realization = self._realized(structure, difference.parameters)
+            if self.realization is not now:
+                self.realization.follow(now)
             self._touches = record
         if difference.state is not None:
-            self._now.place(difference.state.vector)
+            self.realization.place(difference.state.vector)
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Read parameters back from the arrays of the model.
-
-        Raises:
-            UnknownOption: There is no such parameter.
-        """
-        return self._now.parameters(keys)
+        """Read parameters back from the arrays of the model."""
+        return self.realization.parameters(keys)
 
     def read(self, into: Any = None) -> Any:
         """Write the present state into an existing one, or a new one."""
         if self.slot is not None:
             self._return()
-        into = self._now.structure.empty_state() if into is None else into
-        self._now.read(into.vector)
+        into = self.realization.structure.empty_state() if into is None else into
+        self.realization.read(into.vector)
         return into
 
     def step(self, command: Floats, substeps: int) -> None:
         """Hold a command for some physics steps.
 
         Raises:
-            EngineFailure: A number is not finite afterwards, memory did not suffice, or a callback
-                of the user is in use.
-            UnknownOption: The structure has no such mode.
+            EngineFailure: Also where memory did not suffice, or a callback of the user is in use.
         """
         if self.slot is not None:
             self._return()
-        refuse_callbacks()
-        now = self._now
-        now.command[:] = command
-        now.forget()
+        if found := callbacks():
+            raise EngineFailure("; ".join(found), self.name)
         self._touches = None
-        try:
-            mujoco.mj_step(now.model, now.data, substeps)
-        except (mujoco.FatalError, mujoco.UnexpectedError) as error:
-            now.recover()
-            raise EngineFailure(f"MuJoCo: {error}", self.name) from error
-        problem = now.problem()
-        if problem:
+        if problem := self.realization.step(command, substeps):
             raise EngineFailure(problem, self.name)
 
     def contacts(self) -> tuple[ContactPoint, ...]:
@@ -157,12 +123,11 @@ class MujocoBackend(Backend):
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""
         self._return()
-        now = self._now
+        now = self.realization
         touches = self._touches if now.replay is not None else self._last_touches()
         replay = now.replay if touches is None else None
-        state = now.revision, now.numbers(), now.memory()
-        payload = Payload(now.structure, dict(now.kept), *state, touches, replay)
-        return EngineSnapshot.of(self, payload)
+        scene = now.structure, dict(now.kept), now.revision
+        return EngineSnapshot.of(self, (*scene, now.numbers(), now.memory(), touches, replay))
 
     def restore(self, snapshot: EngineSnapshot) -> None:
         """Go back to a snapshot.
@@ -170,45 +135,39 @@ class MujocoBackend(Backend):
         Raises:
             SnapshotMismatch: It was taken by another engine, or another version of this one.
         """
-        payload: Payload = snapshot.opened(self)
-        now: Realization | None = vars(self).get("_now")
-        if now is None or now.revision is not payload.revision:
-            now = self._realized(payload.structure, payload.parameters)
-            now.revision = payload.revision
-        now.recall(payload.numbers, payload.memory)
-        now.replay = payload.replay
-        self._now, self.slot, self._touches = now, None, payload.touches
-
-    @property
-    def realization(self) -> Realization:
-        """The compiled model, with parameters and state of the scene when it is not in a slot."""
-        return self._now
+        structure, parameters, revision, numbers, memory, touches, replay = snapshot.opened(self)
+        now: Realization | None = vars(self).get("realization")
+        if now is None or now.revision is not revision:
+            now = self._realized(structure, parameters)
+            now.revision = revision
+        now.recall(numbers, memory)
+        now.replay = replay
+        self.realization, self.slot, self._touches = now, None, touches
 
     def move_to(self, slot: Slot) -> Realization:
         """Copy the state to a slot; return the model with the parameters of the scene."""
         if self.slot != slot:
             self._return()
-            slot[0].take(slot[1], self._now)
+            slot[0].take(slot[1], self.realization)
             self.slot = slot
-        self._now.forget()
+        self.realization.forget()
         self._touches = None
-        return self._now
+        return self.realization
 
     def _return(self) -> None:
         """Take the state back from where it is stepped."""
         if self.slot is not None:
             group, index = self.slot
-            group.give_back(index, self._now)
+            group.give_back(index, self.realization)
             self.slot = None
 
     def close(self) -> None:
         """Free the model and its data."""
-        for name in list(vars(self)):
-            delattr(self, name)
+        vars(self).clear()
 
     def _realized(self, structure: Any, parameters: Parameters) -> Realization:
         """Return the present realization, edited, or a new one."""
-        now: Realization | None = vars(self).get("_now")
+        now: Realization | None = vars(self).get("realization")
         if now is None or structure != now.structure:
             return Realization(structure, parameters)
         now.edit(parameters)
@@ -217,5 +176,5 @@ class MujocoBackend(Backend):
     def _last_touches(self) -> Touches:
         if self._touches is None:
             self._return()
-            self._touches = self._now.touches()
+            self._touches = self.realization.touches()
         return self._touches

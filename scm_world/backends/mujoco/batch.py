@@ -13,7 +13,8 @@ from mujoco.batch import Batch, SimulationError
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import EngineBatch
-from scm_world.backends.mujoco.realization import FULL, STATE, Realization, lost, refuse_callbacks
+from scm_world.backends.mujoco.reading import callbacks
+from scm_world.backends.mujoco.realization import FULL, STATE, Realization, lost
 from scm_world.errors import EngineFailure
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ Slot = tuple["Simulations", int]
 KEPT = 4
 """Structures whose simulations are kept although no scene is in them at the moment."""
 
-_LEFT_BEHIND: list[Simulations] = []
+_LEFT_BEHIND: list[Any] = []
 """Simulations whose threads were left behind by a fork."""
 
 
@@ -68,14 +69,28 @@ class Simulations:
         elif not scene.lean:
             self.batch.get_data(index, scene.data)
 
-    def step(self, which: Integers, commands: Floats, substeps: int) -> None:
-        """Hold commands, shape (n, at least n_commands), in some of the simulations."""
-        width, everyone = self._width, len(which) == len(self.models)
+    def step(self, which: Any, commands: Floats, substeps: int, into: Floats) -> str:
+        """Step some of the simulations and read them; return what went wrong, or nothing."""
+        batch, width, said = self.batch, self._width, ""
+        everyone = len(which) == len(self.models)
         rows = slice(None) if everyone else which
         self._commands[rows, :width] = commands[rows, :width]
         if self.before.size:
-            self.before[rows], self.taken[rows] = self.batch.state[rows], substeps
-        self.batch.step(ids=None if everyone else which, nstep=substeps)
+            self.before[rows], self.taken[rows] = batch.state[rows], substeps
+        try:
+            batch.step(ids=None if everyone else which, nstep=substeps)
+        except SimulationError as error:
+            said = f"MuJoCo: {error}"
+        counts = batch.warning[..., 1]
+        wrong, full = self.read(which, into), counts[:, 1:3].max(axis=1) > 1
+        counts[:] = 1
+        if not said and full[which].any():
+            said = f"scene {which[full[which]][0]} of the batch: {FULL}"
+        elif not said and wrong >= 0:
+            vector = into[wrong, : self.structure.layout.size]
+            where = lost(self.structure, vector, float(batch.state[wrong, 0]))
+            said = f"scene {wrong} of the batch: {where}"
+        return said
 
 
 @final
@@ -108,41 +123,37 @@ class MujocoBatch(EngineBatch):
         if self._process != os.getpid():
             # Threads do not survive a fork, so all simulations are made again. The old ones cannot
             # be freed here: that would wait for the threads for ever.
+            _LEFT_BEHIND.append((self._groups, self._slots))
+            self._groups, self._slots = {}, [None] * len(self._backends)
             self._process, self._last = os.getpid(), None
-            _LEFT_BEHIND.extend(self._groups.values())
-            _LEFT_BEHIND.extend(slot[0] for slot in self._slots if slot is not None)
-            self._groups.clear()
-            self._slots = [None] * len(self._backends)
-        refuse_callbacks()
+        if found := callbacks():
+            raise EngineFailure("; ".join(found), "mujoco")
         everyone = len(which) == len(self._backends)
         slots = [backend.slot for backend in self._backends] if everyone else None
         if self._last is not None and slots == self._slots:
-            problem = _step(self._last, which.astype(np.int32), commands, substeps, into)
-            if problem:
+            if problem := self._last.step(which.astype(np.int32), commands, substeps, into):
                 raise EngineFailure(problem, "mujoco")
             return
-        groups: dict[int, tuple[Simulations, list[int]]] = {}
-        changed: set[int] = set()
+        groups: dict[Simulations, list[int]] = {}
+        changed: set[Simulations] = set()
         for index in which.tolist():
             slot = group, _ = self._slot(index)
-            key = id(group)
-            groups.setdefault(key, (group, []))[1].append(index)
+            groups.setdefault(group, []).append(index)
             scene = self._backends[index].move_to(slot)
             if group.seen[index] != (scene.model, scene.revision):
                 group.seen[index] = scene.model, scene.revision
                 alike = scene.fingerprint() == group.usual[0]
                 group.models[index] = group.usual[1] if alike else scene.model
-                changed.add(key)
-        problems = []
-        everyone = len(groups) == 1 and len(which) == len(self._backends)
-        self._last = next(iter(groups.values()))[0] if everyone else None
-        for key, (group, members) in groups.items():
-            if key in changed:
-                group.batch.set_models(group.models)
-            problem = _step(group, np.array(members, dtype=np.int32), commands, substeps, into)
-            problems += [problem] if problem else []
-        if problems:
-            raise EngineFailure("; ".join(problems), "mujoco")
+                changed.add(group)
+        self._last = next(iter(groups)) if everyone and len(groups) == 1 else None
+        for group in changed:
+            group.batch.set_models(group.models)
+        said = [
+            group.step(np.array(members, dtype=np.int32), commands, substeps, into)
+            for group, members in groups.items()
+        ]
+        if any(said):
+            raise EngineFailure("; ".join(filter(None, said)), "mujoco")
 
     def _slot(self, index: int) -> Slot:
         """Return the slot of a scene in the group of its structure."""
@@ -151,32 +162,11 @@ class MujocoBatch(EngineBatch):
             return slot
         self._slots[index], group = None, self._groups.get(scene.structure)
         if group is None:
-            used = {id(slot[0]) for slot in self._slots if slot is not None}
-            unused = [key for key, other in self._groups.items() if id(other) not in used]
+            used = {slot[0] for slot in self._slots if slot is not None}
+            unused = [key for key, other in self._groups.items() if other not in used]
             for key in unused[: max(0, len(self._groups) + 1 - KEPT)]:
                 del self._groups[key]
             group = Simulations(scene, len(self._backends), self._threads)
             self._groups[scene.structure] = group
         slot = self._slots[index] = group, index
         return slot
-
-
-def _step(group: Simulations, which: Any, commands: Floats, substeps: int, into: Floats) -> str:
-    """Step and read; say what went wrong, or nothing."""
-    said = ""
-    try:
-        group.step(which, commands, substeps)
-    except SimulationError as error:
-        said = f"MuJoCo: {error}"
-    counts = group.batch.warning[..., 1]
-    wrong, full = group.read(which, into), counts[:, 1:3].max(axis=1) > 1
-    counts[:] = 1
-    if not said and full[which].any():
-        said = f"scene {which[full[which]][0]} of the batch: {FULL}"
-    elif not said and wrong >= 0:
-        vector, time = (
-            into[wrong, : group.structure.layout.size],
-            float(group.batch.state[wrong, 0]),
-        )
-        said = f"scene {wrong} of the batch: {lost(group.structure, vector, time)}"
-    return said

@@ -32,16 +32,17 @@ class Touches:
 
     def contacts(self) -> tuple[ContactPoint, ...]:
         """Name the bodies."""
-        return tuple(
-            ContactPoint(
-                (self.owners[first], self.owners[second]),
-                row[:3].copy(),
-                row[3:6].copy(),
-                -float(row[6]),
-                float(row[7]),
-            )
-            for (first, second), row in zip(self.shapes, self.numbers, strict=True)
-        )
+        found = []
+        for (one, other), row in zip(self.shapes, self.numbers, strict=True):
+            names, (distance, force) = (self.owners[one], self.owners[other]), row[6:].tolist()
+            found.append(ContactPoint(names, row[:3].copy(), row[3:6].copy(), -distance, force))
+        return tuple(found)
+
+
+def shapes_of(model: mujoco.MjModel, data: mujoco.MjData) -> Integers:
+    """Copy the numbers of the shapes of each contact: the geoms, then the flexes, shape (k, 2)."""
+    shapes: Integers = data.contact.geom.astype(np.int64)
+    return np.where(shapes < 0, model.ngeom + data.contact.flex, shapes) if model.nflex else shapes
 
 
 def touches(model: mujoco.MjModel, data: mujoco.MjData, owners: tuple[str, ...]) -> Touches:
@@ -50,10 +51,7 @@ def touches(model: mujoco.MjModel, data: mujoco.MjData, owners: tuple[str, ...])
     Their force is the sum of those on the edges of a pyramid, or the first one of an elliptic cone;
     contacts within a gap have none.
     """
-    contact = data.contact
-    shapes = contact.geom.astype(np.int64)
-    if model.nflex:
-        shapes = np.where(shapes < 0, model.ngeom + contact.flex, shapes)
+    contact, shapes = data.contact, shapes_of(model, data)
     numbers = np.zeros((len(shapes), 8))
     numbers[:, :3], numbers[:, 3:6] = contact.pos, contact.frame[:, :3]
     numbers[:, 6], forces = contact.dist, numbers[:, 7]

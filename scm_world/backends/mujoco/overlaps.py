@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from scm_world._types import Floats, Integers
+from scm_world.backends.mujoco.contacts import shapes_of
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.models.scene import SURFACES, Overlap, ParameterKey, Scene
 
@@ -22,17 +23,18 @@ Shapes = tuple[int, int]
 """Numbers of two shapes: the geoms of the model, then its flexes."""
 
 
+@lru_cache(maxsize=32)
 @final
 class _Scratch:
-    """A compiled structure, to put scenes into one after another."""
+    """A compiled structure of a thread, to put scenes into one after another."""
 
-    def __init__(self, structure: Any) -> None:
+    def __init__(self, structure: Any, thread: int) -> None:
         default = structure.default_scene().parameters
         self._written: dict[ParameterKey, Floats] = {
             key: value for key, value in default.items() if key[1] in SURFACES
         }
         self._now = Realization(structure, self._written)
-        model, self.owners = self._now.model, self._now.owners
+        model, self.owners = self._now.model, structure.owners
         kinds = np.ones(model.ngeom + model.nflex, dtype=np.int64)
         roots = model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)]
         kinds[: model.ngeom][np.isin(model.body_rootid[model.geom_bodyid], roots)] = 0
@@ -54,22 +56,12 @@ class _Scratch:
         if model.nflex:
             mujoco.mj_flex(model, data)
         mujoco.mj_collision(model, data)
-        contact = data.contact
-        shapes = contact.geom
-        if model.nflex:
-            shapes = np.where(shapes < 0, model.ngeom + contact.flex, shapes)
-        return shapes, -contact.dist
-
-
-@lru_cache(maxsize=32)
-def _scratch(structure: Any, thread: int) -> _Scratch:
-    """Compile a structure once in each thread."""
-    return _Scratch(structure)
+        return shapes_of(model, data), -data.contact.dist
 
 
 def touching(scene: Scene, tolerance: float) -> frozenset[Shapes]:
     """Return the shapes that lie deeper in one another than a tolerance [m]."""
-    shapes, depths = _scratch(scene.structure, threading.get_ident()).contacts(scene)
+    shapes, depths = _Scratch(scene.structure, threading.get_ident()).contacts(scene)
     return frozenset((one, other) for one, other in shapes[depths > tolerance].tolist())
 
 
@@ -100,7 +92,7 @@ def overlaps(
         >>> print(*overlaps(scene, 1e-4))
         'tool_block' lies 2.5 mm deep in 'floor'
     """
-    scratch = _scratch(scene.structure, threading.get_ident())
+    scratch = _Scratch(scene.structure, threading.get_ident())
     shapes, depths = scratch.contacts(scene)
     if not len(depths):
         return ()

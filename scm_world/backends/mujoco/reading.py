@@ -10,12 +10,11 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
 
-from scm_world._types import Integers
 from scm_world.backends.mujoco.fields import (
     MEDIUM,
     control_unit,
@@ -28,15 +27,7 @@ from scm_world.backends.mujoco.readouts import find_readouts
 from scm_world.backends.mujoco.sources import Source, read_source, realized, understood
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, nearest
-from scm_world.models.model import (
-    REPORTED,
-    BodyRow,
-    Model,
-    Numbers,
-    Parameter,
-    Row,
-    StateRow,
-)
+from scm_world.models.model import REPORTED, BodyRow, Model, Parameter, Row, StateRow
 from scm_world.models.scene import REVERSED, reversed_ranges
 
 _JNT = mujoco.mjtJoint
@@ -65,18 +56,20 @@ def callbacks() -> list[str]:
     ]
 
 
+_TRIANGLE = np.ones((3, 3)) - (2.0 - 1e-6) * np.eye(3)
+"""Takes moments of inertia to numbers that are not negative if none exceeds the sum of others."""
+
+
 def sensible(mj: mujoco.MjModel) -> bool:
     """Return whether masses, and what MuJoCo derives from them, are those of something that moves.
 
     They are finite and not negative, and moments of inertia obey the triangle inequality.
     """
-    most = mj.body_inertia.max(axis=1)
-    parts = mj.body_mass, mj.body_inertia, mj.dof_M0, mj.dof_invweight0, mj.body_invweight0
-    return (
-        all(part.min() >= 0.0 and part.max() < math.inf for part in parts)
-        and mj.dof_M0.min() > 0.0
-        and bool((mj.body_inertia.sum(axis=1) - 2.0 * most >= -1e-6 * most).all())
-    )
+    moments, diagonal = mj.body_inertia, mj.dof_M0
+    parts = mj.body_mass, moments.ravel(), diagonal, mj.dof_invweight0, mj.body_invweight0.ravel()
+    found = np.concatenate(parts)
+    valid = found.min() >= 0.0 and found.max() < math.inf and diagonal.min() > 0.0
+    return bool(valid and (moments @ _TRIANGLE).min() >= 0.0)
 
 
 Bindings = Callable[[mujoco.MjModel, mujoco.MjData, Couplings], Iterable[Parameter]]
@@ -94,7 +87,7 @@ def read_model(
     settings: Mapping[str, Any] | None = None,
     reported: Iterable[str] | str = (),
     states: Mapping[str, Sequence[str]] | None = None,
-    controls: Sequence[str] | None = None,
+    controls: int | None = None,
     bindings: Bindings | None = None,
     frame: Literal["body", "world"] = "body",
     part_of: Mapping[str, str] | None = None,
@@ -121,8 +114,7 @@ def read_model(
         states: Names of states, in the order of the state vector, each with the elementary states
             (and reported quantities) that it consists of: ``{"joint_positions":
             ["hip.position", "knee.position"]}``. Each elementary state by itself if None.
-        controls: Names of the actuators that are commanded, in order, the first ones of the model;
-            all if None.
+        controls: How many actuators are commanded, the first ones of the model; all if None.
         bindings: Makes the parameters in place of the fields of the compiled model, given that
             model and its kinematic trees: each writes one value to any arrays. ``expose`` has no
             effect then.
@@ -151,27 +143,18 @@ def read_model(
     medium = [p for p in patterns or () if p != "*" and fnmatch.filter(MEDIUM, p)]
     trees = Couplings(mj, fluid=bool(medium))
     names = element_names(mj)
-    elements = {row.name: row for row in _states(mj, names, trees, start, frame)}
+    elements, commands = _moving(mj, names, trees, start, frame)
     moving = _grouped(elements, states, [reported] if isinstance(reported, str) else [*reported])
-    inputs = tuple(_inputs(mj, names, trees, start))
-    if controls is not None:
-        inputs = inputs[: len(controls)]
-        if [row.name for row in inputs] != [f"{name}.control" for name in controls]:
-            first = [row.name.removesuffix(".control") for row in inputs]
-            raise ModelError([f"controls={[*controls]}: the first actuators are {first}"])
-    if bindings is not None:
-        rows = tuple(bindings(mj, start, trees))
-        chosen = {row.name for row in rows}
-    else:
-        rows = tuple(table(mj, start, trees))
-        chosen = _exposed(rows, patterns)
+    inputs = tuple(commands[:controls])
+    rows = tuple((bindings or table)(mj, start, trees))
+    chosen = {row.name for row in rows} if bindings else _exposed(rows, patterns)
     parameters = tuple(row for row in rows if row.name in chosen)
     wrong = reversed_ranges({row.key: row.default for row in parameters})
     if wrong:
         raise ModelError([f"{where}: {'.'.join(key)}: {REVERSED}" for key in wrong])
     touch = mj.nflex > 0 or bool(trees.touches.any())
     staged = touch and int(mj.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
-    drift = tuple(_drift(mj, sealed, start))
+    drift = tuple(_drift(mj, sealed, start, elements.values()))
     for note in drift:
         warnings.warn(note, stacklevel=3)
     keys = "\0".join(f"{row.name}\0{row.key}" for row in parameters)
@@ -224,45 +207,39 @@ def _check(mj: mujoco.MjModel, where: str) -> None:
     problems = []
     if mj.nv == 0:
         hint = "add a joint, or a freejoint; for a URDF, fixed_base=False lets its root link move"
-        problems.append(f"{where} has no joint, so that nothing in it can move; {hint}")
-    labels = element_names(mj)["actuator"]
-    for i in range(mj.nactuator):
+        problems.append(f"has no joint, so that nothing in it can move; {hint}")
+    users = mujoco.mjtDyn.mjDYN_USER, mujoco.mjtGain.mjGAIN_USER, mujoco.mjtBias.mjBIAS_USER
+    for i, name in enumerate(element_names(mj)["actuator"]):
         kinds = mj.actuator_dyntype[i], mj.actuator_gaintype[i], mj.actuator_biastype[i]
-        users = mujoco.mjtDyn.mjDYN_USER, mujoco.mjtGain.mjGAIN_USER, mujoco.mjtBias.mjBIAS_USER
-        label = labels[i]
         if any(int(kind) == int(user) for kind, user in zip(kinds, users, strict=True)):
-            problems.append(
-                f"{where}: the actuator {label!r} needs a callback of the user; give it one of "
-                "MuJoCo's own types"
-            )
+            what = "needs a callback of the user; give it one of MuJoCo's own types"
+            problems.append(f"the actuator {name!r} {what}")
         if mj.actuator_historyadr[i] >= 0:
-            problems.append(
-                f"{where}: the actuator {label!r} acts with a delay, and what it remembers is no "
-                "state; remove its delay and nsample"
-            )
+            what = "acts with a delay, and what it remembers is no state; remove delay and nsample"
+            problems.append(f"the actuator {name!r} {what}")
     if getattr(mj, "nplastic", 0):  # since MuJoCo 4
-        problems.append(
-            f"{where} has plastic springs or flexes, whose rest shape is a hidden state; remove "
-            "springyield and yield"
-        )
-    problems += _check_inertia(mj, where) if mj.nv else ()
+        what = "plastic springs or flexes, whose rest shape is a hidden state"
+        problems.append(f"has {what}; remove springyield and yield")
+    if mj.nv:
+        problems += _check_inertia(mj)
     if problems:
-        raise ModelError(problems)
+        raise ModelError([f"{where}: {problem}" for problem in problems])
 
 
-def _check_inertia(mj: mujoco.MjModel, where: str) -> Iterator[str]:
+def _check_inertia(mj: mujoco.MjModel) -> Iterator[str]:
     """List bodies with impossible inertia, or joints that have none to move."""
     model, data = copy.copy(mj), mujoco.MjData(mj)
     data.warning.number[:] = 1  # MuJoCo prints the first warning of a kind
     mujoco.mj_setConst(model, data)
     if data.warning.number[0] == 1 and sensible(model):
         return
-    moments, names = mj.body_inertia, element_names(mj)
-    possible = (mj.body_mass >= 0.0) & (moments.min(axis=1) >= 0.0)
-    possible &= 2.0 * moments.max(axis=1) <= moments.sum(axis=1) * (1.0 + 1e-6)
-    if not possible.all():
-        wrong = ", ".join(repr(names["body"][body]) for body in np.flatnonzero(~possible))
-        yield f"{where}: no body has such a mass, or such moments of inertia, as {wrong}"
+    names = element_names(mj)
+    possible = (mj.body_mass >= 0.0) & (mj.body_inertia >= 0.0).all(axis=1)
+    with np.errstate(invalid="ignore"):
+        wrong = ~(possible & (mj.body_inertia @ _TRIANGLE >= 0.0).all(axis=1))
+    if wrong.any():
+        bodies = ", ".join(repr(names["body"][body]) for body in np.flatnonzero(wrong))
+        yield f"no body has such a mass, or such moments of inertia, as {bodies}"
         return
     matrix = np.empty((mj.nv, mj.nv))
     mujoco.mj_fullM(model, data, matrix)
@@ -271,8 +248,8 @@ def _check_inertia(mj: mujoco.MjModel, where: str) -> Iterator[str]:
     weak = np.abs(vectors[:, values < 1e-9]).max(axis=1, initial=0.0) > 1e-6
     joints = dict.fromkeys(names["joint"][int(joint)] for joint in mj.dof_jntid[weak])
     yield (
-        f"{where}: the joints {', '.join(map(repr, joints))} depend on one another or move no "
-        "mass, so that the mass matrix is singular; remove one of them, or give them armature"
+        f"the joints {', '.join(map(repr, joints))} depend on one another or move no mass, so that "
+        "the mass matrix is singular; remove one of them, or give them armature"
     )
 
 
@@ -294,7 +271,9 @@ DRIFT = 1e-4
 """Differences that are worth a note [m] or [rad]."""
 
 
-def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator[str]:
+def _drift(
+    mj: mujoco.MjModel, source: Source, start: mujoco.MjData, elements: Iterable[StateRow]
+) -> Iterator[str]:
     """Measure how far plain MuJoCo, with its warm start, differs where iterations are few."""
     if mj.opt.iterations >= FEW:
         return
@@ -308,14 +287,13 @@ def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator
         ends.append(data.qpos.copy())
     apart = np.empty(mj.nv)
     mujoco.mj_differentiatePos(mj, apart, 1.0, *ends)
-    kinds = mj.jnt_type[mj.dof_jntid]
-    place = np.arange(mj.nv) - mj.jnt_dofadr[mj.dof_jntid]
-    slides = (kinds == int(_JNT.mjJNT_SLIDE)) | ((kinds == int(_JNT.mjJNT_FREE)) & (place < 3))
-    found = [
-        f"{np.abs(apart[which]).max():.2g} {unit}"
-        for which, unit in ((~slides, "rad"), (slides, "m"))
-        if np.abs(apart[which]).max(initial=0.0) > DRIFT or not np.isfinite(apart[which]).all()
-    ]
+    found = []
+    for unit in ("rad", "m"):
+        rows = (row for row in elements if row.array == "qvel" and row.unit == f"{unit}/s")
+        dofs = [number for row in rows for number in row.numbers]
+        most = np.abs(apart[dofs]).max(initial=0.0)
+        if not most <= DRIFT:
+            found.append(f"{most:.2g} {unit}")
     if found:
         few = mj.opt.iterations
         yield (
@@ -339,10 +317,8 @@ def _notes(mj: mujoco.MjModel, keyframe: str | int | None, staged: bool) -> Iter
     if mj.nskin:
         yield f"{mj.nskin} skin(s) act on pictures only."
     if mj.nkey and keyframe is None:
-        yield (
-            f"{mj.nkey} keyframe(s) are not used: episodes begin in the pose of the file; "
-            "keyframe='name' begins with one."
-        )
+        unused = "are not used: episodes begin in the pose of the file"
+        yield f"{mj.nkey} keyframe(s) {unused}; keyframe='name' begins with one."
 
 
 # --- parameters --------------------------------------------------------------------------------
@@ -356,19 +332,14 @@ def _exposed(rows: Sequence[Parameter], patterns: Sequence[str] | None) -> set[s
     found: set[str] = set()
     problems = []
     for pattern in patterns:
-        open_end = pattern.rpartition(".")[2] == "*"
-        named = {
-            row.name
-            for row in can
-            if fnmatch.fnmatchcase(row.name, pattern) and (row.usual or not open_end)
-        }
+        usual = pattern.rpartition(".")[2] == "*"  # by such a pattern no other attributes are meant
+        meant = [row for row in rows if fnmatch.fnmatchcase(row.name, pattern)]
+        named = {row.name for row in meant if not row.refusal and (row.usual or not usual)}
         found |= named
-        if named:
-            continue
-        refused = [row for row in rows if row.refusal and fnmatch.fnmatchcase(row.name, pattern)]
-        if refused:
-            problems.append(f"expose={pattern!r}: {refused[0].name!r} {refused[0].refusal}")
-        else:
+        refused = next((row for row in meant if row.refusal), None)
+        if not named and refused:
+            problems.append(f"expose={pattern!r}: {refused.name!r} {refused.refusal}")
+        elif not named:
             near = nearest(pattern, (row.name for row in can))
             hint = f"; did you mean {near!r}?" if near else ""
             problems.append(f"expose={pattern!r} names no parameter{hint}")
@@ -378,32 +349,6 @@ def _exposed(rows: Sequence[Parameter], patterns: Sequence[str] | None) -> set[s
 
 
 # --- states and inputs -------------------------------------------------------------------------
-
-
-class Permutation(NamedTuple):
-    """Where each of MuJoCo's numbers stands in the state vector.
-
-    Attributes:
-        positions: ``vector[positions]`` is ``qpos``.
-        velocities: ``vector[velocities]`` is ``qvel``.
-        activations: ``vector[activations]`` is ``act``.
-    """
-
-    positions: Integers
-    velocities: Integers
-    activations: Integers
-
-
-def permutation(model: Model) -> Permutation:
-    """Return the place of every number of MuJoCo's state in that of the tables."""
-    places = model.layout.slices
-    found: dict[str, list[tuple[int, int]]] = {"qpos": [], "qvel": [], "act": [], REPORTED: []}
-    for row in model.states:
-        found[row.array] += (
-            (number, place) for place, number in enumerate(row.numbers, places[row.name].start)
-        )
-    ordered = ([place for _, place in sorted(found[array])] for array in ("qpos", "qvel", "act"))
-    return Permutation(*(np.array(one, dtype=np.int64) for one in ordered))
 
 
 _COORDINATES = {
@@ -448,15 +393,18 @@ def _ends(limited: Any, ends: Any) -> tuple[float, float]:
     return (float(ends[0]), float(ends[1])) if limited else (-math.inf, math.inf)
 
 
-def _states(
+def _moving(
     mj: mujoco.MjModel,
     names: Mapping[str, tuple[str, ...]],
     trees: Couplings,
     data: mujoco.MjData,
     frame: Literal["body", "world"],
-) -> list[StateRow]:
-    """Describe what moves, in MuJoCo's order, then what is reported; the data are the start."""
-    found: list[tuple[str, StateRow]] = []
+) -> tuple[dict[str, StateRow], list[Row]]:
+    """Describe what moves, in MuJoCo's order, what is reported, and the components of a command.
+
+    The data are those of the beginning.
+    """
+    found, inputs = list[tuple[str, StateRow]](), list[Row]()
 
     def add(
         kind: str, name: str, array: str, places: list[int], ends: tuple[float, float], **rest: Any
@@ -494,23 +442,33 @@ def _states(
                 unit=unit, doc=_IN_WORLD[attribute] if turned else doc, always=always,
                 contact=contact, trees=frozenset([tree]), frame="world" if turned else "body",
             )  # fmt: skip
-    for actuator, count in enumerate(mj.actuator_actnum.tolist()):
-        first = int(mj.actuator_actadr[actuator])
-        if first < 0 or not count:
-            continue
-        tree, always, contact = _of_actuator(trees, actuator, stateful=True)
-        ends = _ends(mj.actuator_actlimited[actuator], mj.actuator_actrange[actuator])
-        add(
-            "actuator", f"{names['actuator'][actuator]}.activation", "act",
-            [*range(first, first + count)], ends, unit="1", doc="Inner state of the actuator.",
-            always=always, contact=contact, trees=frozenset([tree]),
-        )  # fmt: skip
+    for actuator, name in enumerate(names["actuator"]):
+        always, contact = trees.actuator(actuator)
+        first, count = int(mj.actuator_actadr[actuator]), int(mj.actuator_actnum[actuator])
+        if count:  # its inner state belongs to the tree that it moves
+            own = frozenset([min(always or contact or {0})])
+            always |= own
+            ends = _ends(mj.actuator_actlimited[actuator], mj.actuator_actrange[actuator])
+            add(
+                "actuator", f"{name}.activation", "act", [*range(first, first + count)], ends,
+                unit="1", doc="Inner state of the actuator.", always=always,
+                contact=contact - always, trees=own,
+            )  # fmt: skip
+        effect = {"always": always, "contact": contact - always}
+        first, count = int(mj.actuator_ctrladr[actuator]), int(mj.actuator_ctrlnum[actuator])
+        unit, doc = control_unit(mj, actuator), _CONTROLS[servo(mj, actuator)]
+        for i in range(first, first + count):
+            low, high = _ends(mj.actuator_ctrllimited[i], mj.actuator_ctrlrange[i])
+            label = f"{name}.control" if count == 1 else f"{name}.control_{i - first}"
+            start = min(max(float(data.ctrl[i]), low), high)
+            inputs.append(Row(label, unit, (), start, low, high, doc, **effect))
     found.sort(key=lambda pair: pair[1].reported)
     named = Counter(row.name for _, row in found)
-    return [
+    rows = [
         replace(row, name=f"{kind}:{row.name}") if named[row.name] > 1 else row
         for kind, row in found
     ]
+    return {row.name: row for row in rows}, inputs
 
 
 def _grouped(
@@ -520,89 +478,39 @@ def _grouped(
 ) -> tuple[StateRow, ...]:
     """Group elementary states, in the order of the state vector."""
     known = [name for name, row in elements.items() if row.reported]
-    asked = {name for pattern in reported for name in fnmatch.filter(known, pattern)}
+    asked = {pattern: fnmatch.filter(known, pattern) for pattern in reported}
     problems = [
         f"reported={pattern!r} names nothing that is reported; there are: {', '.join(known)}"
-        for pattern in reported
-        if not fnmatch.filter(known, pattern)
+        for pattern, found in asked.items()
+        if not found
     ]
-    rows = [row for name, row in elements.items() if not row.reported or name in asked]
-    if states is None and not problems:
-        return tuple(rows)
+    wanted = {*elements}.difference(known).union(*asked.values())
     used = Counter(part for parts in (states or {}).values() for part in parts)
-    problems += [f"states: there is no state {name!r}" for name in used if name not in elements]
-    problems += [f"states: {name!r} stands in {n} of them" for name, n in used.items() if n > 1]
-    problems += [
-        f"states: {row.name!r} is left out" for row in rows if states and not used[row.name]
-    ]
+    if states and (max(used.values()) > 1 or not wanted <= used.keys() <= elements.keys()):
+        problems.append(f"states: {', '.join(wanted)} have to stand in one of them each")
     if problems:
         raise ModelError(problems)
+    if states is None:
+        return tuple(row for name, row in elements.items() if name in wanted)
     found = []
-    for name, parts in (states or {}).items():
-        first, *rest = (elements[part] for part in parts)
-        if not rest:
-            found.append(replace(first, name=name))
-            continue
-        together = (first, *rest)
-        always = frozenset().union(*(row.always for row in together))
-        found.append(
-            replace(
-                first,
-                name=name,
-                shape=(sum(len(row.numbers) for row in together),),
-                default=_row_of(together, "default"),
-                low=_row_of(together, "low"),
-                high=_row_of(together, "high"),
+    for name, parts in states.items():
+        rows = [elements[part] for part in parts]
+        row = replace(rows[0], name=name)
+        if len(rows) > 1:
+            always = frozenset().union(*(one.always for one in rows))
+            values: dict[str, Any] = {}
+            for what in ("default", "low", "high"):
+                each = (np.broadcast_to(getattr(one, what), one.shape).ravel() for one in rows)
+                values[what] = numbers(np.concatenate([*each]))
+            row = replace(
+                row,
+                shape=(sum(len(one.numbers) for one in rows),),
                 always=always,
-                contact=frozenset().union(*(row.contact for row in together)) - always,
-                trees=frozenset().union(*(row.trees for row in together)),
-                numbers=tuple(number for row in together for number in row.numbers),
-                frame=max(row.frame for row in together),
+                contact=frozenset().union(*(one.contact for one in rows)) - always,
+                trees=frozenset().union(*(one.trees for one in rows)),
+                numbers=tuple(number for one in rows for number in one.numbers),
+                frame=max(one.frame for one in rows),
+                **values,
             )
-        )
+        found.append(row)
     return tuple(found)
-
-
-def _row_of(rows: Iterable[StateRow], what: str) -> Numbers:
-    """Return default or bounds of states in a row."""
-    parts = (np.broadcast_to(getattr(row, what), row.shape).ravel() for row in rows)
-    return numbers(np.concatenate([*parts]))
-
-
-def _of_actuator(
-    trees: Couplings, actuator: int, *, stateful: bool
-) -> tuple[int, frozenset[int], frozenset[int]]:
-    """Return the tree that an actuator is counted to, and the trees that it acts on.
-
-    The inner state of an actuator belongs to the tree it moves.
-    """
-    always, contact = trees.actuator(actuator)
-    tree = min(always or contact or {0})
-    if stateful:
-        always |= {tree}
-    return tree, always, contact - always
-
-
-def _inputs(
-    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings, data: mujoco.MjData
-) -> Iterator[Row]:
-    """Describe the components of a command; the data have those of the beginning."""
-    for actuator in range(mj.nactuator):
-        name = names["actuator"][actuator]
-        first, count = int(mj.actuator_ctrladr[actuator]), int(mj.actuator_ctrlnum[actuator])
-        unit, doc = control_unit(mj, actuator), _CONTROLS[servo(mj, actuator)]
-        stateful = bool(mj.actuator_actnum[actuator])
-        _, always, contact = _of_actuator(trees, actuator, stateful=stateful)
-        for i in range(first, first + count):
-            low, high = _ends(mj.actuator_ctrllimited[i], mj.actuator_ctrlrange[i])
-            yield Row(
-                name=f"{name}.control" if count == 1 else f"{name}.control_{i - first}",
-                unit=unit,
-                shape=(),
-                default=min(max(float(data.ctrl[i]), low), high),
-                low=low,
-                high=high,
-                doc=doc,
-                always=always,
-                contact=contact,
-            )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, final
@@ -119,231 +119,6 @@ class Computed:
 
 # --- finding -----------------------------------------------------------------------------------
 
-
-def find_readouts(
-    mj: mujoco.MjModel,
-    source: Source,
-    states: Sequence[StateRow],
-    parameters: Sequence[Parameter],
-    wanted: Sequence[str],
-) -> Iterator[Readout]:
-    """Describe what was asked for.
-
-    Args:
-        mj: The compiled model.
-        source: What it was compiled from.
-        states: Rows of the state vector.
-        parameters: Those that are exposed.
-        wanted: Names: ``"tip.position"``, ``"body:tip.position"``, ``"imu.value"``.
-
-    Raises:
-        ModelError: All names that cannot be computed, with the reasons.
-    """
-    finder = _Finder(mj, source, states, parameters)
-    problems = []
-    for name in wanted:
-        found = finder.find(name)
-        if isinstance(found, str):
-            problems.append(f"readouts={name!r}: {found}")
-        else:
-            yield found
-    if problems:
-        raise ModelError(problems)
-
-
-def _joints_of(mj: mujoco.MjModel, row: StateRow) -> list[int]:
-    """Return the joint of each number of a state; none for activations."""
-    if row.array == "qpos":
-        found = np.searchsorted(mj.jnt_qposadr, row.numbers, side="right") - 1
-    else:
-        found = mj.dof_jntid[list(row.numbers) if row.array == "qvel" else []]
-    return [int(joint) for joint in found]
-
-
-@final
-class _Finder:
-    """Looks for elements, and for what decides where they are."""
-
-    def __init__(
-        self,
-        mj: mujoco.MjModel,
-        source: Source,
-        states: Sequence[StateRow],
-        parameters: Sequence[Parameter],
-    ) -> None:
-        self._mj, self._source, self._states = mj, source, states
-        self._joints = {row.name: _joints_of(mj, row) for row in states}
-        self._parameters = [row for row in parameters if not row.visual]
-        self._names = element_names(mj)
-
-    def find(self, name: str) -> Readout | str:
-        """Describe a readout, or return what is wrong with its name."""
-        prefix, _, plain = name.rpartition(":")
-        element, _, attribute = plain.rpartition(".")
-        kinds = [
-            kind for kind in (("sensor",) if attribute == "value" else _OBJECTS)
-            if clean(element) in self._names[kind] and prefix in ("", kind)
-        ]  # fmt: skip
-        if name in [row.name for row in (*self._parameters, *self._states)]:
-            others = [f"{kind}:{name}" for kind in _OBJECTS if clean(element) in self._names[kind]]
-            return "it is a variable already" + (f"; write {others[0]!r}" if others else "")
-        if attribute not in (*_POSES, "value"):
-            allowed = ", ".join((*_POSES, "value"))
-            return f"{attribute!r} is nothing that can be computed; there are: {allowed}"
-        if len(kinds) > 1:
-            choices = " or ".join(repr(f"{kind}:{plain}") for kind in kinds)
-            return f"a {', a '.join(kinds)} are called {element!r}; write {choices}"
-        if not kinds:
-            sought = ("sensor",) if attribute == "value" else (*_OBJECTS,)
-            near = nearest(element, [n for kind in sought for n in self._names[kind]])
-            what = "sensor" if attribute == "value" else "site, body or shape"
-            hint = f"; did you mean {near!r}?" if near else ""
-            return f"no {what} is called {element!r}{hint}"
-        kind, index = kinds[0], self._names[kinds[0]].index(clean(element))
-        if kind == "sensor":
-            return self._sensor(name, index)
-        states, parameters = self._parents([(kind, index)], attribute.endswith("velocity"))
-        function: Callable[..., Any] | None = None
-        if not parameters and attribute in ("position", "orientation"):
-            function = self._chain(kind, index, states, turn=attribute == "orientation")
-        row = (name, *_POSES[attribute])
-        return self._row(*row, states, parameters, (kind, index, attribute), function)
-
-    def _chain(self, kind: str, index: int, states: Sequence[StateRow], *, turn: bool) -> Chain:
-        """Write a pose down as a chain of joints, which is computed faster than by MuJoCo."""
-        mj, first, numbers = self._mj, 0, dict[int, int]()
-        for row in states:
-            for joint in dict.fromkeys(self._joints[row.name]):
-                numbers.setdefault(joint, first)
-                first += self._joints[row.name].count(joint)
-        steps: list[tuple[float, ...]] = []
-        body = index
-        if kind != "body":
-            owner, places, turns = {
-                "site": (mj.site_bodyid, mj.site_pos, mj.site_quat),
-                "geom": (mj.geom_bodyid, mj.geom_pos, mj.geom_quat),
-            }[kind]
-            steps, body = [(OFFSET, 0.0, *places[index], *turns[index])], int(owner[index])
-        while body:
-            joints = range(
-                mj.body_jntadr[body], mj.body_jntadr[body] + max(0, mj.body_jntnum[body])
-            )
-            kinds = [int(mj.jnt_type[joint]) for joint in joints]
-            steps = [*(_joint_step(mj, joint, numbers[joint]) for joint in joints), *steps]
-            if kinds != [int(_JNT.mjJNT_FREE)]:
-                steps.insert(0, (OFFSET, 0.0, *mj.body_pos[body], *mj.body_quat[body]))
-            body = int(mj.body_parentid[body])
-        return Chain.of(steps, turn=turn)
-
-    def _row(
-        self,
-        name: str,
-        unit: str,
-        shape: tuple[int, ...],
-        doc: str,
-        states: Sequence[StateRow],
-        parameters: Sequence[Parameter],
-        what: tuple[str, int, str],
-        function: Callable[..., Any] | None = None,
-    ) -> Readout:
-        places = tuple((row.array, row.numbers, row.frame) for row in states)
-        finders = tuple(row.slot for row in parameters if row.slot is not None)
-        parents = tuple(row.name for row in (*states, *parameters))
-        function = function or Computed(self._source, places, finders, *what)
-        return Readout(name, unit, shape, parents, function, doc.format(kind=what[0]))
-
-    def _parents(
-        self, objects: Iterable[tuple[str, int]], velocity: bool
-    ) -> tuple[list[StateRow], list[Parameter]]:
-        """Find the states and parameters that decide where some objects are."""
-        mj, elements, joints = self._mj, set[tuple[str, str]](), set[int]()
-        for kind, index in objects:
-            elements.add((kind, self._names[kind][index]))
-            body = {"site": mj.site_bodyid, "geom": mj.geom_bodyid}.get(kind, range(mj.nbody))[
-                index
-            ]
-            while body:
-                elements.add(("body", self._names["body"][body]))
-                first = int(mj.body_jntadr[body])
-                joints |= set(range(first, first + int(mj.body_jntnum[body])))
-                body = mj.body_parentid[body]
-        elements |= {("joint", self._names["joint"][joint]) for joint in joints}
-        arrays = ("qpos", "qvel") if velocity else ("qpos",)
-        states = [
-            row
-            for row in self._states
-            if row.array in arrays and not joints.isdisjoint(self._joints[row.name])
-        ]
-        parameters = [
-            row
-            for row in self._parameters
-            if row.key[1] in _MOVING
-            and any(row.key[0] in (name, f"{kind}:{name}") for kind, name in elements)
-        ]
-        return states, parameters
-
-    # --- sensors -------------------------------------------------------------------------------
-
-    def _sensor(self, name: str, index: int) -> Readout | str:
-        mj = self._mj
-        kind = mujoco.mjtSensor(int(mj.sensor_type[index]))
-        reason = self._hidden(index, kind)
-        if reason:
-            return reason
-        velocity = mj.sensor_needstage[index] == int(_STAGE.mjSTAGE_VEL)
-        word, target = kind.name.removeprefix("mjSENS_"), int(mj.sensor_objid[index])
-        unit, scope = _SENSORS.get(word, ("1", "all"))
-        if "{L}" in unit:
-            if word.startswith("TENDON"):
-                length = tendon_unit(mj, target)
-            else:
-                length = "m" if mj.jnt_type[target] == int(_JNT.mjJNT_SLIDE) else "rad"
-            unit = "1" if length == "1" else unit.format(L=length)
-        states = [row for row in self._states if row.array in ("qpos", "qvel")]
-        parameters = self._parameters
-        objects = self._objects(index) if scope == "frames" else None
-        if scope == "joint":
-            array, parameters = "qvel" if velocity else "qpos", []
-            states = [
-                row for row in states
-                if row.array == array and target in self._joints[row.name]
-            ]  # fmt: skip
-        elif objects is not None:
-            states, parameters = self._parents(objects, velocity)
-        size = int(mj.sensor_dim[index])
-        shape, doc = (size,) if size > 1 else (), f"The {word.lower()} sensor."
-        return self._row(name, unit, shape, doc, states, parameters, ("sensor", index, "value"))
-
-    def _hidden(self, index: int, kind: mujoco.mjtSensor) -> str:
-        """Return why a sensor is no function of states and parameters; empty if it is one."""
-        mj = self._mj
-        if disabled(mj, mujoco.mjtDisableBit.mjDSBL_SENSOR):
-            return "the model disables sensors"
-        if kind == _SENS.mjSENS_CLOCK:
-            return "it is the time, and no function of the state"
-        if kind in (_SENS.mjSENS_USER, _SENS.mjSENS_PLUGIN):
-            return "what it measures is decided by a callback or plugin"
-        if (
-            mj.sensor_historyadr[index] >= 0
-            or mj.sensor_delay[index]
-            or mj.sensor_interval[index, 0]
-        ):
-            return "it has a delay or an interval, and so a memory"
-        if mj.sensor_needstage[index] not in (int(_STAGE.mjSTAGE_POS), int(_STAGE.mjSTAGE_VEL)):
-            return "it measures forces or accelerations, which are no function of the state alone"
-        return ""
-
-    def _objects(self, index: int) -> list[tuple[str, int]] | None:
-        """List the objects whose frames a sensor compares; None for frames that follow more."""
-        mj, kinds = self._mj, {int(obj): name for name, obj in _OBJECTS.items()}
-        ends = [(int(mj.sensor_objtype[index]), int(mj.sensor_objid[index]))]
-        if mj.sensor_refid[index] >= 0:
-            ends.append((int(mj.sensor_reftype[index]), int(mj.sensor_refid[index])))
-        if any(obj not in kinds for obj, _ in ends):  # inertial frames and cameras
-            return None
-        return [(kinds[obj], end) for obj, end in ends]
-
-
 _SENSORS = {
     "JOINTPOS": ("{L}", "joint"), "JOINTVEL": ("{L}/s", "joint"), "BALLQUAT": ("1", "joint"),
     "BALLANGVEL": ("rad/s", "joint"), "JOINTLIMITPOS": ("{L}", "all"),
@@ -359,17 +134,200 @@ _SENSORS = {
 }  # fmt: skip
 """Unit of a sensor, with L for that of the coordinate, and what decides its value: a joint, the
 frames that it compares, or all states and parameters."""
+_MEMORY = (
+    "it measures forces or accelerations, the time, or what a callback, a plugin or a delay "
+    "decides, which is no function of the state alone"
+)
 
 
-def _joint_step(mj: mujoco.MjModel, joint: int, first: int) -> tuple[float, ...]:
-    """Write a joint down as a step of a chain."""
-    axis, anchor = mj.jnt_axis[joint], mj.jnt_pos[joint]
-    reference = float(mj.qpos0[mj.jnt_qposadr[joint]])
-    match mujoco.mjtJoint(int(mj.jnt_type[joint])):
-        case _JNT.mjJNT_HINGE:
-            return (HINGE, first, *axis, *anchor, reference)
-        case _JNT.mjJNT_SLIDE:
-            return (SLIDE, first, *axis, 0.0, 0.0, 0.0, reference)
-        case _JNT.mjJNT_BALL:
-            return (BALL, first, *anchor)
-    return (FREE, first)
+def find_readouts(
+    mj: mujoco.MjModel,
+    source: Source,
+    states: Sequence[StateRow],
+    parameters: Sequence[Parameter],
+    wanted: Sequence[str],
+) -> Iterator[Readout]:
+    """Describe what was asked for: ``"tip.position"``, ``"body:tip.position"``, ``"imu.value"``.
+
+    Raises:
+        ModelError: All names that cannot be computed, with the reasons.
+    """
+    finder = _Finder(mj, source, states, [row for row in parameters if not row.visual])
+    problems = []
+    for name in wanted:
+        found = finder.find(name)
+        if isinstance(found, str):
+            problems.append(f"readouts={name!r}: {found}")
+        else:
+            yield found
+    if problems:
+        raise ModelError(problems)
+
+
+@final
+@dataclass
+class _Finder:
+    """Looks for elements, and for what decides where they are; see ``find_readouts``."""
+
+    mj: mujoco.MjModel
+    source: Source
+    states: Sequence[StateRow]
+    parameters: Sequence[Parameter]
+
+    def __post_init__(self) -> None:
+        self.names, self.joints = element_names(self.mj), dict[str, list[int]]()
+        for row in self.states:  # the joint of each number; none of activations
+            found = self.mj.dof_jntid[list(row.numbers) if row.array == "qvel" else []]
+            if row.array == "qpos":
+                found = np.searchsorted(self.mj.jnt_qposadr, row.numbers, side="right") - 1
+            self.joints[row.name] = [int(joint) for joint in found]
+
+    def find(self, name: str) -> Readout | str:
+        """Describe a readout, or return what is wrong with its name."""
+        prefix, _, plain = name.rpartition(":")
+        element, _, attribute = plain.rpartition(".")
+        sought = ("sensor",) if attribute == "value" else (*_OBJECTS,)
+        kinds = [
+            kind for kind in sought
+            if clean(element) in self.names[kind] and prefix in ("", kind)
+        ]  # fmt: skip
+        if name in [row.name for row in (*self.parameters, *self.states)]:
+            others = [f"{kind}:{name}" for kind in _OBJECTS if clean(element) in self.names[kind]]
+            return "it is a variable already" + (f"; write {others[0]!r}" if others else "")
+        if attribute not in (*_POSES, "value"):
+            allowed = ", ".join((*_POSES, "value"))
+            return f"{attribute!r} is nothing that can be computed; there are: {allowed}"
+        if len(kinds) > 1:
+            choices = " or ".join(repr(f"{kind}:{plain}") for kind in kinds)
+            return f"a {', a '.join(kinds)} are called {element!r}; write {choices}"
+        if not kinds:
+            near = nearest(element, [n for kind in sought for n in self.names[kind]])
+            what = "sensor" if attribute == "value" else "site, body or shape"
+            hint = f"; did you mean {near!r}?" if near else ""
+            return f"no {what} is called {element!r}{hint}"
+        kind, index = kinds[0], self.names[kinds[0]].index(clean(element))
+        if kind == "sensor":
+            return self._sensor(name, index)
+        unit, shape, doc = _POSES[attribute]
+        states, parameters = self._parents([(kind, index)], attribute.endswith("velocity"))
+        function: Any = self._computed(states, parameters, kind, index, attribute)
+        if not parameters and attribute in ("position", "orientation"):
+            function = self._chain(kind, index, states, turn=attribute == "orientation")
+        parents = tuple(row.name for row in (*states, *parameters))
+        return Readout(name, unit, shape, parents, function, doc.format(kind=kind))
+
+    def _computed(
+        self,
+        states: Sequence[StateRow],
+        parameters: Sequence[Parameter],
+        kind: str,
+        index: int,
+        attribute: str,
+    ) -> Computed:
+        places = tuple((row.array, row.numbers, row.frame) for row in states)
+        finders = tuple(row.slot for row in parameters if row.slot is not None)
+        return Computed(self.source, places, finders, kind, index, attribute)
+
+    def _chain(self, kind: str, index: int, states: Sequence[StateRow], *, turn: bool) -> Chain:
+        """Write a pose down as a chain of joints, which is computed faster than by MuJoCo."""
+        mj, first, numbers = self.mj, 0, dict[int, int]()
+        for row in states:
+            for joint in dict.fromkeys(self.joints[row.name]):
+                numbers.setdefault(joint, first)
+                first += self.joints[row.name].count(joint)
+        steps: list[tuple[float, ...]] = []
+        body = index
+        if kind != "body":
+            owner, places, turns = {
+                "site": (mj.site_bodyid, mj.site_pos, mj.site_quat),
+                "geom": (mj.geom_bodyid, mj.geom_pos, mj.geom_quat),
+            }[kind]
+            steps, body = [(OFFSET, 0.0, *places[index], *turns[index])], int(owner[index])
+        while body:
+            start, own = int(mj.body_jntadr[body]), list[tuple[float, ...]]()
+            for joint in range(start, start + int(mj.body_jntnum[body])):
+                axis, anchor, first = mj.jnt_axis[joint], mj.jnt_pos[joint], numbers[joint]
+                reference = float(mj.qpos0[mj.jnt_qposadr[joint]])
+                own.append(
+                    {
+                        int(_JNT.mjJNT_HINGE): (HINGE, first, *axis, *anchor, reference),
+                        int(_JNT.mjJNT_SLIDE): (SLIDE, first, *axis, 0.0, 0.0, 0.0, reference),
+                        int(_JNT.mjJNT_BALL): (BALL, first, *anchor),
+                        int(_JNT.mjJNT_FREE): (FREE, first),
+                    }[int(mj.jnt_type[joint])]
+                )
+            if not own or own[0][0] != FREE:
+                own.insert(0, (OFFSET, 0.0, *mj.body_pos[body], *mj.body_quat[body]))
+            steps, body = [*own, *steps], int(mj.body_parentid[body])
+        return Chain.of(steps, turn=turn)
+
+    def _parents(
+        self, objects: Iterable[tuple[str, int]], velocity: bool
+    ) -> tuple[list[StateRow], list[Parameter]]:
+        """Find the states and parameters that decide where some objects are."""
+        mj, elements, joints = self.mj, set[tuple[str, str]](), set[int]()
+        for kind, index in objects:
+            elements.add((kind, self.names[kind][index]))
+            owners = {"site": mj.site_bodyid, "geom": mj.geom_bodyid}
+            body = int(owners[kind][index]) if kind in owners else index
+            while body:
+                elements.add(("body", self.names["body"][body]))
+                first = int(mj.body_jntadr[body])
+                joints |= set(range(first, first + int(mj.body_jntnum[body])))
+                body = int(mj.body_parentid[body])
+        elements |= {("joint", self.names["joint"][joint]) for joint in joints}
+        arrays = ("qpos", "qvel") if velocity else ("qpos",)
+        states = [
+            row
+            for row in self.states
+            if row.array in arrays and not joints.isdisjoint(self.joints[row.name])
+        ]
+        parameters = [
+            row
+            for row in self.parameters
+            if row.key[1] in _MOVING
+            and any(row.key[0] in (name, f"{kind}:{name}") for kind, name in elements)
+        ]
+        return states, parameters
+
+    def _sensor(self, name: str, index: int) -> Readout | str:
+        """Describe a sensor; one that compares frames follows from what decides where they are."""
+        mj, target = self.mj, int(self.mj.sensor_objid[index])
+        kind, stage = mujoco.mjtSensor(int(mj.sensor_type[index])), int(mj.sensor_needstage[index])
+        if disabled(mj, mujoco.mjtDisableBit.mjDSBL_SENSOR):
+            return "the model disables sensors"
+        if (
+            kind in (_SENS.mjSENS_CLOCK, _SENS.mjSENS_USER, _SENS.mjSENS_PLUGIN)
+            or mj.sensor_historyadr[index] >= 0
+            or mj.sensor_delay[index]
+            or mj.sensor_interval[index, 0]
+            or stage not in (int(_STAGE.mjSTAGE_POS), int(_STAGE.mjSTAGE_VEL))
+        ):
+            return _MEMORY
+        velocity, word = stage == int(_STAGE.mjSTAGE_VEL), kind.name.removeprefix("mjSENS_")
+        unit, scope = _SENSORS.get(word, ("1", "all"))
+        if "{L}" in unit:
+            if word.startswith("TENDON"):
+                length = tendon_unit(mj, target)
+            else:
+                length = "m" if mj.jnt_type[target] == int(_JNT.mjJNT_SLIDE) else "rad"
+            unit = "1" if length == "1" else unit.format(L=length)
+        states = [row for row in self.states if row.array in ("qpos", "qvel")]
+        parameters = self.parameters
+        known = {int(obj): element for element, obj in _OBJECTS.items()}
+        ends = [(int(mj.sensor_objtype[index]), target)]
+        if mj.sensor_refid[index] >= 0:
+            ends.append((int(mj.sensor_reftype[index]), int(mj.sensor_refid[index])))
+        if scope == "joint":
+            array, parameters = "qvel" if velocity else "qpos", []
+            states = [
+                row for row in states
+                if row.array == array and target in self.joints[row.name]
+            ]  # fmt: skip
+        elif scope == "frames" and all(obj in known for obj, _ in ends):
+            # others are inertial frames and cameras, which follow more
+            states, parameters = self._parents([(known[obj], i) for obj, i in ends], velocity)
+        size, parents = int(mj.sensor_dim[index]), (row.name for row in (*states, *parameters))
+        function = self._computed(states, parameters, "sensor", index, "value")
+        shape, doc = (size,) if size > 1 else (), f"The {word.lower()} sensor."
+        return Readout(name, unit, shape, tuple(parents), function, doc)

@@ -19,14 +19,12 @@ from scm_world.backends.mujoco.states import (
     MOTION,
     LastStep,
     into_bodies,
-    into_world,
     read_rows,
-    settle,
     turned_bodies,
 )
 from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import EngineFailure, Infeasible, ModelError, UnknownOption
-from scm_world.models.model import Model
+from scm_world.errors import Infeasible, ModelError, UnknownOption
+from scm_world.models.model import REPORTED, Model
 from scm_world.models.scene import (
     REVERSED,
     ParameterKey,
@@ -46,25 +44,8 @@ _ONLY = np.zeros(1, dtype=np.int32)
 """The row of a single vector."""
 
 
-def refuse_callbacks() -> None:
-    """Refuse to step while a callback of the user acts.
-
-    Raises:
-        EngineFailure: With the callbacks.
-    """
-    found = reading.callbacks()
-    if found:
-        raise EngineFailure("; ".join(found), "mujoco")
-
-
 def lost(structure: Any, vector: Floats, time: float) -> str:
-    """Return which states are not finite, and when, as a sentence.
-
-    Args:
-        structure: With the names of the states.
-        vector: The state, shape (structure.layout.size,).
-        time: Of the simulation, which begins with 0 at a reset [s].
-    """
+    """Return which states of a vector are not finite, and when [s], as a sentence."""
     places = structure.layout.slices
     names = [name for name, where in places.items() if not np.isfinite(vector[where]).all()]
     more = f" and {len(names) - 4} more" if len(names) > 4 else ""
@@ -86,12 +67,11 @@ class Realization:
 
     Attributes:
         structure: What was compiled.
-        owners: Name of the body of each shape: the geoms, then the flexes.
         model: With the present parameters.
         data: With the present state.
         kept: The parameters in force; at first, none has been written.
         revision: An object that identifies the parameters in force; new with every change.
-        command: Where it is written, shape (n_commands,).
+        command: As it is held, shape (n_commands,).
         lean: Whether ``mjSTATE_INTEGRATION`` is all that a scene has to keep.
         replay: ``mjSTATE_INTEGRATION`` before the last steps and how many these were, if they were
             taken elsewhere, so that their contacts are not in the data.
@@ -107,30 +87,23 @@ class Realization:
         self.data = data = mujoco.MjData(model)
         self._scratch = mujoco.MjData(model)
         self._slots = structure.slots(model, data)
-        self._constant = frozenset(key for key, slot in self._slots.items() if slot.constant)
-        self._follow_ups = {key: f for key, slot in self._slots.items() if (f := slot.follow_up)}
-        self._bodies = structure.body_names
-        self.owners = structure.owners
         self.kept: dict[ParameterKey, Floats] = {}
         self.revision = object()
         self.replay: tuple[Floats, int] | None = None
         self.command = data.ctrl[: structure.n_commands]
         self._forces = data.qfrc_actuator
-        self._places = np.concatenate(reading.permutation(structure)).astype(np.int64)
+        motion = [structure.places(array)[1] for array in ("qpos", "qvel", "act")]
+        self._places = np.concatenate(motion)
         self._motion, self._zeros = np.empty(len(self._places)), np.zeros(len(self._places))
         self._names, self._turned, self._own = turned_bodies(structure, compiled)
-        places = structure.layout.slices
-        pairs = [
-            (place, number)
-            for row in structure.states
-            if row.reported
-            for place, number in enumerate(row.numbers, places[row.name].start)
-        ]
-        self._reported = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-        self.lean = not (pairs or self._names)
+        self._spins = self._turned[:, 4:]
+        self._reported = structure.places(REPORTED)
+        self._row = self._motion[None], self._forces[None], self._places, self._reported
+        self.lean = not (self._reported.size or self._names)
         self._last: LastStep | None = None
         self._written: Floats | None = None  # since the last step, if bodies are turned
         self._counts = data.warning.number
+        self._full = self._counts[1:3]  # times that contacts or constraints had no memory, plus 1
         self._size = int(mujoco.mj_stateSize(model, STATE))
         # MuJoCo prints a warning, and writes it to a file, when it counts the first of its kind.
         self._counts[:] = self._scratch.warning.number[:] = 1
@@ -141,20 +114,15 @@ class Realization:
     def read(self, into: Floats) -> None:
         """Write the state into a vector, shape (layout.size,)."""
         mujoco.mj_getState(self.model, self.data, self._motion, MOTION)
-        into[self._places] = self._motion
-        if self._reported.size:
-            into[self._reported[0]] = self._forces[self._reported[1]]
-        if self._names:
-            into_world(into[None], _ONLY, self._turned)
-        if self._written is not None:
-            settle(self._written, into, self._turned)
+        read_rows(*self._row, self._turned, _ONLY, into[None])
+        if self._written is not None:  # as it was written, although turning has rounded it
+            into[self._spins] = self._written[self._spins]
 
     def place(self, vector: Floats) -> None:
         """Write a state; all else stays as it is. What is as the last step left it stays exact."""
-        remembered = self._remembered() if self._names else None
         motion = vector[self._places]
-        if remembered is not None:
-            names, known, exact = remembered
+        if self._names:
+            names, known, exact = self._remembered()
             if names != self._names:
                 where = [names.index(name) if name in names else -1 for name in self._names]
                 nobody = np.full((1, 7), np.nan)
@@ -173,8 +141,9 @@ class Realization:
 
     def rows(self, batch: Batch) -> Callable[[Any, Floats], int]:
         """Return what reads some states out of a batch, and returns a row that is not finite."""
-        forces = batch.bind("qfrc_actuator") if self._reported.size else None
-        return partial(read_rows, batch.state, forces, self._places, self._turned, self._reported)
+        forces = batch.bind("qfrc_actuator") if self._reported.size else np.empty((0, 0))
+        motions = batch.state[:, 1 : 1 + len(self._places)]
+        return partial(read_rows, motions, forces, self._places, self._reported, self._turned)
 
     def reset(self) -> None:
         """Forget every step; parameters stay."""
@@ -190,12 +159,21 @@ class Realization:
         """Forget what was before a step that is made now."""
         self.replay = self._last = self._written = None
 
-    def problem(self) -> str:
-        """Return why the state after a step is invalid; empty if it is valid."""
+    def step(self, command: Floats, substeps: int) -> str:
+        """Hold a command; return why the state after it is invalid, or nothing."""
+        self.command[:] = command
+        self.forget()
+        try:
+            mujoco.mj_step(self.model, self.data, substeps)
+        except (mujoco.FatalError, mujoco.UnexpectedError) as error:
+            numbers = self.numbers()
+            mujoco.mj_resetData(self.model, self.data)  # what the step was using is free again
+            self.recall(numbers, None)
+            return f"MuJoCo: {error}"
         mujoco.mj_getState(self.model, self.data, self._motion, MOTION)
-        if self._motion @ self._zeros == 0.0 and self._counts[1] + self._counts[2] == 2:
+        full = self._full.tolist() != [1, 1]
+        if self._motion.dot(self._zeros) == 0.0 and not full:
             return ""
-        full = self._counts[1] + self._counts[2] > 2
         self._counts[:] = 1
         if full:
             return FULL
@@ -203,28 +181,18 @@ class Realization:
         self.read(vector)
         return lost(self.structure, vector, self.data.time)
 
-    def recover(self) -> None:
-        """Free what a step was using when it failed; the state stays as the step left it."""
-        numbers = self.numbers()
-        mujoco.mj_resetData(self.model, self.data)
-        mujoco.mj_setState(self.model, self.data, numbers, STATE)
-        self._counts[:] = 1
-
     def touches(self) -> Touches:
         """Copy the contacts of the last physics step; of Runge-Kutta, those of its last stage."""
-        if self.replay is not None:
-            return self._replayed(*self.replay)
-        return touches(self.model, self.data, self.owners)
-
-    def _replayed(self, numbers: Floats, steps: int) -> Touches:
-        """Take steps again on other data, and copy the contacts of the last one."""
-        data = self._scratch
+        owners = self.structure.owners
+        if self.replay is None:
+            return touches(self.model, self.data, owners)
+        data, (numbers, steps) = self._scratch, self.replay
         mujoco.mj_setState(self.model, data, numbers, STATE)
         try:
             mujoco.mj_step(self.model, data, steps)
         except (mujoco.FatalError, mujoco.UnexpectedError):
             mujoco.mj_resetData(self.model, data)  # it failed then, too, and left no contacts
-        found = touches(self.model, data, self.owners)
+        found = touches(self.model, data, owners)
         mujoco.mj_resetData(self.model, data)
         data.warning.number[:] = 1
         return found
@@ -302,13 +270,15 @@ class Realization:
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
         """Read parameters and moments of inertia back from the arrays of the model."""
-        found: dict[ParameterKey, Floats] = {}
+        found, bodies = dict[ParameterKey, Floats](), self.structure.body_names
         for key in keys:
-            if key not in self._slots and key[1] == "inertia" and key[0] in self._bodies:
-                found[key] = self.model.body_inertia[self._bodies.index(key[0])].copy()
+            slot = self._slots.get(key)
+            if slot is not None:
+                found[key] = slot.read()
+            elif key[1] == "inertia" and key[0] in bodies:
+                found[key] = self.model.body_inertia[bodies.index(key[0])].copy()
             else:
                 self.check([key])
-                found[key] = self._slots[key].read()
         return found
 
     def edit(self, parameters: Parameters) -> None:
@@ -334,9 +304,9 @@ class Realization:
             if not before:
                 return
             wrong = reversed_ranges({key: kept[key] for key in before})
-            reason = REVERSED if wrong else self.followed(before)
+            reason = REVERSED if wrong else self._followed([*before])
             if reason:
-                wrong = wrong or self._culprits(before)
+                wrong = wrong or [key for key in before if slots[key].constant]
                 names = ", ".join(".".join(key).strip(".") for key in wrong)
                 values = [parameters[key] for key in wrong]
                 raise Infeasible(names, values[0] if len(values) == 1 else values, [reason])
@@ -345,15 +315,15 @@ class Realization:
                 if old is not None:  # where there is none, the model is new and is given up
                     kept[key] = old
                     slots[key].write(old)
-            self.followed(before)
+            self._followed([*before])
             raise
 
-    def followed(self, keys: Iterable[ParameterKey]) -> str:
+    def _followed(self, keys: list[ParameterKey]) -> str:
         """Compute what follows from some parameters; return why that is invalid, or nothing."""
-        keys = tuple(keys)
-        for follow_up in {self._follow_ups[key] for key in keys if key in self._follow_ups}:
+        slots = [self._slots[key] for key in keys]
+        for follow_up in {slot.follow_up for slot in slots if slot.follow_up is not None}:
             follow_up(self.model)
-        if self._constant.isdisjoint(keys):
+        if not any(slot.constant for slot in slots):
             return ""
         try:
             mujoco.mj_setConst(self.model, self._scratch)
@@ -366,14 +336,3 @@ class Realization:
             singular[0] = 1
             return "masses and moments of inertia would not be those of something that can move"
         return ""
-
-    def _culprits(self, keys: Iterable[ParameterKey]) -> list[ParameterKey]:
-        """List the parameters among some that no body can have; all that count if none is wrong."""
-        constant = [key for key in keys if key in self._constant]
-        wrong = []
-        for key in constant:
-            value, most = self._slots[key].read(), self._slots[key].read().max()
-            bad = not np.isfinite(value).all() or (key[1] == "mass" and value < 0.0)
-            if bad or (key[1] == "inertia" and 2.0 * most - value.sum() > 1e-6 * most):
-                wrong.append(key)
-        return wrong or constant

@@ -9,7 +9,6 @@ from typing import Any, final
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world._types import Floats
 
@@ -44,29 +43,22 @@ class Slot:
 def place(
     *views: Any,
     constant: bool = False,
-    to: Callable[[Floats], Any] | None = None,
-    back: Callable[[Any], Any] | None = None,
+    to: Callable[[Floats], Any] = lambda value: value,
+    back: Callable[[Any], Any] = lambda view: view,
     follow_up: Callable[[Any], None] | None = None,
 ) -> Slot:
     """Return the slot of a value that stands in some views of arrays, alike in all of them.
 
-    Args:
-        views: Of any shape; the first one is read.
-        constant: See ``Slot``.
-        to: What MuJoCo keeps of a value; the value itself if None.
-        back: The value of what stands in a view; all of it if None.
-        follow_up: See ``Slot``.
+    ``to`` returns what MuJoCo keeps of a value, and ``back`` the value of what stands in the first
+    view.
     """
 
     def write(value: Floats) -> None:
-        kept = value if to is None else to(value)
+        kept = to(value)
         for view in views:
             view[...] = kept
 
-    def read() -> Floats:
-        return np.array(views[0] if back is None else back(views[0]), dtype=np.float64)
-
-    return Slot(write, read, constant, follow_up)
+    return Slot(write, lambda: np.array(back(views[0]), dtype=np.float64), constant, follow_up)
 
 
 def first(view: Floats) -> Any:
@@ -100,22 +92,16 @@ def at(
     mj: mujoco.MjModel,
     data: mujoco.MjData,
 ) -> Slot:
-    """Find a value in one array or several of the model, its options or its data.
+    """Find a value at one place of some arrays: ``"body_mass"``, ``"opt.gravity data.eq_active"``.
 
-    Args:
-        form: Makes a slot of the views.
-        arrays: Their names: ``"body_mass"``, ``"opt.gravity"``, ``"eq_active0 data.eq_active"``.
-        index: Place in each of them; of several rows that are alike, a value stands in each.
-        constant: See ``Slot``.
-        mj: The model.
-        data: Its data.
+    At a slice, several rows are alike and the value stands in each.
     """
     views = []
     for array in arrays.split():
         of, _, name = array.rpartition(".")
         views.append(getattr({"": mj, "opt": mj.opt, "data": data}[of], name)[(*index, ...)])
-    back = first if index and isinstance(index[0], slice) else None
-    return form(*views, constant=constant, back=back)
+    rest = {"back": first} if index and isinstance(index[0], slice) else {}
+    return form(*views, constant=constant, **rest)
 
 
 def option(name: str, mj: mujoco.MjModel, _: mujoco.MjData) -> Slot:
@@ -147,8 +133,8 @@ def color(geom: int, material: int, mj: mujoco.MjModel, _: mujoco.MjData) -> Slo
     A shape with a material (not -1) has its color while its own is ``GRAY``. Colors are read with
     the digits that 32 bits hold: 0.3 is read as 0.3.
     """
-    own: NDArray[np.float32] = mj.geom_rgba[geom]
-    other: NDArray[np.float32] = mj.mat_rgba[material] if material >= 0 else own
+    own = mj.geom_rgba[geom]
+    other = mj.mat_rgba[material] if material >= 0 else own
     inherits = material >= 0 and bool((own == GRAY).all())
 
     def write(value: Floats) -> None:

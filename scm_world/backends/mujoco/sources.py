@@ -20,18 +20,12 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from scm_world._types import Floats
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.output.reading import read_bytes, regular
+from scm_world.output.reading import read_bytes
 
-_CHOICES = {
-    "integrator": mujoco.mjtIntegrator,
-    "solver": mujoco.mjtSolver,
-    "cone": mujoco.mjtCone,
-    "jacobian": mujoco.mjtJacobian,
-}
 _UNNAMED = "MuJoCo Model"
+_CHOICES = ("integrator", "solver", "cone", "jacobian")
 _NUMBERS = ("timestep", "iterations", "tolerance", "ls_iterations", "noslip_iterations", "impratio")
 
 
@@ -60,12 +54,9 @@ class Source:
             ModelError: Another version of MuJoCo compiled it.
         """
         if self.version != mujoco.__version__:
-            raise ModelError(
-                [
-                    f"the model was compiled by MuJoCo {self.version}, and MuJoCo "
-                    f"{mujoco.__version__} does not read it; read its file again"
-                ]
-            )
+            versions = f"{self.version}, and MuJoCo {mujoco.__version__}"
+            what = f"the model was compiled by MuJoCo {versions} does not read it"
+            raise ModelError([f"{what}; read its file again"])
         return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": self.binary})
 
 
@@ -110,27 +101,16 @@ def realized(source: Source) -> tuple[mujoco.MjModel, tuple[str, ...]]:
 def read_source(
     source: Any, *, fixed_base: bool, options: Mapping[str, Any]
 ) -> tuple[Source, str, str, tuple[str, ...]]:
-    """Read and compile a model.
-
-    Args:
-        source: A path, XML text, an ``MjSpec`` or an ``MjModel``.
-        fixed_base: Whether the root link of a URDF is fixed to the world.
-        options: Options of MJCF that are set to something else.
+    """Read and compile a model; see ``reading.read_model``.
 
     Returns:
         The source, a name for the model, how to call it in errors, and what its compiler replaces.
-
-    Raises:
-        UnreadableFile: A file cannot be read.
-        ModelError: It is no such thing, MuJoCo refuses it, or it has plugins.
-        UnknownOption: An option is not one.
     """
     notes, plugins = tuple[str, ...](), ""
     if isinstance(source, mujoco.MjModel):
         where, stem, mj = "the MjModel", "", copy.copy(source)
     else:
         spec, where, stem, urdf = _specified(source)
-        _check_files(spec)
         if urdf:
             _complete(spec, where, fixed_base=fixed_base)
         with understood(where):
@@ -149,28 +129,12 @@ def read_source(
     return Source(binary.tobytes(), mujoco.__version__), name, where, notes
 
 
-def _check_files(spec: mujoco.MjSpec) -> None:
-    """Refuse files that MuJoCo would read without an end."""
-    named = [(spec.meshdir, part.file) for part in (*spec.meshes, *spec.hfields, *spec.skins)]
-    for texture in spec.textures:
-        named += [(spec.texturedir, name) for name in (texture.file, *texture.cubefiles)]
-    for folder, name in named:
-        inner = os.path.basename(name) if spec.strippath else name
-        path = Path(spec.modelfiledir, folder, inner)
-        if name and path.exists() and not path.is_dir():
-            try:
-                regular(path)
-            except OSError as error:
-                advice = "correct the path that the model names"
-                raise UnreadableFile(str(path), str(error), advice) from None
-
-
 def _set_option(options: mujoco.MjOption, name: str, value: Any) -> None:
     """Set an option to a number, or to a word of MJCF."""
     if name not in (*_CHOICES, *_NUMBERS):
         raise UnknownOption("setting", name, (*_CHOICES, *_NUMBERS))
     if name in _CHOICES:
-        members = _CHOICES[name].__members__.items()
+        members = getattr(mujoco, f"mjt{name.capitalize()}").__members__.items()
         words = {member.partition("_")[2].lower(): int(kind) for member, kind in members}
         if str(value).lower() not in words:
             raise UnknownOption(name, value, words)
@@ -179,40 +143,30 @@ def _set_option(options: mujoco.MjOption, name: str, value: Any) -> None:
 
 
 def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
-    """Parse what is given.
-
-    Returns:
-        The specification, how to call it, the stem of its file, and whether it is a URDF.
-    """
-    path = None
+    """Return a specification, how to call it, the stem of its file, and whether it is a URDF."""
     if isinstance(source, mujoco.MjSpec):
         return source.copy(), "the MjSpec", "", False
+    path = Path()
     if isinstance(source, str) and source.lstrip().startswith("<"):
-        where, text = "the XML text", source
+        where, text, included = "the XML text", source, dict[str, bytes]()
     elif isinstance(source, str | os.PathLike):
         path = Path(source)
         where, text = str(path), _contents(path)
+        included = _included(text, path.parent)
     else:
-        raise ModelError(
-            [
-                f"{source!r} is no model: give the path of an .xml, .mjcf or .urdf file, XML text, "
-                "a mujoco.MjSpec or a mujoco.MjModel"
-            ]
-        )
-    tag = _root_tag(text)
+        kinds = "an .xml, .mjcf or .urdf file, XML text, a mujoco.MjSpec or a mujoco.MjModel"
+        raise ModelError([f"{source!r} is no model: give the path of {kinds}"])
+    plain = re.sub(r"<!--.*?-->|<\?.*?\?>|<!DOCTYPE[^>]*>", "", text, flags=re.DOTALL)
+    found = re.search(r"<\s*([\w:.-]+)", plain)
+    tag = found[1] if found else ""
     if tag not in ("mujoco", "robot"):
-        raise ModelError(
-            [
-                f"{where} begins with <{tag}>: give MJCF, which begins with <mujoco>, or URDF, "
-                "which begins with <robot>"
-            ]
-        )
+        kinds = "MJCF, which begins with <mujoco>, or URDF, which begins with <robot>"
+        raise ModelError([f"{where} begins with <{tag}>: give {kinds}"])
     if tag == "robot":
         _check_names(text, where)
     with understood(where):
-        if path is None:
-            return mujoco.MjSpec.from_string(text), where, "", tag == "robot"
-        spec = mujoco.MjSpec.from_string(text, include=_included(text, path.parent))
+        spec = mujoco.MjSpec.from_string(text, include=included)
+    if path.name:
         spec.modelfiledir = str(path.parent)
     return spec, where, path.stem, tag == "robot"
 
@@ -256,13 +210,6 @@ def _included(text: str, folder: Path) -> dict[str, bytes]:
                 texts.append(_contents(folder / name))
                 found[name] = texts[-1].encode()
     return found
-
-
-def _root_tag(text: str) -> str:
-    """Return the outermost tag of an XML text; ``""`` if there is none."""
-    plain = re.sub(r"<!--.*?-->|<\?.*?\?>|<!DOCTYPE[^>]*>", "", text, flags=re.DOTALL)
-    found = re.search(r"<\s*([\w:.-]+)", plain)
-    return found[1] if found else ""
 
 
 @contextmanager
@@ -328,13 +275,11 @@ def _check_names(text: str, where: str) -> None:
     problems = []
     for kind in ("link", "joint"):
         found = [one.get("name", "") for one in root.findall(kind) if one.get("type") != "fixed"]
-        problems += [
-            f"{where} has {n} {kind}s called {name!r}; give each a name of its own"
-            for name, n in Counter(found).items()
-            if name and n > 1
-        ]
-        if "" in found:
-            problems.append(f"{where} has a {kind} without a name; give it one")
+        for name, n in Counter(found).items():
+            if not name:
+                problems.append(f"{where} has a {kind} without a name; give it one")
+            elif n > 1:
+                problems.append(f"{where} has {n} {kind}s called {name!r}; give each its own name")
     if problems:
         raise ModelError(problems)
 
@@ -351,15 +296,17 @@ def _replaced_inertia(spec: mujoco.MjSpec, mj: mujoco.MjModel) -> Iterator[str]:
             continue  # it is part of its parent
         if body.mass < mj.body_mass[number] == compiler.boundmass:
             masses.append(f"{body.name} ({body.mass:g}, now {compiler.boundmass:g} kg)")
-        if body.explicitinertial:
-            given, now = _principal(body), np.sort(mj.body_inertia[number])
-            mean = np.full(3, given.mean())
-            replaced = any(
-                np.allclose(now, one, 1e-9, 0.0) for one in (mean, compiler.boundinertia)
-            )
-            if replaced and not np.allclose(now, given, 1e-9, 0.0):
-                numbers = "{:.3g} {:.3g} {:.3g}, now {:.3g} {:.3g} {:.3g} kg m²"
-                moments.append(f"{body.name} ({numbers.format(*given, *now)})")
+        if not body.explicitinertial:
+            continue
+        given, now = np.sort(body.inertia), np.sort(mj.body_inertia[number])
+        if not np.isnan(body.fullinertia[0]):
+            xx, yy, zz, xy, xz, yz = body.fullinertia
+            given = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+        bounds = given.mean(), compiler.boundinertia
+        replaced = any(np.allclose(now, bound, 1e-9, 0.0) for bound in bounds)
+        if replaced and not np.allclose(now, given, 1e-9, 0.0):
+            triples = ("{:.3g} {:.3g} {:.3g}".format(*part) for part in (given, now))
+            moments.append(f"{body.name} ({', now '.join(triples)} kg m²)")
     for found, why in (
         (masses, "Nothing moves without a mass, so that the compiler gave one to"),
         (moments, "No body has such moments of inertia, so that the compiler replaced those of"),
@@ -369,19 +316,11 @@ def _replaced_inertia(spec: mujoco.MjSpec, mj: mujoco.MjModel) -> Iterator[str]:
             yield f"{why} {', '.join(found[:4])}{more}."
 
 
-def _principal(body: Any) -> Floats:
-    """Compute the moments of inertia that a specification gives a body, in ascending order."""
-    if np.isnan(body.fullinertia[0]):
-        return np.sort(body.inertia)
-    xx, yy, zz, xy, xz, yz = body.fullinertia
-    return np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-
-
 def _add_motors(spec: mujoco.MjSpec) -> None:
-    """Add a motor for every hinge and slide of a URDF, as its joints are meant to be driven.
+    """Add a motor for every hinge and slide of a URDF that does not mimic another one.
 
     The control is the torque or force of the joint [N m] or [N], within the effort that the URDF
-    allows; it is not limited where there is none. A joint that mimics another one has none.
+    allows; it is not limited where there is none.
     """
     mimics = {equality.name1 for equality in spec.equalities}
     for joint in spec.joints:
@@ -390,12 +329,8 @@ def _add_motors(spec: mujoco.MjSpec) -> None:
             continue
         low, high = joint.actfrcrange
         motor = spec.add_actuator(
-            name=joint.name,
-            trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            target=joint.name,
-            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-            biastype=mujoco.mjtBias.mjBIAS_NONE,
+            name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
-        motor.gainprm[0] = 1.0
+        motor.set_to_motor()
         if low < high:
             motor.ctrllimited, motor.ctrlrange = True, (low, high)

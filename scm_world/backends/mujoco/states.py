@@ -15,19 +15,17 @@ import numba
 import numpy as np
 
 from scm_world._types import Floats, Integers
-from scm_world.backends.mujoco.reading import permutation
 from scm_world.models.model import Model
 
 MOTION = sum(int(getattr(mujoco.mjtState, f"mjSTATE_{part}")) for part in ("QPOS", "QVEL", "ACT"))
 
 
-@numba.njit("void(f8[::1], i8, f8[::1], b1)", cache=True, error_model="numpy")
-def _rotate(turn: Floats, start: int, vector: Floats, inverse: bool) -> None:
-    """Rotate a vector in place by the quaternion (x, y, z, w) that begins at ``start``."""
-    x, y, z, w = turn[start], turn[start + 1], turn[start + 2], turn[start + 3]
+@numba.njit(cache=True, error_model="numpy")
+def _rotate(turn: Floats, vector: Floats, sign: float) -> None:
+    """Rotate a vector in place by a quaternion (x, y, z, w); back by it if the sign is -1."""
+    x, y, z, w = turn[0], turn[1], turn[2], turn[3]
     scale = 2.0 / (w * w + x * x + y * y + z * z)
-    if inverse:
-        w = -w
+    w *= sign
     a, b, c = vector[0], vector[1], vector[2]
     # v + 2 w (q x v) + 2 q x (q x v)
     i, j, k = y * c - z * b, z * a - x * c, x * b - y * a
@@ -36,29 +34,43 @@ def _rotate(turn: Floats, start: int, vector: Floats, inverse: bool) -> None:
     vector[2] = c + scale * (w * k + x * j - y * i)
 
 
-@numba.njit("void(f8[:, ::1], i4[::1], i8[:, ::1])", cache=True)
-def into_world(vectors: Floats, which: Any, turned: Integers) -> None:
-    """Make w of quaternions not negative, and turn angular velocities into the world.
+@numba.njit(
+    "i8(f8[:, :], f8[:, :], i8[::1], i8[:, ::1], i8[:, ::1], i4[::1], f8[:, ::1])",
+    cache=True,
+    error_model="numpy",
+)
+def read_rows(
+    motions: Floats,
+    forces: Floats,
+    places: Integers,
+    reported: Integers,
+    turned: Integers,
+    which: Any,
+    into: Floats,
+) -> int:
+    """Write some rows of motions as states; return the last that is not finite, or -1.
 
-    Args:
-        vectors: States, one to a row, changed in place.
-        which: The rows.
-        turned: Where in a row the quaternion and the angular velocity of each body are, shape
-            (n, 7).
+    ``places`` has where in a state each number of a motion is, ``reported`` the places in
+    ``qfrc_actuator`` and in a state of what is reported (2, m), and ``turned`` those of quaternion
+    and angular velocity of each turned body in a state (n, 7).
     """
-    spin = np.empty(3)
+    wrong = -1
     for row in which:
-        vector = vectors[row]
+        state, motion, zero = into[row], motions[row], 0.0
+        for i in range(places.size):
+            state[places[i]] = motion[i]
+            zero += 0.0 * motion[i]
+        if zero != 0.0:  # it is nan
+            wrong = row
+        for i in range(reported.shape[1]):
+            state[reported[1, i]] = forces[row, reported[0, i]]
         for body in range(turned.shape[0]):
             q, v = turned[body, 0], turned[body, 4]
-            for axis in range(3):
-                spin[axis] = vector[v + axis]
-            _rotate(vector, q, spin, False)
-            for axis in range(3):
-                vector[v + axis] = spin[axis]
-            if vector[q + 3] < 0.0:
-                for axis in range(4):
-                    vector[q + axis] = -vector[q + axis]
+            _rotate(state[q : q + 4], state[v : v + 3], 1.0)
+            if state[q + 3] < 0.0:
+                for i in range(q, q + 4):
+                    state[i] = -state[i]
+    return wrong
 
 
 @numba.njit("void(f8[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1])", cache=True)
@@ -67,82 +79,23 @@ def into_bodies(
 ) -> None:
     """Turn angular velocities in the world into those in the frames of the bodies.
 
-    A body whose quaternion and angular velocity are those that were read after the last step gets
-    MuJoCo's own numbers of that step: turning back and forth would change the last digits.
-
-    Args:
-        vector: The state to write.
-        turned: Where in it the seven numbers of each body are, shape (n, 7).
-        own: Where in the motion they are: quaternion (w, x, y, z) and angular velocity.
-        known: Quaternion and angular velocity that were read, nan for a new body, shape (n, 7).
-        exact: MuJoCo's own numbers then, shape (n, 7).
-        motion: Written.
+    A body whose quaternion and angular velocity are ``known``, read after the last step (nan for a
+    new body), gets the ``exact`` numbers that MuJoCo had then: turning back and forth would change
+    the last digits. ``turned`` and ``own`` have their places in the state and in the motion; all
+    four have shape (n, 7).
     """
     spin = np.empty(3)
     for body in range(turned.shape[0]):
         q, v = turned[body, 0], turned[body, 4]
-        turns, spins = False, False
-        for axis in range(4):
-            turns |= vector[q + axis] != known[body, axis]
-        for axis in range(3):
-            spins |= vector[v + axis] != known[body, 4 + axis]
-            spin[axis] = vector[v + axis]
-        sign = -1.0 if vector[q + 3] < 0.0 else 1.0
-        for axis in range(4):
-            place = q + (axis + 3) % 4  # w comes first
-            motion[own[body, axis]] = sign * vector[place] if turns else exact[body, axis]
-        _rotate(vector, q, spin, True)
-        for axis in range(4, 7):
-            motion[own[body, axis]] = spin[axis - 4] if turns or spins else exact[body, axis]
-
-
-_CLOSE = 1e-14  # relative; a few roundings, far less than any physics
-
-
-@numba.njit("void(f8[::1], f8[::1], i8[:, ::1])", cache=True)
-def settle(written: Floats, into: Floats, turned: Integers) -> None:
-    """Read an angular velocity as it was written, where only roundings differ."""
-    for places in turned:
-        error, norm = 0.0, 0.0
-        for place in places[4:]:
-            error += abs(into[place] - written[place])
-            norm += abs(written[place])
-        if error <= _CLOSE * norm:
-            for place in places[4:]:
-                into[place] = written[place]
-
-
-def read_rows(
-    states: Floats,
-    forces: Any,
-    places: Integers,
-    turned: Integers,
-    reported: Integers,
-    which: Any,
-    into: Floats,
-) -> int:
-    """Copy some rows of MuJoCo's states (time, positions, velocities, activations, ...).
-
-    Args:
-        states: Of all simulations, one to a row.
-        forces: ``qfrc_actuator`` of all, shape (n, nv); None if nothing is reported.
-        places: Where in a vector each number of the motion is.
-        turned: See ``into_world``.
-        reported: Places in a vector, and in ``forces``, of what is reported, shape (2, m).
-        which: The rows, shape (m,).
-        into: The first columns of these rows are written.
-
-    Returns:
-        A row in which something is not finite; -1 if there is none.
-    """
-    rows, motion = which[:, None], states[which, 1 : 1 + len(places)]
-    into[rows, places] = motion
-    if reported.size:
-        into[rows, reported[0]] = forces[rows, reported[1]]
-    if len(turned):
-        into_world(into, which, turned)
-    wrong = which[~np.isfinite(motion).all(axis=1)]
-    return int(wrong[-1]) if len(wrong) else -1
+        turn, spin[:] = vector[q : q + 4], vector[v : v + 3]
+        turns = (turn != known[body, :4]).any()
+        spins = turns or (spin != known[body, 4:]).any()
+        sign = -1.0 if turn[3] < 0.0 else 1.0
+        for i in range(4):  # w comes first
+            motion[own[body, i]] = sign * turn[(i + 3) % 4] if turns else exact[body, i]
+        _rotate(turn, spin, -1.0)
+        for i in range(3):
+            motion[own[body, 4 + i]] = spin[i] if spins else exact[body, 4 + i]
 
 
 def turned_bodies(model: Model, mj: mujoco.MjModel) -> tuple[tuple[str, ...], Integers, Integers]:
@@ -158,7 +111,7 @@ def turned_bodies(model: Model, mj: mujoco.MjModel) -> tuple[tuple[str, ...], In
         if row.frame == "world" and row.array == "qvel"
         for number in row.numbers
     }
-    qpos, qvel, _ = permutation(model)
+    (_, qpos), (_, qvel) = model.places("qpos"), model.places("qvel")
     names, turned, own = [], [], []
     for joint in np.flatnonzero(mj.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)).tolist():
         q, v = int(mj.jnt_qposadr[joint]) + 3, int(mj.jnt_dofadr[joint]) + 3

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from functools import cached_property
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import mujoco
 import numpy as np
@@ -29,17 +29,11 @@ _OBJ, _TRN, _WRAP, _EQ, _OFF = (
     mujoco.mjtEq,
     mujoco.mjtDisableBit,
 )
-_WAYS = {
-    "joints": (int(_WRAP.mjWRAP_JOINT),),
-    "sites": (int(_WRAP.mjWRAP_SITE),),
-    "geoms": (int(_WRAP.mjWRAP_SPHERE), int(_WRAP.mjWRAP_CYLINDER)),
-}
-"""What tendons run through and around."""
 
 
-def disabled(mj: mujoco.MjModel, flag: mujoco.mjtDisableBit) -> bool:
-    """Return whether a part of physics is switched off by a flag of the model."""
-    return bool(mj.opt.disableflags & int(flag))
+def disabled(mj: mujoco.MjModel, *flags: mujoco.mjtDisableBit) -> bool:
+    """Return whether a part of physics is switched off by one of some flags of the model."""
+    return any(mj.opt.disableflags & int(flag) for flag in flags)
 
 
 def works(mj: mujoco.MjModel, actuator: int) -> bool:
@@ -76,18 +70,21 @@ class Couplings:
         fluid: Whether a medium acts, or may be made to act; it acts in any case if it is dense.
 
     Attributes:
-        fluid: The same.
+        fluid: Whether a medium acts.
         roots: Number of the body at the root of each tree.
+        every: All trees.
         links: What joins trees, by kind and number.
     """
 
     def __init__(self, mj: mujoco.MjModel, fluid: bool = False) -> None:
         self._mj = mj
         self.fluid = fluid or mj.opt.density > 0.0 or mj.opt.viscosity > 0.0
+        self._touch = not disabled(mj, _OFF.mjDSBL_CONTACT, _OFF.mjDSBL_CONSTRAINT)
         self._moves = np.asarray(mj.body_treeid) >= 0
         self.roots = sorted({int(root) for root in mj.body_rootid[self._moves]})
+        self.every = frozenset(range(len(self.roots)))
         number = {root: i for i, root in enumerate(self.roots)}
-        self._tree = np.array([number.get(int(root), -1) for root in mj.body_rootid])
+        self._tree = [number.get(root, -1) for root in mj.body_rootid.tolist()]
         self.links: dict[str, list[TreeLink]] = {}
         for kind, count in (
             ("tendon", mj.ntendon), ("flex", mj.nflex), ("equality", mj.neq),
@@ -95,26 +92,17 @@ class Couplings:
         ):  # fmt: skip
             self.links[kind] = [getattr(self, f"_{kind}")(i) for i in range(count)]
         self._coupled = _groups(len(self.roots), (link.trees for link in self._all_links()))
-        self._known: dict[Trees, Effect] = {}
-
-    @property
-    def every(self) -> Trees:
-        """All trees."""
-        return frozenset(range(len(self.roots)))
 
     def tree(self, body: int) -> int:
         """Return the number of the tree of a body; -1 where nothing in it can move."""
-        return int(self._tree[body])
+        return self._tree[body]
 
     # --- what elements act on ------------------------------------------------------------------
 
-    def always(self, trees: Iterable[int]) -> Effect:
-        """Return the effect of something that acts on some trees in every step."""
-        key = frozenset(trees)
-        if key not in self._known:
-            found = frozenset().union(*{self._coupled[tree] for tree in key})
-            self._known[key] = found, self._reached(found) - found
-        return self._known[key]
+    def always(self, trees: Iterable[int], shapes: Iterable[int] = ()) -> Effect:
+        """Return the effect of what acts on trees in every step, and on how shapes touch."""
+        found = NONE.union(*(self._coupled[tree] for tree in trees))
+        return found, self._reached(found.union(*map(self._touched, shapes))) - found
 
     def touching(self, trees: Iterable[int]) -> Effect:
         """Return the effect of something that acts on some trees by contact alone."""
@@ -133,20 +121,17 @@ class Couplings:
         """Return the effect of the place of a body in its parent, with all that hangs from it."""
         if self._moves[body]:
             return self.body(body)
-        parents, found = self._mj.body_parentid, {body}
-        for other in range(body + 1, self._mj.nbody):
-            if int(parents[other]) in found:
+        parents, found = self._mj.body_parentid.tolist(), {body}
+        for other in range(body + 1, len(parents)):
+            if parents[other] in found:
                 found.add(other)
         trees = {self.tree(b) for b in found if self.tree(b) >= 0}
         held = (link.trees for link in self._all_links() if not found.isdisjoint(link.bodies))
-        always, contact = self.always(trees.union(*held))
-        shapes = [g for g in range(self._mj.ngeom) if int(self._mj.geom_bodyid[g]) in found]
-        touched = self._reached({tree for g in shapes for tree in self._touched(g)})
-        return always, (contact | touched) - always
+        return self.always(trees.union(*held), self._shapes(*found))
 
     def contact_of(self, geom: int) -> Effect:
         """Return the effect of how a shape behaves in contact."""
-        return self.touching(self._touched(geom))
+        return self.always((), [geom])
 
     def geom(self, geom: int) -> Effect:
         """Return the effect of the size or place of a shape: contact, tendons, a medium."""
@@ -154,8 +139,7 @@ class Couplings:
         trees = NONE.union(*(link.trees for link in self._all_links() if geom in link.geoms))
         if self.fluid and self._moves[body] and self._mj.geom_fluid[geom, 0] > 0.0:
             trees |= {self.tree(body)}
-        always, contact = self.always(trees)
-        return always, (contact | self._reached(self._touched(geom))) - always
+        return self.always(trees, [geom])
 
     def site(self, site: int) -> Effect:
         """Return the effect of the place of a site: on what is attached to it."""
@@ -165,10 +149,8 @@ class Couplings:
 
     def pair(self, pair: int) -> Effect:
         """Return the effect of how a declared pair of shapes behaves in contact."""
-        if not self._contacts_on:
-            return NOTHING
-        geoms = int(self._mj.pair_geom1[pair]), int(self._mj.pair_geom2[pair])
-        return self.touching(self._moving([int(self._mj.geom_bodyid[g]) for g in geoms]))
+        geoms = [self._mj.pair_geom1[pair], self._mj.pair_geom2[pair]]
+        return self.touching(self._moving(self._mj.geom_bodyid[geoms])) if self._touch else NOTHING
 
     def tendon(self, tendon: int) -> Effect:
         """Return the effect of a tendon: on what it reaches."""
@@ -176,19 +158,15 @@ class Couplings:
 
     def equality(self, equality: int) -> Effect:
         """Return the effect of an equality constraint: on what it joins."""
-        if disabled(self._mj, _OFF.mjDSBL_EQUALITY):
-            return NOTHING
-        return self.always(self.links["equality"][equality].trees)
+        off = disabled(self._mj, _OFF.mjDSBL_EQUALITY)
+        return NOTHING if off else self.always(self.links["equality"][equality].trees)
 
     def actuator(self, actuator: int) -> Effect:
         """Return the effect of an actuator: on what its transmission reaches."""
-        mj = self._mj
-        if not works(mj, actuator):
+        if not works(self._mj, actuator):
             return NOTHING
-        if mj.actuator_trntype[actuator] == int(_TRN.mjTRN_BODY):
-            body = int(mj.actuator_trnid[actuator, 0])
-            shapes = [g for g in range(mj.ngeom) if int(mj.geom_bodyid[g]) == body]
-            return self.touching({tree for g in shapes for tree in self._touched(g)})
+        if self._mj.actuator_trntype[actuator] == int(_TRN.mjTRN_BODY):
+            return self.always((), self._shapes(int(self._mj.actuator_trnid[actuator, 0])))
         return self.always(self.links["actuator"][actuator].trees)
 
     def option(self, _: int) -> Effect:
@@ -209,53 +187,37 @@ class Couplings:
     # --- contact -------------------------------------------------------------------------------
 
     @cached_property
-    def _contacts_on(self) -> bool:
-        off = (_OFF.mjDSBL_CONTACT, _OFF.mjDSBL_CONSTRAINT)
-        return not any(disabled(self._mj, flag) for flag in off)
-
-    @cached_property
     def _masked(self) -> NDArray[np.bool_]:
         """Which geoms, and flexes after them, may touch by their masks, as MuJoCo filters them."""
-        mj, n = self._mj, self._mj.ngeom
+        mj, n, moves = self._mj, self._mj.ngeom, self._moves
+        weld = np.asarray(mj.body_weldid)
+        parent = weld[mj.body_parentid[weld]]
+        bodies = (moves[:, None] | moves) & (weld[:, None] != weld)
+        if not disabled(mj, _OFF.mjDSBL_FILTERPARENT):
+            family = (weld[:, None] == parent) | (parent[:, None] == weld)
+            bodies &= ~(family & (weld != 0)[:, None] & (weld != 0))
+        first, second = mj.exclude_signature >> 16, mj.exclude_signature & 0xFFFF
+        bodies[first, second] = bodies[second, first] = False
         kind = np.concatenate([mj.geom_contype, mj.flex_contype])
         affinity = np.concatenate([mj.geom_conaffinity, mj.flex_conaffinity])
-        one = (kind[:, None] & affinity[None, :]) != 0
-        found: NDArray[np.bool_] = (one | one.T) & self._contacts_on
-        found[:n, :n] &= self._may_meet[np.ix_(mj.geom_bodyid, mj.geom_bodyid)]
-        return found
-
-    def _with_pairs(self, found: NDArray[np.bool_], which: bool) -> NDArray[np.bool_]:
-        """Mark the shapes that have a declared pair."""
-        for first, second in zip(self._mj.pair_geom1, self._mj.pair_geom2, strict=True):
-            found[first, second] = found[second, first] = which
+        one = (kind[:, None] & affinity) != 0
+        found: NDArray[np.bool_] = (one | one.T) & self._touch
+        found[:n, :n] &= bodies[np.ix_(mj.geom_bodyid, mj.geom_bodyid)]
         return found
 
     @cached_property
     def dynamic(self) -> NDArray[np.bool_]:
         """Which shapes may touch with numbers of their own, without a pair, (ngeom, ngeom)."""
-        n = self._mj.ngeom
-        return self._with_pairs(self._masked[:n, :n].copy(), False)
+        mj = self._mj
+        found = self._masked[: mj.ngeom, : mj.ngeom].copy()
+        found[mj.pair_geom1, mj.pair_geom2] = found[mj.pair_geom2, mj.pair_geom1] = False
+        return found
 
     @cached_property
     def touches(self) -> NDArray[np.bool_]:
         """Which shapes may touch, by their masks or because a pair says so, (ngeom, ngeom)."""
-        return self._with_pairs(self.dynamic.copy(), self._contacts_on)
-
-    @cached_property
-    def _may_meet(self) -> NDArray[np.bool_]:
-        """Which bodies are not kept from touching one another, shape (nbody, nbody)."""
-        mj, moves = self._mj, self._moves
-        weld = np.asarray(mj.body_weldid)
-        parent = weld[mj.body_parentid[weld]]
-        found: NDArray[np.bool_] = moves[:, None] | moves[None, :]
-        found &= weld[:, None] != weld[None, :]
-        if not disabled(mj, _OFF.mjDSBL_FILTERPARENT):
-            free = (weld != 0)[:, None] & (weld != 0)[None, :]
-            family = (weld[:, None] == parent[None, :]) | (parent[:, None] == weld[None, :])
-            found &= ~(free & family)
-        for signature in mj.exclude_signature.tolist():
-            first, second = signature >> 16, signature & 0xFFFF
-            found[first, second] = found[second, first] = False
+        mj, found = self._mj, self.dynamic.copy()
+        found[mj.pair_geom1, mj.pair_geom2] = found[mj.pair_geom2, mj.pair_geom1] = self._touch
         return found
 
     @cached_property
@@ -283,50 +245,54 @@ class Couplings:
         return _groups(len(self.roots), [*(link.trees for link in self._all_links()), *contacts])
 
     def _reached(self, trees: Iterable[int]) -> Trees:
-        return frozenset().union(*{self._islands[tree] for tree in trees})
+        return NONE.union(*(self._islands[tree] for tree in trees))
 
     # --- couplings -----------------------------------------------------------------------------
 
     def _all_links(self) -> Iterator[TreeLink]:
         return (link for links in self.links.values() for link in links)
 
+    def _shapes(self, *bodies: int) -> list[int]:
+        found: list[int] = np.flatnonzero(np.isin(self._mj.geom_bodyid, bodies)).tolist()
+        return found
+
     def _moving(self, bodies: Iterable[int]) -> Trees:
         """Return the trees of the bodies that can move."""
         return frozenset(self.tree(body) for body in bodies if self._moves[body])
 
     def _link(
-        self,
-        *,
-        joints: Iterable[int] = (),
-        sites: Iterable[int] = (),
-        geoms: Iterable[int] = (),
-        bodies: Iterable[int] = (),
-        beside: Iterable[int] = (),
+        self, joints: Any = (), sites: Any = (), geoms: Any = (), bodies: Any = (), beside: Any = ()
     ) -> TreeLink:
         """Return what joins some elements; the places of sites beside it count, too."""
-        mj, places = self._mj, {*sites, *beside}
-        geoms, bodies = frozenset(geoms), {*bodies, *(int(mj.site_bodyid[s]) for s in sites)}
-        bodies |= {int(mj.geom_bodyid[geom]) for geom in geoms}
-        trees = self._moving({*bodies, *(int(mj.jnt_bodyid[joint]) for joint in joints)})
-        bodies |= {int(mj.site_bodyid[site]) for site in beside}
-        return TreeLink(trees, frozenset(places), geoms, frozenset(bodies))
+        mj = self._mj
+        near, ends = frozenset(map(int, geoms)), {*map(int, sites)}
+        places = ends.union(map(int, beside))
+        held = {*bodies, *(int(mj.site_bodyid[s]) for s in ends)}
+        held |= {int(mj.geom_bodyid[geom]) for geom in near}
+        trees = self._moving(held.union(int(mj.jnt_bodyid[joint]) for joint in joints))
+        held |= {int(mj.site_bodyid[site]) for site in places}
+        return TreeLink(trees, frozenset(places), near, frozenset(held))
 
     def _tendon(self, tendon: int) -> TreeLink:
         mj, first = self._mj, int(self._mj.tendon_adr[tendon])
-        way = range(first, first + int(mj.tendon_num[tendon]))
-        of = {kind: [i for i in way if mj.wrap_type[i] in kinds] for kind, kinds in _WAYS.items()}
-        found = {kind: [int(mj.wrap_objid[i]) for i in places] for kind, places in of.items()}
-        sides = (int(mj.wrap_prm[i]) for i in of["geoms"])
-        return self._link(**found, beside=[side for side in sides if side >= 0])
+        way = slice(first, first + int(mj.tendon_num[tendon]))
+        kinds, numbers = mj.wrap_type[way], mj.wrap_objid[way]
+        bends = np.isin(kinds, [int(_WRAP.mjWRAP_SPHERE), int(_WRAP.mjWRAP_CYLINDER)])
+        sides = mj.wrap_prm[way][bends]
+        return self._link(
+            joints=numbers[kinds == int(_WRAP.mjWRAP_JOINT)],
+            sites=numbers[kinds == int(_WRAP.mjWRAP_SITE)],
+            geoms=numbers[bends],
+            beside=sides[sides >= 0],
+        )
 
     def _equality(self, equality: int) -> TreeLink:
         mj = self._mj
         ends = [int(e) for e in (mj.eq_obj1id[equality], mj.eq_obj2id[equality]) if e >= 0]
         match mujoco.mjtEq(int(mj.eq_type[equality])):
             case _EQ.mjEQ_CONNECT | _EQ.mjEQ_WELD:
-                if mj.eq_objtype[equality] == int(_OBJ.mjOBJ_SITE):
-                    return self._link(sites=ends)
-                return self._link(bodies=ends)
+                at_sites = mj.eq_objtype[equality] == int(_OBJ.mjOBJ_SITE)
+                return self._link(sites=ends) if at_sites else self._link(bodies=ends)
             case _EQ.mjEQ_JOINT:
                 return self._link(joints=ends)
             case _EQ.mjEQ_TENDON:
@@ -358,12 +324,9 @@ class Couplings:
 
 def _groups(n: int, links: Iterable[Iterable[int]]) -> list[Trees]:
     """Merge what is linked, directly or through others; return the group of each."""
-    group = [{i} for i in range(n)]
+    group = [frozenset([i]) for i in range(n)]
     for link in links:
-        joined = {id(group[i]): group[i] for i in link}
-        if len(joined) > 1:
-            members = set().union(*joined.values())
-            for member in members:
-                group[member] = members
-    shared = {id(members): frozenset(members) for members in group}
-    return [shared[id(members)] for members in group]
+        joined = NONE.union(*(group[i] for i in link))
+        for member in joined:
+            group[member] = joined
+    return group

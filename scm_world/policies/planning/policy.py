@@ -23,12 +23,22 @@ from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
 from scm_world.policies.planning.model import PlanningModel, as_score, nearness
-from scm_world.tasks.base import action_range
 from scm_world.variables import Noise, Normal
 from scm_world.world import Simulation
 
 KEPT = 0.3
 """Share of the elites that take part in the next round again."""
+
+
+def action_range(world: Any) -> tuple[Floats, Floats]:
+    """Return the lower and upper end of all actions, shape (n_actions,) each.
+
+    An action without an end is drawn from [-1, 1], or as far beyond the end that it has.
+    """
+    low, high = world.action_low, world.action_high
+    low = np.where(np.isfinite(low), low, np.minimum(-1.0, high - 2.0))
+    high = np.where(np.isfinite(high), high, np.maximum(1.0, low + 2.0))
+    return low, high
 
 
 @final

@@ -18,10 +18,10 @@ import numpy as np
 
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
+from scm_world.policies.planning import action_range
 from scm_world.queries.experiments.effects import RESOLUTION, Effects, ProbeSetting, gap
 from scm_world.queries.experiments.noise import shared_noise
-from scm_world.queries.experiments.probes import Probe, anywhere, drawn
-from scm_world.tasks.base import ProbeGenerator, action_range
+from scm_world.queries.experiments.probes import Probe, ProbeGenerator, anywhere, drawn
 from scm_world.variables import Measured, Noise, Rotations
 from scm_world.world import Simulation
 

@@ -9,7 +9,7 @@ the same, regardless of earlier probes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar, final
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
-from scm_world.tasks.base import ProbeGenerator, Scenario, action_range
+from scm_world.policies.planning import action_range
 from scm_world.variables import (
     Box,
     Categories,
@@ -38,6 +38,7 @@ LONGEST = 60  # control steps of random actions before a probe state
 TRIED = 60  # states in which bodies may touch
 WORLD = "world"  # the body that everything fixed belongs to
 MOVING = 0.75  # of the pairs that touch are of two other bodies, where there are such
+DRAWS = 96  # of a probe state, without those that have a name
 HALVINGS = 30  # of a range of commands, until one of them is found that no limit cuts
 TINY = 1e-9  # share of that range, which makes a difference there
 KEPT = 10  # for how many control steps an action is kept at most
@@ -46,6 +47,60 @@ SHARE = 0.5  # of the parameters that have other values, in the probes where som
 NEAR = 0.5  # of the places are within reach
 REACH = {"rad": np.pi, "m": 0.2, "rad/s": 4.0, "m/s": 2.0}
 """How far a state without bounds is moved from where it is, by its unit; others by 1."""
+
+
+@final
+class ProbeGenerator:
+    """The random numbers of one probe state.
+
+    They depend on seed, probe and attempt only, not on earlier draws.
+
+    Args:
+        noise: The seed's noise.
+        probe: Number of the probe state.
+        attempt: Counts up where a choice was not feasible.
+    """
+
+    def __init__(self, noise: Noise, probe: int, attempt: int = 0) -> None:
+        self._noise, self._probe, self._attempt = noise, probe, attempt
+        self._numbers = self.random("probe", DRAWS)
+        self._used = 0
+
+    def uniform(self, low: float, high: float, n: int | None = None) -> Any:
+        """Draw one number, or an array of ``n``; at most 96 in all."""
+        count = 1 if n is None else n
+        drawn = self._numbers[self._used : self._used + count]
+        self._used += count
+        scaled = low + (high - low) * drawn
+        return float(scaled[0]) if n is None else scaled
+
+    def random(self, stream: str, n: int) -> Floats:
+        """Draw numbers in [0, 1) of a named stream, shape (n,)."""
+        drawn = self._noise.uniforms(stream, n=n, episode=self._probe, step=self._attempt)
+        found: Floats = drawn[0]
+        return found
+
+
+@final
+@dataclass(frozen=True)
+class Scenario:
+    """A kind of probe state.
+
+    Attributes:
+        name: Its name.
+        prepare: Chooses the values to set in a world that has just been reset. It may step the
+            world before. The second value it returns is passed to ``act``.
+        act: Returns an action, shape (n_actions,).
+        steps: Number of control steps before the experiments; drawn from 0 to 2 if None.
+        fresh: Whether the values that were set count as the natural ones: experiments then do not
+            add up with them to one intervention, and are faster.
+    """
+
+    name: str
+    prepare: Callable[[Any, ProbeGenerator], tuple[dict[str, Value], Any]]
+    act: Callable[[Any, Any, ProbeGenerator], Floats]
+    steps: int | None = None
+    fresh: bool = False
 
 
 @final
@@ -86,7 +141,8 @@ def probes(
     """
     noise = Noise(seed)
     world.reset(seed=seed)
-    known = tuple(world.task.scenarios(world)) if scenarios else ()
+    asked = world.task.scenarios(world) if scenarios else ()
+    known = tuple(Scenario(prepare.__name__, prepare, act, steps) for prepare, act, steps in asked)
     kinds = known or _kinds(world, settled=settled)
     for number in range(first, n):
         yield _prepared(world, kinds[number % len(kinds)], noise, number, settled)

@@ -39,16 +39,17 @@ from scm_world.tasks.rewards import (
     reward,
     succeeded,
 )
-from scm_world.tasks.trifinger import building, hardware, kernels, shapes, shaping
+from scm_world.tasks.trifinger import hardware, kernels
 from scm_world.tasks.trifinger.conventions import CONVENTIONS, TriFingerConventions
-from scm_world.tasks.trifinger.entities.block_world import BlockWorld
+from scm_world.tasks.trifinger.entities.block_world import BlockWorld, fingers_reach
 from scm_world.tasks.trifinger.entities.robot import ACTIONS, robot
 from scm_world.tasks.trifinger.entities.stage import light_and_cameras, stage
-from scm_world.tasks.trifinger.feasibility import fingers_reach
 from scm_world.tasks.trifinger.hardware import PRESETS, RESOLUTIONS, TIMESTEP
+from scm_world.tasks.trifinger.kernels import POSE
 from scm_world.tasks.trifinger.scenarios import scenarios
 from scm_world.tasks.trifinger.symmetry import thirds
-from scm_world.variables import Function, Linear, Measured, Variable
+from scm_world.tasks.trifinger.views import boxes_apart, view_of
+from scm_world.variables import Function, Linear, Measured, Variable, names
 
 HEAD = (
     Observed(TIME),
@@ -60,7 +61,7 @@ HEAD = (
 )
 """The first rows of every observation."""
 
-_ROWS: Mapping[str, Any] = {
+ROWS: Mapping[str, Any] = {
     "size": ((0.03, 0.1), 0.0, 0.6),
     "cartesian_position": (((-0.5, -0.5, 0.0), (0.5, 0.5, 0.5)), -1.0, 1.0),
     "orientation": ((-10.0, 10.0), -1.0, 1.0),
@@ -74,16 +75,10 @@ def observe(name: str, kind: int, *parts: str) -> Iterable[Observed]:
     """List the published type of a body, its size and pose, and further quantities of it."""
     yield Observed(f"{name}.type", (kind, kind), low=0.0, high=30.0)
     for part in ("size", "cartesian_position", "orientation", *parts):
-        yield Observed(f"{name}.{part}", *_ROWS[part])
-
-
-def observe_position(name: str) -> Observed:
-    """Return the three numbers of a goal that is a point."""
-    return Observed(f"{name}.cartesian_position", *_ROWS["cartesian_position"])
+        yield Observed(f"{name}.{part}", *ROWS[part])
 
 
 REWARD = "reward"
-SECONDS_PER_BLOCK = 10.0
 
 MEASURES = ("cartesian_position", "orientation", "linear_velocity", "angular_velocity")
 """States of a block, in the order in which they are listed."""
@@ -101,7 +96,7 @@ class TriFingerTask(Task):
 
     Attributes:
         interleaved: Whether block and goal alternate in the observation.
-        block: The block and its goal, a ``OneBlock``, where there is one of each.
+        shape: Shape of block and goal, where that is not a box.
         roots: The variables that ``shared`` declares by default.
         goal_causes: The variables that a new goal is drawn for.
         default_weights: Weight of every dense reward term, in order, and of
@@ -117,6 +112,9 @@ class TriFingerTask(Task):
         start: The same, if an option changed them.
         success: Replaces the usual goal, if given; see ``Common``.
         terminated: Ends an episode before its time, if given; see ``Common``.
+
+    Raises:
+        UnknownOption: An argument is not known, or out of the bounds of its variable.
     """
 
     choices: ClassVar[dict[str, Any]] = {
@@ -131,13 +129,13 @@ class TriFingerTask(Task):
     conventions: TriFingerConventions = CONVENTIONS["scm_world"]
 
     interleaved: ClassVar[bool] = False
-    block: Any = None
+    shape: Hull | None = None
     roots: tuple[Variable, ...] = ()
     goal_causes: tuple[str, ...] = ()
     default_weights: ClassVar[Mapping[str, float]]
     paper_weights: ClassVar[Mapping[str, float]] = {}
     dense_terms: ClassVar[tuple[Measured, ...]] = ()
-    ready_terms: ClassVar[tuple[Measured, ...]] = shaping.ROBOT
+    ready_terms: ClassVar[tuple[Measured, ...]] = kernels.ROBOT
     terms: tuple[Measured, ...] = ()
     options: ClassVar[type] = Common
     unchecked: ClassVar[tuple[str, ...]] = ()
@@ -183,35 +181,24 @@ class TriFingerTask(Task):
     def entities(self) -> Iterable[Entity]:
         """List the entities of the scene other than the robot and the stage."""
 
-    def parts(self) -> Iterable[building.Part]:
-        """List the parts of a building, each a block with its place."""
-        return ()
-
     @property
     def tools(self) -> tuple[str, ...]:
-        """Names of the blocks that should be moved: one for each part."""
-        return tuple(f"tool_{name}" for name, _ in self.parts()) or tuple(self.targets.values())
+        """Names of the blocks that should be moved."""
+        return tuple(self.targets.values())
 
     @property
     def targets(self) -> Mapping[str, str]:
         """Names of the goals, each with the block that its solution puts there."""
-        if self.block is not None:
-            return dict(self.block.targets)
-        return {f"goal_{name}": f"tool_{name}" for name, _ in self.parts()}
+        return {}
 
     @property
     def obstacles(self) -> tuple[str, ...]:
         """Names of the obstacles."""
         return ()
 
-    @property
-    def shape(self) -> Hull | None:
-        """Shape of block and goal, where that is not a box."""
-        return None if self.block is None else self.block.shape
-
     def shared(self) -> Iterable[Variable]:
-        """Declare one size, or one shape, for block and goal, where there is one of each."""
-        return self.roots if self.block is None else self.block.shared()
+        """Declare causes that several entities have in common."""
+        return self.roots
 
     @cached_property
     def _first(self) -> Hashable:
@@ -226,30 +213,24 @@ class TriFingerTask(Task):
         """Declare the dense reward terms."""
         return self.dense_terms
 
-    def _fraction(self) -> Measured:
-        """Declare the fraction of the goals that is filled."""
-        published, parts = self.conventions.aligned_boxes, building.POSE
-        if self.shape is not None:
-            mechanism = Function(shapes.hull_aligned if published else shapes.hull_filled)
-            parts = ("vertices", *building.POSE[1:])
-        elif len(self.tools) == len(self.targets) == 1 and not published:
-            mechanism = Function(kernels.filled)
-        else:
-            boxes = building.aligned if published else building.filled
-            mechanism = Function(boxes, constants={"tools": float(len(self.tools))})
-        bodies = (*self.tools, *self.targets)
-        return Measured(
-            name=FRACTION,
-            bounds=None if published else UNIT,
-            parents=tuple(f"{body}.{part}" for body in bodies for part in parts),
-            mechanism=mechanism,
-            doc="Fraction of the volume of all goals that the blocks fill.",
-        )
-
     def readouts(self) -> Iterable[Variable]:
         """Declare reward terms, fractional success and success."""
         yield from self.dense()
-        yield self._fraction()
+        published, parts = self.conventions.published, POSE
+        constants = {"tools": float(len(self.tools))}
+        if self.shape is not None:
+            function: Any = kernels.hull_aligned if published else kernels.hull_filled
+            parts, constants = ("vertices", *POSE[1:]), {}
+        else:
+            function = kernels.aligned if published else kernels.filled
+        bodies = (*self.tools, *self.targets)
+        yield Measured(
+            name=FRACTION,
+            bounds=None if published else UNIT,
+            parents=tuple(f"{body}.{part}" for body in bodies for part in parts),
+            mechanism=Function(function, constants=constants),
+            doc="Fraction of the volume of all goals that the blocks fill.",
+        )
         yield succeeded()
         yield from self.terms
         yield reward(self.weights)
@@ -257,20 +238,20 @@ class TriFingerTask(Task):
     @property
     def seconds(self) -> float:
         """Ten seconds for each block [s]."""
-        still = len(self.obstacles) if self.conventions.static_counts else 0
-        return SECONDS_PER_BLOCK * (len(self.tools) + still)
+        still = len(self.obstacles) if self.conventions.published else 0
+        return 10.0 * (len(self.tools) + still)
 
     @property
     def goal(self) -> Goal:
         """The blocks should fill the goals."""
         have, want = (
-            tuple(f"{name}.{part}" for name in names for part in building.POSE)
+            tuple(f"{name}.{part}" for name in names for part in POSE)
             for names in (self.targets.values(), self.targets)
         )
         exact, aligned = (
-            partial(building.fraction_of, self.shape, published) for published in (False, True)
+            partial(kernels.fraction_of, self.shape, published) for published in (False, True)
         )
-        fraction = aligned if self.conventions.aligned_boxes else exact
+        fraction = aligned if self.conventions.published else exact
         return Goal(
             achieved=have,
             desired=want,
@@ -280,7 +261,7 @@ class TriFingerTask(Task):
                 SUCCESS: lambda mine, its: fraction(mine, its) > FULFILLED,
                 OVERLAP: aligned,
             },
-            closeness=((shaping.TIPS, *have, *want), building.boxes_apart),
+            closeness=((kernels.TIPS, *have, *want), boxes_apart),
             tools=self.tools,
             targets=self.targets,
         )
@@ -304,7 +285,7 @@ class TriFingerTask(Task):
         return Observation(
             rows=(*HEAD, *self.observed()),
             saturates=True,
-            view=building.view_of(boxes) if boxes else None,
+            view=view_of(boxes) if boxes else None,
             # there are none with a wall, which always stands in the same place
             symmetries=None if self.obstacles or not self.targets else thirds,
             measured=(*(f"{tool}.{what}" for tool in self.tools for what in MEASURES), FRACTION),
@@ -316,10 +297,10 @@ class TriFingerTask(Task):
         found = {
             f"{tool}.{part}": values[f"{goal}.{part}"]
             for goal, tool in self.targets.items()
-            for part in building.POSE[1:]
+            for part in POSE[1:]
         }
         joints, height = values["joint_positions"], float(values["robot_height"])
-        boxes = ([values[f"{goal}.{part}"] for part in building.POSE] for goal in self.targets)
+        boxes = ([values[f"{goal}.{part}"] for part in POSE] for goal in self.targets)
         if any(fingers_reach(b[0], b[1], b[2], joints, height) for b in boxes):
             found["joint_positions"] = np.array(hardware.ASIDE)
         return found
@@ -349,22 +330,22 @@ class TriFingerTask(Task):
             others.append(declared(TERMINATED, self.terminated))
         entities = (*_always_there(timing, self.start), *self.entities())
         entities = tuple(entity for entity in entities if entity.name not in self.absent)
-        shared, is_settled = tuple(self.shared()), not self.absent
-        while not is_settled:
+        shared, there = tuple(self.shared()), set[str]()
+
+        def is_whole(variable: Variable) -> bool:
+            causes = (parent.name for parent in variable.all_parents)
+            return variable.name == REWARD or there.issuperset(causes)
+
+        while self.absent:
+            before = len(entities), len(others)
             bodies = (*shared, *(v for entity in entities for v in entity.variables))
-            names = {variable.name for variable in (*bodies, *others)}
-            whole = tuple(e for e in entities if all(_kept(v, names) for v in e.variables))
-            kept = [one for one in (_kept(v, names) for v in others) if one is not None]
-            is_settled = (len(whole), len(kept)) == (len(entities), len(others))
-            entities, others = whole, kept
-        made = BlockWorld(
-            entities,
-            shared,
-            self.decided_by,
-            timing,
-            self.conventions,
-            self.unchecked if self.conventions.published_spaces else (),
-        )
+            there = {variable.name for variable in (*bodies, *others)}
+            entities = tuple(e for e in entities if all(map(is_whole, e.variables)))
+            others = [variable for variable in others if is_whole(variable)]
+            if before == (len(entities), len(others)):
+                others = [_without(one, there) for one in others]
+                break
+        made = BlockWorld(entities, shared, self, timing)
         return made, [*made.variables(), *others]
 
 
@@ -379,43 +360,10 @@ def _always_there(timing: Timing, start: tuple[float, ...]) -> tuple[Entity, ...
     )
 
 
-def _kept(variable: Variable, names: set[str]) -> Variable | None:
-    """Return a variable that can be computed from others; of the reward, what is left of it."""
-    parents = variable.all_parents
-    there = [index for index, parent in enumerate(parents) if parent.name in names]
-    if len(there) == len(parents):
-        return variable
+def _without(variable: Variable, there: set[str]) -> Variable:
+    """Return the sum of the reward terms that are left; any other variable as it is."""
     mechanism: Any = getattr(variable, "mechanism", None)
     if variable.name != REWARD or not isinstance(mechanism, Linear):
-        return None
-    weights = tuple(mechanism.weights[index] for index in there)
-    update = {
-        "parents": tuple(parents[index] for index in there),
-        "mechanism": mechanism.model_copy(update={"weights": weights}),
-    }
-    return variable.model_copy(update=update)
-
-
-class Building(TriFingerTask):
-    """A goal family whose blocks are parts of a building, as many as variables say.
-
-    ``roots`` has to hold ``blocks_mass(default)``: the mass of every part is a copy of it.
-
-    Attributes:
-        piece: Where the parts come from.
-    """
-
-    default_weights: ClassVar[Mapping[str, float]] = {FRACTION: 1.0}
-    interleaved = True
-    rest = hardware.RAISED  # the fingers begin out of the way
-    piece: ClassVar[building.Piece]
-
-    def entities(self) -> Iterable[Entity]:
-        """List the blocks, and their places in the building."""
-        airborne, targets = self.conventions.published_spaces, self.targets
-        pieces = [
-            building.bodies(self.piece, name, tuple(which.items()), airborne)
-            for name, which in self.parts()
-        ]
-        yield from (tool for tool, _ in pieces)
-        yield from (goal for _, goal in pieces if goal.name in targets)
+        return variable
+    terms = zip(names(variable.all_parents), mechanism.weights, strict=True)
+    return reward({name: weight for name, weight in terms if name in there})

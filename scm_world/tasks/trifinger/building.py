@@ -1,101 +1,45 @@
-"""Blocks that should fill goals: success, goal, solution and the parts of a building."""
+"""Buildings: families whose blocks are parts of something; and towers, the simplest of them."""
 
 from __future__ import annotations
 
 import inspect
-import itertools
-from collections.abc import Callable, Mapping
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, final
+from typing import Any, ClassVar, Unpack, final
 
 import numpy as np
-from numba import njit
 
-from scm_world._types import ArrayLike, Floats, Values
+from scm_world._types import Floats, Value, Values
 from scm_world.errors import ModelError
-from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction
-from scm_world.geometry.hulls import Hull
-from scm_world.geometry.rotations import rotation_matrix
+from scm_world.tasks.composition import Entity
+from scm_world.tasks.rewards import FRACTION, Common
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import shapes
-from scm_world.tasks.trifinger.entities.blocks import ToolBlock, block_mass
-from scm_world.tasks.trifinger.entities.goals import GoalBlock, goal_orientation, goal_position
-from scm_world.tasks.trifinger.views import SIZE, view
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.base import TriFingerTask
+from scm_world.tasks.trifinger.catalogue import Causes
+from scm_world.tasks.trifinger.entities.bodies import (
+    body,
+    lowest_point,
+    orientation,
+    position,
+    tool,
+)
 from scm_world.variables import Function, Variable
-from scm_world.variables.mechanisms import Stacked
+from scm_world.variables.mechanisms import Constant
 
 MASS = "blocks_mass"
-BOX = 10  # numbers of a box in a goal vector: size (3), position (3), quaternion (4)
-TIPS = "end_effector_positions"
 
-NEAR = 0.1
-"""What a meter between fingertips and block counts beside one between block and goal."""
+Part = tuple[str, dict[str, Any]]
+"""The name of a part of a building, and the numbers, or arrays, that say which one it is."""
 
-CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-"""Of a cube with edges of length one, shape (8, 3)."""
-
-POSE = ("size", "cartesian_position", "orientation")
+Constants = tuple[tuple[str, Constant], ...]
 
 
-@Stacked
-@njit(cache=True)
-def filled(numbers: Floats, tools: float) -> float:
-    """Compute the fraction of the volume of all goals that the blocks fill, in [0, 1].
-
-    Args:
-        numbers: Size, position and quaternion of each block, then of each goal, shape (10 n,).
-        tools: How many blocks there are.
-    """
-    rows, of = numbers.reshape(-1, BOX), int(tools)
-    size, position, turn = rows[:, :3].copy(), rows[:, 3:6].copy(), rows[:, 6:].copy()
-    return overlap_fraction(
-        size[:of], position[:of], turn[:of], size[of:], position[of:], turn[of:]
-    )
-
-
-@Stacked
-def aligned(numbers: Floats, tools: float) -> float:
-    """Compute the predecessor's overlap: of the axis-aligned hulls, not capped; see ``filled``."""
-    parts = np.split(numbers.reshape(-1, BOX), [3, 6], axis=1)
-    of = int(tools)
-    return aabb_overlap_fraction(*(part[:of] for part in parts), *(part[of:] for part in parts))
-
-
-def fraction_of(
-    shape: Hull | None, published: bool, achieved: ArrayLike, desired: ArrayLike
-) -> Floats:
-    """Compute how much of the desired boxes, or of the desired hull, is filled, shape (...)."""
-    vertices = None if shape is None else np.array(shape.vertices)
-
-    def one(mine: Floats, its: Floats) -> float:
-        if vertices is None:
-            boxes = aligned if published else filled
-            return float(boxes(mine, its, tools=len(mine) / BOX))
-        overlap = shapes.hull_aligned if published else shapes.hull_filled
-        return overlap(vertices, mine[3:6], mine[6:], vertices, its[3:6], its[6:])
-
-    vectorized = np.vectorize(one, signature="(n),(n)->()", otypes=[float])
-    return np.asarray(vectorized(np.asarray(achieved, float), np.asarray(desired, float)))
-
-
-def view_of(
-    targets: Mapping[str, str],
-) -> tuple[tuple[str, ...], int, Callable[[Values], Floats]]:
-    """Describe the view of the boxes that have goals, in their own frames."""
-    parts = [
-        (TIPS, *(f"{tool}.{part}" for part in POSE), *(f"{goal}.{p}" for p in POSE[1:]))
-        for goal, tool in targets.items()
-    ]
-
-    def seen(values: Values) -> Floats:
-        return np.concatenate([view(*(values[name] for name in names)) for names in parts])
-
-    return tuple(dict.fromkeys(itertools.chain(*parts))), SIZE * len(parts), seen
-
-
-Part = tuple[str, dict[str, float]]
-"""The name of a part of a building, and the numbers that say which one it is."""
+def constants_of(which: Mapping[str, Any]) -> Constants:
+    """Return the numbers of a part as mechanisms keep them: arrays as tuples."""
+    return tuple(Function("part", constants=which).constants.items())
 
 
 def blocks_mass(default: float) -> Variable:
@@ -104,18 +48,14 @@ def blocks_mass(default: float) -> Variable:
     return numbers.SHARED_MASSES.option(MASS, default, doc, "tool_block_mass")
 
 
-Causes = str | tuple[Any, ...]
-"""The name of a variable to copy, or ``(function, "parent", …)``: a function of their values.
-
-Keyword-only arguments of the function get the constants of the part, and ``airborne``: 1 where
-blocks may begin in the air, as in the predecessor.
-"""
-
-
 @final
 @dataclass(frozen=True)
 class Piece:
     """Where the parts of a building come from; they have no spaces of their own.
+
+    Each is the name of a variable to copy, or ``(function, "parent", …)``. Keyword-only arguments
+    of the function get the constants of the part, and ``airborne``: 1 where blocks may begin in the
+    air, as in the predecessor.
 
     Attributes:
         size: Edge lengths of a block and of its place.
@@ -140,65 +80,182 @@ class Piece:
                 raise ModelError([f"Piece.{field}={given!r}: {advice}"])
 
 
-def _bound(causes: Causes | None, constants: Mapping[str, float]) -> dict[str, Any]:
-    """Return parents and mechanism."""
-    if causes is None or isinstance(causes, str):
-        return {"parents": () if causes is None else (causes,), "mechanism": None}
-    function, *parents = causes
-    taken = inspect.signature(function).parameters.values()
-    names = [one.name for one in taken if one.kind is one.KEYWORD_ONLY]
-    own = {name: constants[name] for name in names if name in constants}
-    return {"parents": tuple(parents), "mechanism": Function(function, constants=own)}
-
-
 @lru_cache(maxsize=512)  # they are immutable, and most structures of a family have them
-def bodies(
-    piece: Piece, name: str, which: tuple[tuple[str, float], ...], airborne: bool
-) -> tuple[ToolBlock, GoalBlock]:
-    """Describe a block of a building, and its place.
+def bodies(piece: Piece, name: str, which: Constants, airborne: bool) -> tuple[Entity, Entity]:
+    """Describe a part of a building, of which ``which`` are the constants: block and place."""
+
+    def taken(causes: Causes | None) -> dict[str, Any]:
+        if causes is None or isinstance(causes, str):
+            return {}
+        given = {**dict(which), "airborne": float(airborne)}
+        options = inspect.signature(causes[0]).parameters.values()
+        names = (one.name for one in options if one.kind is one.KEYWORD_ONLY)
+        return {name: given[name] for name in names if name in given}
+
+    mine, its = f"tool_{name}", f"goal_{name}"
+    sizes = [
+        numbers.PART_SIZES.derived(f"{solid}.size", piece.size, constants=taken(piece.size))
+        for solid in (mine, its)
+    ]
+    start, *start_from = piece.start
+    block = tool(
+        mine,
+        sizes[0],
+        numbers.BLOCK_MASSES.derived(f"{mine}.mass", MASS),
+        start=Function(start, constants=taken(piece.start)),
+        start_from=tuple(start_from),
+        start_again=True,
+        spaces=numbers.places(numbers.half_height(f"{mine}.size"), airborne=airborne),
+    )
+    pose = (
+        position(its, piece.place, taken(piece.place)),
+        orientation(its, piece.turn, taken(piece.turn)),
+    )
+    return block, body("goal", its, sizes[1], *pose, yaw=False)
+
+
+class Building(TriFingerTask):
+    """A goal family whose blocks are parts of a building, as many as variables say.
+
+    ``roots`` has to hold ``blocks_mass(default)``: the mass of every part is a copy of it.
+
+    Attributes:
+        piece: Where the parts come from.
+    """
+
+    default_weights: ClassVar[Mapping[str, float]] = {FRACTION: 1.0}
+    interleaved = True
+    rest = hardware.RAISED  # the fingers begin out of the way
+    piece: ClassVar[Piece]
+
+    @abstractmethod
+    def parts(self) -> Iterable[Part]:
+        """List the parts of the building, each a block with its place."""
+
+    @property
+    def tools(self) -> tuple[str, ...]:
+        """Names of the blocks that should be moved: one for each part."""
+        return tuple(f"tool_{name}" for name, _ in self.parts())
+
+    @property
+    def targets(self) -> Mapping[str, str]:
+        """Names of the goals, each with the block that its solution puts there."""
+        return {f"goal_{name}": f"tool_{name}" for name, _ in self.parts()}
+
+    def entities(self) -> Iterable[Entity]:
+        """List the blocks, and their places in the building."""
+        airborne, targets = self.conventions.published, self.targets
+        pieces = [
+            bodies(self.piece, name, constants_of(which), airborne) for name, which in self.parts()
+        ]
+        yield from (tool for tool, _ in pieces)
+        yield from (goal for _, goal in pieces if goal.name in targets)
+
+
+# --- towers ---------------------------------------------------------------------------------------
+
+DIMS = "tower_dims"
+NUMBER = "number_of_blocks_in_tower"
+CENTER = "tower_center"
+
+CORNER = 0.12  # [m] where the first block begins: at minus this in x and y
+EDGE = 0.16  # [m] how far a block may reach in x and y at the start
+GAP = 0.005  # [m] between blocks at the start
+
+Counts = tuple[int, int, int]
+
+
+def part(dims: Floats, number: Value) -> Floats:
+    """Compute the size of a block of the tower, shape (..., 3) [m]."""
+    return np.asarray(dims / number)
+
+
+def place(
+    dims: Floats, number: Value, center: Floats, *, level: float, col: float, row: float
+) -> Floats:
+    """Compute the center of the part with these numbers along z, y and x, shape (..., 3) [m]."""
+    corner = np.concatenate([center - dims[..., :2] / 2.0, 0.0 * dims[..., 2:]], axis=-1)
+    return np.asarray(corner + (np.array([row, col, level]) + 0.5) * part(dims, number))
+
+
+@lru_cache(maxsize=256)
+def _cells(columns: int, rows: int) -> tuple[tuple[int, int], ...]:
+    """List the cells of a grid: its diagonal, then the ones beside it."""
+    cells = ((i, j) for i in range(columns) for j in range(rows))
+    return tuple(sorted(cells, key=lambda cell: (abs(cell[0] - cell[1]), cell)))
+
+
+def start(
+    size: Floats, orientation: Floats, number: Value, *, level: float, col: float, row: float
+) -> Floats:
+    """Compute where a block begins: on the diagonal of the floor, then beside it, then above [m].
+
+    Source:
+        CausalWorld 1.2, ``towers.py``; there the diagonal is all there is, and the blocks rise
+        by half of their height when it is full, into one another.
+    """
+    first = [max(0.0, min(CORNER, EDGE - 0.5 * edge)) for edge in size[:2].tolist()]
+    step = [edge + GAP for edge in size[:2].tolist()]
+    fits = [int(2.0 * f / s + 1e-9) + 1 for f, s in zip(first, step, strict=True)]
+    index = int((level * number[1] + col) * number[0] + row)
+    layer, cell = divmod(index, fits[0] * fits[1])
+    i, j = _cells(*fits)[cell]
+    height = layer * float(size[2]) + lowest_point(size, orientation)
+    return np.array([i * step[0] - first[0], j * step[1] - first[1], height])
+
+
+@final
+class Towers(Building):
+    """A cuboid on the floor, cut into equal blocks.
+
+    Its size, its place and into how many blocks it is cut along each axis are variables. The
+    blocks begin beside one another on the floor, and do so again whenever their size changes.
 
     Args:
-        piece: Where they come from.
-        name: Of the two, without what tells them apart.
-        which: The constants that say which one it is.
-        airborne: Whether blocks may begin in the air, as in the predecessor.
+        tool_block_mass: Default mass of a block [kg].
+        number_of_blocks_in_tower: Default number of blocks along x, y and z.
+        tower_dims: Default size of the tower [m].
+        tower_center: Default place of the middle of its base, x and y [m].
+        common: Options of every task; see ``Common``.
     """
-    constants = {**dict(which), "airborne": float(airborne)}
-    size, place, start, turn = (_bound(one, constants) for one in vars(piece).values())
-    (tool, mine), (goal, its) = (
-        (body, numbers.PART_SIZES.declare(f"{body}.size", None, "Full edge lengths.", **size))
-        for body in (f"tool_{name}", f"goal_{name}")
+
+    name = "towers"
+    decided_by = (NUMBER,)
+    goal_causes = (NUMBER, MASS, DIMS, CENTER)
+    piece = Piece(
+        size=(part, DIMS, NUMBER), place=(place, DIMS, NUMBER, CENTER), start=(start, NUMBER)
     )
-    block = ToolBlock(
-        tool,
-        size=mine,
-        mass=block_mass(f"{tool}.mass", MASS),
-        spawn=start["mechanism"],
-        spawn_from=start["parents"],
-        spawn_again=True,
-        spaces=numbers.places(numbers.half_height(mine.name), airborne=airborne),
-    )
-    pose = goal_position(goal, **place), goal_orientation(goal, **turn)
-    return block, GoalBlock(goal, size=its, pose=pose, yaw=False)
 
+    def __init__(
+        self,
+        *,
+        tool_block_mass: float = numbers.BLOCKS_MASS,
+        number_of_blocks_in_tower: Counts = (1, 1, 5),
+        tower_dims: tuple[float, float, float] = (0.035, 0.035, 0.175),
+        tower_center: tuple[float, float] = (0.0, 0.0),
+        **common: Unpack[Common],
+    ) -> None:
+        super().__init__(**common)
+        self.roots = (
+            blocks_mass(tool_block_mass),
+            numbers.TOWER_COUNT.option(
+                NUMBER,
+                number_of_blocks_in_tower,
+                "How many blocks the tower has along x, y and z.",
+            ),
+            numbers.TOWER_DIMS.option(DIMS, tower_dims, "Full edge lengths of the tower."),
+            numbers.TOWER_CENTER.option(
+                CENTER, tower_center, "Where the middle of its base is, x and y."
+            ),
+        )
 
-def boxes_apart(tips: Floats, *values: Floats) -> Floats:
-    """Compute minus the distances of boxes, given as size, position and quaternion each."""
-    half = len(values) // 2
-    total = np.zeros(tips.shape[:-1])
-    fingers = tips.reshape(*tips.shape[:-1], 3, 3)
-    for first in range(0, half, 3):
-        box, goal = (values[at : at + 3] for at in (first, half + first))
-        gaps = np.linalg.norm(corners(*box) - corners(*goal), axis=-1)
-        reach = np.linalg.norm(fingers - box[1][..., None, :], axis=-1)
-        total += gaps.mean(axis=-1) + NEAR * reach.mean(axis=-1)
-    return -total / (half // 3)
+    def arrange(self, values: Values) -> Counts:
+        """Count the blocks along each axis."""
+        x, y, z = (int(count) for count in values[NUMBER])
+        return x, y, z
 
-
-def corners(size: Floats, position: Floats, orientation: Floats) -> Floats:
-    """Compute the corners of boxes, shape (..., 8, 3) [m]."""
-    body = CORNERS * size[..., None, :]
-    found: Floats = position[..., None, :] + body @ np.swapaxes(
-        rotation_matrix(orientation), -1, -2
-    )
-    return found
+    def parts(self) -> Iterable[Part]:
+        """List the blocks, level by level, column by column."""
+        for level, col, row in np.ndindex(*reversed(self.arranged)):
+            which = {"level": float(level), "col": float(col), "row": float(row)}
+            yield f"level_{level}_col_{col}_row_{row}", which

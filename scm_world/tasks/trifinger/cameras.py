@@ -2,44 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from scm_world._types import Floats
 from scm_world.models.camera import Camera, Vector, Views, camera_from, down_and_forward
 from scm_world.models.scene import Scene
 from scm_world.tasks.trifinger.hardware import JOINT_LOW, TABLE_OFFSET
 
+_PUBLISHED: Mapping[str, tuple[Vector, tuple[float, float, float, float]]] = {
+    "60": ((0.2496, 0.2458, 0.58 - TABLE_OFFSET), (0.3760, 0.8690, -0.2918, -0.1354)),
+    "120": ((0.0047, -0.2834, 0.58 - TABLE_OFFSET), (0.9655, -0.0098, -0.0065, -0.2603)),
+    "300": ((-0.2470, 0.2513, 0.50 - TABLE_OFFSET), (-0.3633, 0.8686, -0.3141, 0.1220)),
+}
+POSES = {
+    name: (np.array(eye), np.divide(turn, np.linalg.norm(turn)))
+    for name, (eye, turn) in _PUBLISHED.items()
+}
+"""Position of each camera, z from the table top [m], and its unit quaternion (x, y, z, w)."""
 
-def _above_table(eye: Vector) -> Vector:
-    return eye[0], eye[1], eye[2] - TABLE_OFFSET
-
-
-_PUBLISHED: tuple[tuple[str, Vector, tuple[float, float, float, float]], ...] = (
-    ("60", (0.2496, 0.2458, 0.58), (0.3760, 0.8690, -0.2918, -0.1354)),
-    ("120", (0.0047, -0.2834, 0.58), (0.9655, -0.0098, -0.0065, -0.2603)),
-    ("300", (-0.2470, 0.2513, 0.50), (-0.3633, 0.8686, -0.3141, 0.1220)),
-)
-
-
-def published_poses() -> dict[str, tuple[Floats, Floats]]:
-    """Return the poses of ``CAMERAS`` as ``camera_from`` takes them.
-
-    Returns:
-        By name: the position, z from the table top, shape (3,) [m], and the unit quaternion
-        (x, y, z, w), shape (4,).
-
-    Example:
-        >>> position, orientation = published_poses()["60"]
-        >>> camera_from("60", position, orientation) == CAMERAS[0]
-        True
-    """
-    return {
-        name: (np.array(_above_table(eye)), np.divide(turn, np.linalg.norm(turn)))
-        for name, eye, turn in _PUBLISHED
-    }
-
-
-CAMERAS = tuple(camera_from(name, *pose) for name, pose in published_poses().items())
+CAMERAS = tuple(camera_from(name, *pose) for name, pose in POSES.items())
 """The three cameras of the real robot, upright and looking along their optical axes.
 
 Source:
@@ -47,9 +29,9 @@ Source:
 """
 
 ORIGINAL_CAMERAS = tuple(
-    Camera(name, _above_table(eye), _above_table(forward), down)
-    for name, eye, orientation in _PUBLISHED
-    for down, forward in (down_and_forward(orientation),)
+    Camera(name, eye, (x, y, z - TABLE_OFFSET), down)
+    for name, (eye, turn) in _PUBLISHED.items()
+    for down, (x, y, z) in (down_and_forward(turn),)
 )
 """The same cameras as CausalWorld 1.2 realises them.
 

@@ -18,6 +18,9 @@ from scm_world.variables import Derived, Exogenous, Function, Measured, Variable
 from scm_world.variables.kinds import parent_of
 from scm_world.variables.spaces import Affine, Bound, Box, Categories, Integers, Rotations
 
+Causes = str | tuple[Any, ...]
+"""The name of a variable to copy, or ``(function, "parent", …)``: a function of their values."""
+
 
 def same(parent: Floats) -> Floats:
     """Copy the value of the parent."""
@@ -27,15 +30,16 @@ def same(parent: Floats) -> Floats:
 @final
 @dataclass(frozen=True)
 class Range:
-    """What variables of one kind have in common.
+    """Common properties of variables of one kind.
 
     Attributes:
-        bounds: What is physically possible.
+        bounds: The physically possible values.
         a: The training space.
         b: The held-out space.
-        unit: Of each number.
-        shape: Of the value.
-        dtype: Of the value.
+        unit: Unit of each number.
+        shape: Shape of the value.
+        dtype: Type of the value.
+        doc: One sentence, unless a declaration has its own.
     """
 
     bounds: Any
@@ -44,38 +48,37 @@ class Range:
     unit: str = "1"
     shape: tuple[int, ...] = ()
     dtype: Literal["real", "integer", "categorical"] = "real"
+    doc: str = ""
 
-    def declare(
-        self,
-        name: str,
-        default: Any,
-        doc: str,
-        parents: tuple[str, ...] = (),
-        mechanism: Any = None,
-        **more: Any,
+    def root(self, name: str, default: Any, doc: str = "") -> Variable:
+        """Declare a variable without causes."""
+        fields = {**vars(self), "name": name, "doc": doc or self.doc}
+        return Exogenous(default=default, **fields)
+
+    def derived(
+        self, name: str, causes: Causes, doc: str = "", constants: Any = None, inverse: Any = None
     ) -> Variable:
-        """Declare a variable of this kind: a root, or a function of parents, by default a copy."""
-        fields = {"name": name, "doc": doc, **vars(self), **more}
-        if not parents:
-            return Exogenous(default=default, **fields)
-        return Derived(parents=parents, mechanism=mechanism or Function(same), **fields)
+        """Declare a copy of a variable, or a function of variables and of constants."""
+        function, *parents = (same, causes) if isinstance(causes, str) else causes
+        mechanism = Function(function, constants=constants or {})
+        fields = {**vars(self), "name": name, "doc": doc or self.doc, "inverse": inverse}
+        return Derived(parents=tuple(parents), mechanism=mechanism, **fields)
 
     def state(
-        self, name: str, default: Any, doc: str, on_set: Iterable[str] = (), **how: Any
+        self, name: str, default: Any, doc: str = "", on_set: Iterable[str] = (), **how: Any
     ) -> Measured:
-        """Declare what physics moves; ``on_set`` names what moves it when it is set."""
+        """Declare a quantity of physics; ``on_set`` names what moves it when that is set."""
         parents = tuple(parent_of(cause, 0, "set") for cause in on_set)
-        fields = {"settable_state": True, "parents": parents, **vars(self), **how}
-        return Measured(name=name, default=default, doc=doc, **fields)
+        fields = {**vars(self), "doc": doc or self.doc, "settable_state": True, **how}
+        return Measured(name=name, default=default, parents=parents, **fields)
 
-    def option(self, name: str, value: Any, doc: str, option: str = "") -> Variable:
+    def option(self, name: str, value: Any, doc: str = "", option: str = "") -> Variable:
         """Declare a root whose default is an option of the task, by default of the same name.
 
         Raises:
             UnknownOption: It is out of bounds.
         """
-        default = checked(option or name, value, self.bounds, shape=self.shape)
-        return self.declare(name, default, doc)
+        return self.root(name, checked(option or name, value, self.bounds, shape=self.shape), doc)
 
 
 # --- places and their spaces ---------------------------------------------------------------------
@@ -110,16 +113,14 @@ def places(low: Bound, *, airborne: bool) -> tuple[Box, Box]:
     return cylindrical(RADIUS_A, low, tops[0]), cylindrical(RADIUS_B, low, tops[1])
 
 
-# --- goal families whose blocks follow from a few numbers -----------------------------------------
-BLOCKS_MASS = 0.08  # [kg]
-DROP_REGION = ((-0.11, -0.11, 0.0), (0.11, 0.11, 0.22))  # [m]
-
 # --- kinds of variables: bounds, A, B; those of what the predecessor hides are ours ---------------
 RESTITUTION = Range(Box(0.0, 0.8), Box(0.0, 0.3), Box(0.3, 0.6))
 SPINNING = Range(Box(0.0, 0.1), Box(0.0, 0.002), Box(0.002, 0.01), unit="m")
 NOISE = Range(Box(0.0, 1.0), Box(0.0, 0.01), Box(0.01, 0.05))
 ROBOT_HEIGHT = Range(Box(0.2, 0.6), Box(0.33, 0.35), Box(0.35, 0.36), unit="m")
-BLOCK_SIZES = Range(Box(0.02, 0.2), Box(0.055, 0.075), Box(0.075, 0.095), unit="m", shape=(3,))
+BLOCK_SIZES = Range(
+    Box(0.02, 0.2), Box(0.055, 0.075), Box(0.075, 0.095), "m", (3,), doc="Full edge lengths."
+)
 TOWER_COUNT = Range(Integers(1, 6), Integers(1, 4), Integers(4, 6), shape=(3,), dtype="integer")
 TOWER_DIMS = Range(Box(0.02, 0.24), Box(0.08, 0.12), Box(0.12, 0.20), unit="m", shape=(3,))
 TOWER_CENTER = Range(Box(-0.15, 0.15), Box(-0.1, 0.05), Box(0.05, 0.1), unit="m", shape=(2,))
@@ -127,7 +128,11 @@ MIN_SIZE = Range(Box(0.02, 0.1), Box(0.035, 0.065), Box(0.065, 0.075), unit="m")
 LEVEL_WIDTH = Range(Box(0.02, 0.3), Box(0.035, 0.12), Box(0.12, 0.15), unit="m")
 NUMS_OBJECTS = Range(Integers(1, 9), Integers(1, 5), Integers(6, 9), dtype="integer")
 DROPPED_SIZE = Range(Box(0.02, 0.1), Box(0.05, 0.07), Box(0.04, 0.05), unit="m")
-COLOR = Range(Box(0.0, 1.0), Box(0.0, 0.5), Box(0.5, 1.0), shape=(3,))
+COLOR = Range(  # A is dark and B is bright, as in the paper
+    *(Box(0.0, 1.0), Box(0.0, 0.5), Box(0.5, 1.0)),
+    shape=(3,),
+    doc="Red, green and blue; nothing physical depends on it.",
+)
 GRAVITIES = Range(  # A and B of the paper; its code has no space
     Box(-30.0, 30.0),
     Box((0.0, 0.0, -10.0), (0.0, 0.0, -7.0)),
@@ -136,9 +141,16 @@ GRAVITIES = Range(  # A and B of the paper; its code has no space
     (3,),
 )
 FRICTION = Range(Box(0.0, 2.0), Box(0.3, 0.6), Box(0.6, 0.8))
-BLOCK_FRICTIONS = Range(Box(0.0, 2.0), Box(0.6, 1.0), Box(1.0, 1.4))
+BLOCK_FRICTIONS = Range(
+    *(Box(0.0, 2.0), Box(0.6, 1.0), Box(1.0, 1.4)),
+    doc="Friction of its surface; a contact has the product of two frictions.",
+)
 LINK_MASSES = Range(Box(0.005, 5.0), Box(0.015, 0.045), Box(0.045, 0.100), "kg")
-BLOCK_MASSES = Range(Box(0.001, 2.0), Box(0.015, 0.045), Box(0.045, 0.100), "kg")
+BLOCK_MASSES = Range(
+    *(Box(0.001, 2.0), Box(0.015, 0.045), Box(0.045, 0.100)),
+    unit="kg",
+    doc="Mass; the inertia of the solid follows from it.",
+)
 SHARED_MASSES = Range(Box(0.001, 2.0), Box(0.02, 0.06), Box(0.06, 0.08), "kg")
 JOINT_DAMPING = Range(Box(0.0, 0.5), Box(0.0, 0.01), Box(0.01, 0.03), "N m s/rad")
 POSITION_GAINS = Range(Box(0.0, 50.0), Box(8.0, 12.0), Box(12.0, 15.0), "N m/rad", (3,))
@@ -169,13 +181,25 @@ POLAR = Range(
     Box((RADIUS_B[0], -math.pi), (RADIUS_B[1], math.pi)),
     "m, rad",
     (2,),
+    doc="Radius and angle of its center; the height follows from the size.",
 )
-POSITIONS = Range(POSITION_BOUNDS, unit="m", shape=(3,))
-ORIENTATIONS = Range(QUATERNION_BOUNDS, shape=(4,))
-YAWS, TURNS = Range(None, _YAW, _YAW, "rad", (3,)), Range(None, unit="rad", shape=(3,))
-"""Rotation vectors with the turns about z as their spaces, and without spaces."""
-LINEAR_VELOCITIES = Range(Box(-10.0, 10.0), unit="m/s", shape=(3,))
-ANGULAR_VELOCITIES = Range(Box(-100.0, 100.0), unit="rad/s", shape=(3,))
+POSITIONS = Range(POSITION_BOUNDS, unit="m", shape=(3,), doc="Position of the center.")
+ORIENTATIONS = Range(
+    QUATERNION_BOUNDS, shape=(4,), doc="Orientation as a unit quaternion (x, y, z, w)."
+)
+TURNS = Range(
+    QUATERNION_BOUNDS,
+    shape=(4,),
+    doc="Orientation as a unit quaternion (x, y, z, w) with w >= 0.",
+)
+YAWS = Range(  # rotation vectors with the turns about z as their spaces
+    *(None, _YAW, _YAW, "rad", (3,)),
+    doc="Orientation as a rotation vector; setting it sets the quaternion.",
+)
+LINEAR_VELOCITIES = Range(Box(-10.0, 10.0), unit="m/s", shape=(3,), doc="Velocity of the center.")
+ANGULAR_VELOCITIES = Range(
+    Box(-100.0, 100.0), unit="rad/s", shape=(3,), doc="Angular velocity in the world frame."
+)
 JOINTS = Range(
     Box((-1.67, -1.67, -3.24) * 3, (1.67, 1.67, 3.24) * 3),
     Box((-1.57, -1.2, -3.0) * 3, (-0.69, 0.0, 0.0) * 3),
@@ -183,27 +207,16 @@ JOINTS = Range(
     "rad",
 )
 """The stops at a quarter and half a turn, and 0.1 rad that a joint may press into them."""
-PART_SIZES = Range(Box(0.005, 0.3), unit="m", shape=(3,))
+PART_SIZES = Range(Box(0.005, 0.3), unit="m", shape=(3,), doc="Full edge lengths.")
 """Edges of a block that is a part of something."""
-OBSTACLE_SIZES = Range(Box(0.005, 0.6), unit="m", shape=(3,))
+OBSTACLE_SIZES = Range(Box(0.005, 0.6), unit="m", shape=(3,), doc="Full edge lengths.")
 
 # --- defaults ------------------------------------------------------------------------------
-GRAVITY = (0.0, 0.0, -9.81)  # [m/s²]
 SURFACE_FRICTION = 0.5
-BLOCK_FRICTION = 1.0
 BLOCK_MASS = 0.02  # [kg]
+BLOCKS_MASS = 0.08  # [kg] in families whose blocks follow from a few numbers
 BLOCK_SIZE = (0.065, 0.065, 0.065)  # [m]
-FLOOR_COLOR = (0.31, 0.27, 0.25)
-STAGE_COLOR = (0.95, 0.95, 0.95)
-BLOCK_COLOR = (1.0, 0.0, 0.0)
 GOAL_COLOR = (0.0, 1.0, 0.0)
 OBSTACLE_SIZE = (0.01, 0.01, 0.01)  # [m]
-FINGER_FRICTION = 0.5
-SPINNING_FRICTION = 0.001
+ZERO = (0.0, 0.0, 0.0)
 IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion (x, y, z, w)
-
-
-def color(name: str, default: tuple[float, float, float]) -> Variable:
-    """Declare a color. Space A is dark and B is bright, as in the paper."""
-    doc = "Red, green and blue; nothing physical depends on it."
-    return COLOR.declare(name, default, doc)

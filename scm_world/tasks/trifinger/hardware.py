@@ -19,16 +19,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import final
+from typing import NamedTuple, final
 
-from scm_world.errors import UnknownOption
 from scm_world.variables import Box, part_of
 
 FINGERS = ("60", "120", "300")
 """The fingers, in the order of every joint vector."""
-
-LINKS_PER_FINGER = 4
-"""Link 0 is the fixed finger base, 1 the upper, 2 the middle and 3 the lower link."""
 
 N_JOINTS = 9
 
@@ -62,8 +58,7 @@ TIP_MASS = 0.01  # [kg] in the origin of its frame
 TIP_INERTIA = (1.66666666667e-07,) * 3  # [kg m²]
 
 
-@dataclass(frozen=True)
-class Inertial:
+class Inertial(NamedTuple):
     """How the mass of a link is spread.
 
     Attributes:
@@ -91,8 +86,7 @@ INERTIAL = (
 )
 
 
-@dataclass(frozen=True)
-class Capsule:
+class Capsule(NamedTuple):
     """A collision shape: all points within ``radius`` of a segment in the frame of the link [m]."""
 
     start: tuple[float, float, float]
@@ -130,9 +124,8 @@ def link_name(finger: str, index: int) -> str:
     return f"robot_finger_{finger}_link_{index}"
 
 
-LINK_NAMES = tuple(link_name(finger, i) for finger in FINGERS for i in range(LINKS_PER_FINGER))
-"""All links, finger by finger."""
-
+LINK_NAMES = tuple(link_name(finger, i) for finger in FINGERS for i in range(4))
+"""Finger by finger: 0 is the fixed base, 1 the upper, 2 the middle and 3 the lower link."""
 
 RESOLUTIONS = ("vector", "finger", "joint")
 """Whether all joints, those of a finger, or each are a variable; the first is the default."""
@@ -201,62 +194,42 @@ def joints_of(resolution: str) -> tuple[JointGroup, ...]:
 TIMESTEP = 0.004  # [s] the unit in which ``frame_skip`` counts, for every preset
 
 
-@dataclass(frozen=True)
-class ControllerSpec:
-    """Published gains of a proportional-derivative law with a safety filter.
+POSITION_GAINS = (10.0, 10.0, 10.0)  # [N m/rad] of the three joints of a finger
+VELOCITY_GAINS = (0.1, 0.3, 0.001)  # [N m s/rad]
+SAFETY_DAMPING = (0.08, 0.08, 0.04)  # [N m s/rad] of the safety filter
+TORQUE_LIMIT = 0.36  # [N m]
+"""Published gains of a proportional-derivative law with a safety filter.
 
-    The law is evaluated at every physics step. In ``joint_positions`` mode, with target q*,
-    position q and velocity v of a joint::
+The law is evaluated at every physics step. In ``joint_positions`` mode, with target q*, position q
+and velocity v of a joint::
 
-        tau = clip(clip(kp (q* - q) - kd v, ±limit) - safety v, ±limit)
+    tau = clip(clip(kp (q* - q) - kd v, ±limit) - safety v, ±limit)
 
-    In ``joint_torques`` mode the inner clip is applied to the commanded torque instead.
+In ``joint_torques`` mode the inner clip is applied to the commanded torque instead.
 
-    Attributes:
-        kp: Position gain of the three joints of a finger [N m/rad].
-        kd: Velocity gain [N m s/rad].
-        safety: Damping of the safety filter [N m s/rad].
-        limit: Largest torque [N m].
-
-    Source:
-        CausalWorld 1.2, ``envs/robot/trifinger.py`` (the law in force there).
-    """
-
-    kp: tuple[float, float, float] = (10.0, 10.0, 10.0)
-    kd: tuple[float, float, float] = (0.1, 0.3, 0.001)
-    safety: tuple[float, float, float] = (0.08, 0.08, 0.04)
-    limit: float = 0.36
+Source:
+    CausalWorld 1.2, ``envs/robot/trifinger.py`` (the law in force there).
+"""
 
 
-@dataclass(frozen=True)
-class Preset:
+class Preset(NamedTuple):
     """Numerical settings that every backend understands in its own way.
 
     Attributes:
         name: ``"fast"`` or ``"precise"``.
         timestep: Physics step [s].
+        contact: Time constant [s] and damping ratio of contacts.
+        sliding: The same for friction between blocks, floor and stage.
     """
 
     name: str
     timestep: float
+    contact: tuple[float, float]
+    sliding: tuple[float, float]
 
 
-FAST = Preset("fast", 0.004)
-PRECISE = Preset("precise", 0.002)
+FAST = Preset("fast", 0.004, contact=(0.010, 1.0), sliding=(0.04, 1.0))
+PRECISE = Preset("precise", 0.002, contact=(0.004, 1.0), sliding=(0.02, 1.0))
 
 PRESETS = {preset.name: preset for preset in (FAST, PRECISE)}
-
-PRESET_NAMES = tuple(PRESETS)
-"""What the categories of ``timestep_preset`` stand for."""
-
-
-def preset(name: str) -> Preset:
-    """Return a preset by its name.
-
-    Raises:
-        UnknownOption: There is no such preset.
-    """
-    try:
-        return PRESETS[name]
-    except KeyError:
-        raise UnknownOption("preset", name, PRESETS) from None
+"""By name, in the order of the categories of ``timestep_preset``."""

@@ -19,8 +19,7 @@ Source:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import final
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -47,9 +46,7 @@ _BASE_X = tuple(_COS_WORLD * x - _SIN_WORLD * y for x, y, _ in hardware.FINGER_O
 _BASE_Y = tuple(_SIN_WORLD * x + _COS_WORLD * y for x, y, _ in hardware.FINGER_OFFSET)  # [m]
 
 
-@final
-@dataclass(frozen=True)
-class Solution:
+class Solution(NamedTuple):
     """Joint positions for three targets of the fingertips.
 
     Attributes:
@@ -125,41 +122,27 @@ def _clip(value: float, joint: int) -> float:
 
 
 @njit(cache=True)
-def _branch(x: float, y: float, z: float, side: float, bend: float) -> tuple[float, float, float]:
-    """Solve one finger, without regard to the bounds, for a target in the frame of its base [m].
-
-    ``side`` is -1 where the leg points down in its plane and 1 where it points up; ``bend`` is the
-    sign of the last joint.
-    """
-    across = math.hypot(y, z)
-    down = side * math.sqrt(max(across - _LATERAL, 0.0)) * math.sqrt(across + _LATERAL)
-    q0 = _wrap(math.atan2(down, -_LATERAL) - math.atan2(z, y))
-    reach = math.hypot(x, down)
-    missing = math.sqrt(max(2.0 * _LEG - reach, 0.0)) * math.sqrt(2.0 * _LEG + reach)
-    q2 = bend * 2.0 * math.atan2(missing, reach)
-    q1 = _wrap(math.atan2(-x, -down) - q2 / 2.0)
-    return q0, q1, q2
-
-
-@njit(cache=True)
-def _solve(x: float, y: float, z: float, near: Floats, i: int, joint_positions: Floats) -> bool:
-    """Solve one finger in the frame of its base; see ``inverse`` for what is chosen."""
-    best_gap, best_turn, best_reached = math.inf, math.inf, False
+def _solve(x: float, y: float, z: float, near: Floats, found: Floats) -> bool:
+    """Solve one finger for a target in the frame of its base [m]; see ``inverse``."""
+    across, best = math.hypot(y, z), (1.0, math.inf)
     for branch in range(4):
-        q0, q1, q2 = _branch(x, y, z, -1.0 if branch < 2 else 1.0, -1.0 if branch % 2 else 1.0)
+        # The leg points down or up in its plane; the last joint is bent one way or the other.
+        side, bend = -1.0 if branch < 2 else 1.0, -1.0 if branch % 2 else 1.0
+        down = side * math.sqrt(max(across - _LATERAL, 0.0)) * math.sqrt(across + _LATERAL)
+        q0 = _wrap(math.atan2(down, -_LATERAL) - math.atan2(z, y))
+        reach = math.hypot(x, down)
+        missing = math.sqrt(max(2.0 * _LEG - reach, 0.0)) * math.sqrt(2.0 * _LEG + reach)
+        q2 = bend * 2.0 * math.atan2(missing, reach)
+        q1 = _wrap(math.atan2(-x, -down) - q2 / 2.0)
         q0, q1, q2 = _clip(q0, 0), _clip(q1, 1), _clip(q2, 2)
         tip_x, tip_y, tip_z = _place(q0, q1, q2, -_LATERAL, 1.0, 1.0)
         gap = math.hypot(math.hypot(tip_x - x, tip_y - y), tip_z - z)
-        turn = (q0 - near[i]) ** 2 + (q1 - near[i + 1]) ** 2 + (q2 - near[i + 2]) ** 2
-        reached = gap <= REACHED_TOLERANCE
-        if reached:
-            better = not best_reached or turn < best_turn
-        else:
-            better = not best_reached and gap < best_gap
-        if better:
-            best_gap, best_turn, best_reached = gap, turn, reached
-            joint_positions[i], joint_positions[i + 1], joint_positions[i + 2] = q0, q1, q2
-    return best_reached
+        turn = (q0 - near[0]) ** 2 + (q1 - near[1]) ** 2 + (q2 - near[2]) ** 2
+        rank = (0.0, turn) if gap <= REACHED_TOLERANCE else (1.0, gap)
+        if rank < best:
+            best = rank
+            found[0], found[1], found[2] = q0, q1, q2
+    return best[0] == 0.0
 
 
 @njit(cache=True)
@@ -177,7 +160,8 @@ def inverse_kernel(
         y = _COS[finger] * forth - _SIN[finger] * right
         z = targets[i + 2] - height + _OFFSET
         finite = math.isfinite(x) and math.isfinite(y) and math.isfinite(z)
-        reached[finger] = finite and _solve(x, y, z, near, i, joint_positions)
+        mine = slice(i, i + 3)
+        reached[finger] = finite and _solve(x, y, z, near[mine], joint_positions[mine])
     return joint_positions, reached
 
 
@@ -192,11 +176,10 @@ def forward(joint_positions: ArrayLike, height: float) -> Floats:
         The origins of the three tip frames, shape (9,) [m], z from the table top.
 
     Example:
-        >>> from scm_world.tasks.trifinger import hardware
         >>> forward(hardware.REST, hardware.NOMINAL_HEIGHT)[:3].round(4).tolist()
         [-0.0595, 0.1586, 0.0559]
     """
-    tips: Floats = forward_kernel(_nine(joint_positions, "joint_positions"), float(height))
+    tips: Floats = forward_kernel(_nine(joint_positions), float(height))
     return tips
 
 
@@ -222,7 +205,6 @@ def inverse(targets: ArrayLike, height: float, near: ArrayLike) -> Solution:
         Joint positions within the bounds, and which fingers reach their targets.
 
     Example:
-        >>> from scm_world.tasks.trifinger import hardware
         >>> tips = forward(hardware.REST, hardware.NOMINAL_HEIGHT)
         >>> solution = inverse(tips, hardware.NOMINAL_HEIGHT, near=hardware.REST)
         >>> bool(np.allclose(solution.joint_positions, hardware.REST)), solution.reached.tolist()
@@ -230,13 +212,9 @@ def inverse(targets: ArrayLike, height: float, near: ArrayLike) -> Solution:
         >>> inverse(np.full(9, 2.0), hardware.NOMINAL_HEIGHT, hardware.REST).reached.tolist()
         [False, False, False]
     """
-    wanted, close = _nine(targets, "targets"), _nine(near, "near")
-    return Solution(*inverse_kernel(wanted, float(height), close))
+    return Solution(*inverse_kernel(_nine(targets), float(height), _nine(near)))
 
 
-def _nine(values: ArrayLike, name: str) -> Floats:
+def _nine(values: ArrayLike) -> Floats:
     """Copy nine numbers, so that the kernels are compiled for one kind of array only."""
-    array = np.array(values, dtype=np.float64)
-    if array.shape != (3 * N_FINGERS,):
-        raise ValueError(f"{name}: expected shape ({3 * N_FINGERS},), got {array.shape}")
-    return array
+    return np.array(values, dtype=np.float64).reshape(3 * N_FINGERS)

@@ -24,18 +24,15 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends import Capabilities, EngineSnapshot, register
-from scm_world.backends.base import InMemory
+from scm_world.backends.base import EngineSnapshot, InMemory
 from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
 from scm_world.geometry.rotations import quaternion_product, to_rotation_vector
 from scm_world.models.scene import Difference, Parameters, Scene
-from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping.bodies import turn_about_z
+from scm_world.tasks.trifinger.hardware import N_JOINTS
 from scm_world.tasks.trifinger.kinematics import forward, inverse
-from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.system import TriFinger
+from scm_world.tasks.trifinger.system import PhysicalState, TriFinger
 
-CUBE = 0.065  # [m] edge of the platform's cube
 TURN = math.radians(-48.0)  # of this package's world about z, so that the fingers lie alike
 NEAR, SMALL = 1e-4, 1e-6  # [m] of inverse kinematics, [rad] of derivatives
 OWN: Mapping[str, Any] = {
@@ -50,7 +47,6 @@ of bounds here): an intervention that sets them, on any backend, tells how much 
 
 
 @final
-@register
 class TriFingerPlatform(InMemory):
     """One cube and the TriFinger Pro, for playing policies.
 
@@ -64,8 +60,8 @@ class TriFingerPlatform(InMemory):
     """
 
     name: ClassVar[str] = "trifinger_platform"
-    capabilities: ClassVar[Capabilities] = Capabilities()
     _platform: Any
+    _played: tuple[tuple[Floats, int], ...]
 
     def __init__(self) -> None:
         if find_spec("trifinger_simulation") is None:
@@ -78,12 +74,11 @@ class TriFingerPlatform(InMemory):
         Raises:
             UnknownOption: It is no scene with one cube, or a value is not the platform's.
         """
-        structure = scene.structure
-        if not isinstance(structure, TriFinger) or (
-            len(structure.blocks), structure.obstacles, structure.hulls
-        ) != (1, (), ()):  # fmt: skip
-            raise UnknownOption("scene of the TriFinger platform", structure, ("one cube",))
-        self._fits(scene.structure, scene.parameters)
+        has = scene.structure
+        is_one = isinstance(has, TriFinger) and len(has.blocks) == 1
+        if not is_one or has.obstacles or has.hulls:
+            raise UnknownOption("scene of the TriFinger platform", has, ("one cube",))
+        self._fits(has, scene.parameters)
         super().build(scene)
         self._begin()
 
@@ -113,22 +108,20 @@ class TriFingerPlatform(InMemory):
             self._start()
             for earlier in self._played:
                 self._play(*earlier)
-        self._played.append((np.array(command), substeps))
+        self._played += ((np.array(command), substeps),)
         self._play(command, substeps)
         if not np.isfinite(self._state.vector).all():
             raise EngineFailure("a number is not finite", self.name)
 
     def snapshot(self) -> EngineSnapshot:
         """Save where the platform began, and all commands since."""
-        scene = Scene(self.structure, dict(self._parameters), self._state.copy())
-        return EngineSnapshot.of(self, (scene, self._first.copy(), list(self._played)))
+        return EngineSnapshot.of(self, (super().snapshot(), self._first, self._played))
 
     def restore(self, snapshot: EngineSnapshot) -> None:
         """Go back to a snapshot; the commands before it are repeated with the next step."""
         scene, first, played = snapshot.opened(self)
-        super().restore(EngineSnapshot.of(self, scene))
-        self._begin()
-        self._first, self._played[:] = first.copy(), played
+        super().restore(scene)
+        self._platform, self._first, self._played = None, first, played
 
     def close(self) -> None:
         """Disconnect the platform's simulation; a step would begin it again."""
@@ -149,29 +142,21 @@ class TriFingerPlatform(InMemory):
                 raise UnknownOption(asked, np.asarray(value).tolist(), (str(only),))
 
     def _begin(self) -> None:
-        self._platform = None
-        self._first = self._state.copy()
-        self._played: list[tuple[Floats, int]] = []
+        self._platform, self._first, self._played = None, self._state.copy(), ()
 
     def _start(self) -> None:
         """Make the platform as the first state and the parameters say."""
+        import pybullet
         from trifinger_simulation import TriFingerPlatform as Platform
         from trifinger_simulation.tasks.move_cube import Pose
 
         first: PhysicalState = self._first
         pose = Pose(turned(first.positions[0], 1), turned_orientations(first.orientations[0], 1))
-        usual = np.array(Platform.spaces.robot_position.default, dtype=np.float64)
         self._platform = Platform(initial_object_pose=pose)
         robot = self._platform.simfinger
-        self._joints = self._posed(first.joint_positions, usual)
+        self._joints = self._posed(first.joint_positions, Platform.spaces.robot_position.default)
         robot.reset_finger_positions_and_velocities(self._joints)
-        self._write(robot)
         self._seen: tuple[float, Floats, Floats] | None = None
-
-    def _write(self, robot: Any) -> None:
-        """Write the parameters that the platform's simulation can have."""
-        import pybullet
-
         found, client = self._parameters, robot._pybullet_client_id
 
         def write(bodies: Iterable[tuple[Any, int]], name: str, **more: float) -> None:
@@ -201,11 +186,8 @@ class TriFingerPlatform(InMemory):
         self._joints = np.array(robot.position)
         state: Any = self._state
         here = self._ours(self._joints, state.joint_positions)
-        slopes = np.zeros((hardware.N_JOINTS, hardware.N_JOINTS))
-        for joint in range(hardware.N_JOINTS):
-            other = self._joints.copy()
-            other[joint] += SMALL
-            slopes[:, joint] = (self._ours(other, here) - here) / SMALL
+        moved = (self._ours(self._joints + SMALL * unit, here) for unit in np.eye(N_JOINTS))
+        slopes = np.column_stack([(other - here) / SMALL for other in moved])
         state.joint_positions[:] = here
         state.joint_velocities[:] = slopes @ np.array(robot.velocity)
         state.joint_torques[:] = np.linalg.lstsq(slopes.T, np.array(robot.torque), rcond=None)[0]

@@ -15,25 +15,30 @@ from scm_world.tasks.base import Goal, Observed, checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, weighted
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import hardware, kernels, shaping
-from scm_world.tasks.trifinger.base import TriFingerTask, observe, observe_position
-from scm_world.tasks.trifinger.entities.goals import goal_sphere
-from scm_world.tasks.trifinger.entities.obstacles import (
+from scm_world.tasks.trifinger import hardware, kernels
+from scm_world.tasks.trifinger.base import ROWS, TriFingerTask, observe
+from scm_world.tasks.trifinger.entities.bodies import (
     COUNT,
+    body,
     obstacle_names,
+    orientation,
+    position,
     scattered,
     scattering,
 )
+from scm_world.tasks.trifinger.kernels import PLACES, SMOOTHNESS, TIPS, TIPS_WAS
 from scm_world.tasks.trifinger.kinematics import inverse
-from scm_world.tasks.trifinger.shaping import SMOOTHNESS, TIPS, WAS
-from scm_world.variables import Cylinder, Draw, Function, Integers, Measured, Variable
+from scm_world.variables import Box, Cylinder, Draw, Function, Integers, Measured, Variable
 from scm_world.variables.kinds import SpaceName
 
 REACHED = 0.01  # [m] mean error of a coordinate that counts as success
 FAR = 0.03  # [m] mean error at which the fractional success is zero
 
 GOALS = tuple(f"goal_{finger}" for finger in hardware.FINGERS)
-PLACES = tuple(f"{name}.cartesian_position" for name in GOALS)
+_SIZES = numbers.Range(
+    *(Box(0.005, 0.2), None, None, "m", (3,)),
+    doc="Diameter, three times; only pictures and the lowest height of A and B use it.",
+)
 _TINTS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -59,12 +64,6 @@ def minus_norm(torques: Floats) -> float:
     return -math.sqrt(total)
 
 
-@njit(cache=True)
-def minus_distance(tips: Floats, goal_60: Floats, goal_120: Floats, goal_300: Floats) -> float:
-    """Compute minus the distance of the tips from their goals [m]."""
-    return -kernels.reach_distance(tips, goal_60, goal_120, goal_300)
-
-
 @final
 class Reaching(TriFingerTask):
     """Three points in the air, one for each fingertip.
@@ -79,14 +78,14 @@ class Reaching(TriFingerTask):
 
     name = "reaching"
     default_weights, dense_terms = weighted(
-        (100_000.0, "tips_to_goals", kernels.reach_progress, (TIPS, WAS, *PLACES)),
-        (0.0, "distance", minus_distance, (TIPS, *PLACES)),
+        (100_000.0, "tips_to_goals", kernels.reach_progress, (TIPS, TIPS_WAS, *PLACES)),
+        (0.0, "distance", kernels.minus_reach_distance, (TIPS, *PLACES)),
         (0.0, "torque", minus_norm, ("joint_torques",)),
         (0.0, *SMOOTHNESS),
         fraction=1.0,
     )
     paper_weights = {FRACTION: 0.0}  # noqa: RUF012 # a constant
-    ready_terms = shaping.REACHING
+    ready_terms = kernels.REACHING
     seconds = 5.0
     decided_by = (COUNT,)
     goal_causes = tuple(f"{name}.cylindrical_position" for name in GOALS)
@@ -113,9 +112,12 @@ class Reaching(TriFingerTask):
         return int(values[COUNT])
 
     def entities(self) -> Iterable[Entity]:
-        """Three goals, and obstacles."""
+        """Three balls of 3 cm that the fingertips should reach, and obstacles."""
         for name, place, tint in zip(GOALS, self._places, _TINTS, strict=True):
-            yield goal_sphere(name, place, tint)
+            size = _SIZES.root(f"{name}.size", (0.03,) * 3)
+            pose = position(name, default=place), orientation(name)
+            spaces = numbers.places(numbers.half_height(size.name), airborne=True)
+            yield body("sphere", name, size, *pose, color=tint, spaces=spaces)
         yield from scattered(self.arranged)
 
     def readouts(self) -> Iterable[Variable]:
@@ -145,13 +147,13 @@ class Reaching(TriFingerTask):
         )
         yield from self.terms
         weights = dict(self.weights)
-        if self.conventions.distance_as_reward:
+        if self.conventions.published:
             weights["reach_error"] = weights.pop(FRACTION)
         yield reward(weights)
 
     def observed(self) -> Iterable[Observed]:
         """Observe the three goals and the obstacles."""
-        yield from map(observe_position, GOALS)
+        yield from (Observed(place, *ROWS["cartesian_position"]) for place in PLACES)
         for name in obstacle_names(self.arranged):
             yield from observe(name, 10)
 
@@ -197,6 +199,4 @@ def error_of(tips: ArrayLike, goals: ArrayLike) -> Floats:
 
 def fraction_of(tips: ArrayLike, goals: ArrayLike) -> Floats:
     """Compute how near tips are to their goals, in [0, 1], shape (...)."""
-    return np.asarray(
-        1.0 - (np.clip(error_of(tips, goals), REACHED, FAR) - REACHED) / (FAR - REACHED)
-    )
+    return np.asarray(np.vectorize(nearness)(error_of(tips, goals), REACHED, FAR))

@@ -15,56 +15,28 @@ from scm_world.tasks.trifinger.platform import turned, turned_orientations
 if TYPE_CHECKING:
     import pandas as pd
 
-COLUMNS: Mapping[str, str] = {
-    "joint_positions": "robot_observation.position",
-    "joint_velocities": "robot_observation.velocity",
-    "joint_torques": "robot_observation.torque",
-    "end_effector_positions": "robot_observation.fingertip_position",
-    "fingertip_forces": "robot_observation.fingertip_force",
-    "tool_block.cartesian_position": "camera_observation.object_position",
-    "tool_block.orientation": "camera_observation.object_orientation",
-    "goal_block.cartesian_position": "desired_goal",
-    "camera.delay": "camera_observation.delay",
-    "camera.confidence": "camera_observation.confidence",
-    "robot_id": "robot_observation.robot_id",
-    "action": "actions",
-    "reward": "rewards",
-}
-"""Columns of the table, and their sources; vectors are ``NAME[0]``, ``NAME[1]``, …"""
+_PARTS = (
+    ("achieved_goal", 0, ""),
+    ("action", 9, ""),
+    ("camera_observation.confidence", 1, "camera.confidence"),
+    ("camera_observation.delay", 1, "camera.delay"),
+    ("camera_observation.object_keypoints", 24, ""),
+    ("camera_observation.object_orientation", 4, "tool_block.orientation"),
+    ("camera_observation.object_position", 3, "tool_block.cartesian_position"),
+    ("desired_goal", 0, "goal_block.cartesian_position"),
+    ("robot_observation.fingertip_force", 3, "fingertip_forces"),
+    ("robot_observation.fingertip_position", 9, "end_effector_positions"),
+    ("robot_observation.fingertip_velocity", 9, ""),
+    ("robot_observation.position", 9, "joint_positions"),
+    ("robot_observation.robot_id", 1, "robot_id"),
+    ("robot_observation.torque", 9, "joint_torques"),
+    ("robot_observation.velocity", 9, "joint_velocities"),
+)
+"""Parts of an observation in the order in which Gymnasium flattens them, by names: how many numbers
+each has (0 stands for those of a goal), and its name in the table, if it is there."""
 
-_LAST = "robot_observation.velocity"
-_PLACE = "camera_observation.object_position"
-_FACING = "camera_observation.object_orientation"
-
-
-def _layout(goal: str) -> dict[str, slice]:
-    """Return the slices of a flat observation: as Gymnasium flattens, by names in order."""
-    length = {"object_position": 3, "object_keypoints": 24}[goal]
-    sizes = {
-        f"achieved_goal.{goal}": length,
-        "action": 9,
-        "camera_observation.confidence": 1,
-        "camera_observation.delay": 1,
-        "camera_observation.object_keypoints": 24,
-        _FACING: 4,
-        _PLACE: 3,
-        f"desired_goal.{goal}": length,
-        "robot_observation.fingertip_force": 3,
-        "robot_observation.fingertip_position": 9,
-        "robot_observation.fingertip_velocity": 9,
-        "robot_observation.position": 9,
-        "robot_observation.robot_id": 1,
-        "robot_observation.torque": 9,
-        _LAST: 9,
-    }
-    found, end = dict[str, slice](), 0
-    for name, size in sizes.items():
-        found[name], end = slice(end, end + size), end + size
-    return found
-
-
-_LAYOUTS = {goal: _layout(goal) for goal in ("object_position", "object_keypoints")}
-"""Of flat observations: 97 numbers of pushing, 139 of lifting."""
+_GOALS = {"object_position": 3, "object_keypoints": 24}
+"""Goals of pushing and of lifting, and their numbers: an observation has 97 or 139."""
 
 
 def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
@@ -88,7 +60,8 @@ def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
             ``indices``. An episode that is cut off is kept; its steps count from its first row.
 
     Returns:
-        Rows with ``episode``, ``step``, the columns ``COLUMNS`` and ``intervention_targets``.
+        Rows with ``episode``, ``step``, what was observed (vectors are ``NAME[0]``, ``NAME[1]``,
+        …), ``action``, ``reward`` and ``intervention_targets``.
 
     Raises:
         MissingExtra: pandas is not installed.
@@ -116,8 +89,8 @@ def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
         advice = "give what get_dataset() of trifinger_rl_datasets gives"
         raise UnreadableFile("the data", f"they lack {', '.join(missing)}", advice)
     parts = _parts(data["observations"])
-    n = len(parts["desired_goal"])
-    parts |= {"actions": _array(data, "actions", (n, 9)), "rewards": _array(data, "rewards", (n,))}
+    n = len(parts["robot_id"])
+    parts |= {"action": _array(data, "actions", (n, 9)), "reward": _array(data, "rewards", (n,))}
     ends = np.zeros(n, dtype=bool)
     for name in {"timeouts", "terminals"} & set(data):
         ends |= _array(data, name, (n,)) != 0.0
@@ -125,10 +98,9 @@ def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
     first = np.flatnonzero(np.diff(episode, prepend=-1))
     step = np.arange(n) - np.repeat(first, np.diff(first, append=n))
     columns: dict[str, Any] = {"episode": episode.astype(np.int64), "step": step}
-    for name, source in COLUMNS.items():
-        value = parts[source].reshape(n, -1)
-        size = value.shape[1]
-        columns |= {f"{name}[{i}]" if size > 1 else name: value[:, i] for i in range(size)}
+    for name, part in parts.items():
+        rows = part.reshape(n, -1).T
+        columns |= {f"{name}[{i}]" if len(rows) > 1 else name: row for i, row in enumerate(rows)}
     found: pd.DataFrame = pandas.DataFrame(columns).assign(intervention_targets=None)
     return found
 
@@ -147,42 +119,41 @@ def _array(data: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Floats
 
 
 def _parts(observations: Any) -> dict[str, Floats]:
-    """Return the parts of observations, each of shape (n, k), in this package's frame."""
+    """Return the parts of observations by their names in the table, in this package's frame."""
     nested = isinstance(observations, Sequence) and bool(observations)
     if nested and all(isinstance(row, Mapping) for row in observations):
-        goal = next(iter(observations[0].get("desired_goal", ())), "")
-        flat = _flattened(observations, _LAYOUTS.get(goal, _LAYOUTS["object_position"]))
-    else:
-        flat = np.asarray(observations)
-    layouts = {layout[_LAST].stop: goal for goal, layout in _LAYOUTS.items()}
-    if flat.ndim != 2 or flat.shape[1] not in layouts or flat.dtype.kind != "f" or not len(flat):
-        allowed = (*(f"shape (n, {width})" for width in layouts), "a list of whole dictionaries")
+        observations = _flattened(observations)
+    flat = np.asarray(observations)
+    widths = {sum(own or size for _, own, _ in _PARTS): size for size in _GOALS.values()}
+    if flat.ndim != 2 or flat.shape[1] not in widths or flat.dtype.kind != "f" or not len(flat):
+        allowed = (*(f"shape (n, {width})" for width in widths), "a list of whole dictionaries")
         raise UnknownOption("observations", f"{flat.dtype} of shape {flat.shape}", allowed)
-    goal = layouts[flat.shape[1]]
     flat = _array({"observations": flat}, "observations", flat.shape)
-    found = {name: flat[:, where] for name, where in _LAYOUTS[goal].items()}
-    if not np.allclose(np.linalg.norm(found[_FACING], axis=1), 1.0, atol=0.05):
+    ends = np.cumsum([size or widths[flat.shape[1]] for _, size, _ in _PARTS])
+    pieces = np.split(flat, ends[:-1], axis=1)
+    found = {name: piece for (*_, name), piece in zip(_PARTS, pieces, strict=True) if name}
+    facing, goal = "tool_block.orientation", "goal_block.cartesian_position"
+    if not np.allclose(np.linalg.norm(found[facing], axis=1), 1.0, atol=0.05):
         allowed = ("observations in SI units: make the environment with scale_obs=False",)
         raise UnknownOption("orientation of the cube", "no unit quaternion", allowed)
-    place = found[f"desired_goal.{goal}"]
-    found["desired_goal"] = place.reshape(len(place), -1, 3).mean(axis=1)
-    for name in ("robot_observation.fingertip_position", _PLACE, "desired_goal"):
-        points = found[name]
-        found[name] = turned(points.reshape(len(points), -1, 3), -1).reshape(points.shape)
-    found[_FACING] = turned_orientations(found[_FACING], -1)
+    found[goal] = found[goal].reshape(len(flat), -1, 3).mean(axis=1)
+    for name in ("end_effector_positions", "tool_block.cartesian_position", goal):
+        found[name] = turned(found[name].reshape(len(flat), -1, 3), -1).reshape(len(flat), -1)
+    found[facing] = turned_orientations(found[facing], -1)
     return found
 
 
-def _flattened(rows: Sequence[Mapping[str, Any]], layout: Mapping[str, slice]) -> Floats:
+def _flattened(rows: Sequence[Mapping[str, Any]]) -> Floats:
     """Return dictionaries as flat observations."""
-    flat = np.empty((len(rows), layout[_LAST].stop))
-    for name, where in layout.items():
-        first, _, second = name.partition(".")
-        for number, row in enumerate(rows):
-            part = row.get(first, {})
+    goal = next(iter(rows[0].get("desired_goal", ())), "")
+    goal, found = goal if goal in _GOALS else "object_position", []
+    for number, row in enumerate(rows):
+        for name, size, _ in _PARTS:
+            first, _, second = name.partition(".")
+            part, second = row.get(first, {}), second if size else goal
             part = np.ravel(part.get(second, ()) if second else part)
-            if part.shape != (size := where.stop - where.start,):
+            if part.shape != (size := size or _GOALS[goal],):
                 given = f"{len(part)} numbers in observation {number}"
                 raise UnknownOption(name, given, (f"{size}, as flatten_obs=False gives",))
-            flat[number, where] = part
-    return flat
+            found.append(part)
+    return np.concatenate(found).reshape(len(rows), -1)

@@ -14,7 +14,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import InterventionError
-from scm_world.tasks.base import ProbeGenerator, Scenario
+from scm_world.tasks.base import Scenario
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import WALL_RADIUS
@@ -25,91 +25,18 @@ CLEARANCE = 2e-4  # [m] how far apart bodies are put that are about to touch
 LOOSE = 1.5e-3  # [m] the same for blocks on one another, which do not stand quite straight
 HIGHEST = 6  # blocks that are stacked
 REACH = 0.045  # [m] from here up all three fingers can press on something in the middle
+ORIGIN = np.zeros(2)
+PLACES = "obstacle_places"
 
-Setting = tuple[dict[str, Value], Floats]
+States = dict[str, Value]
+Setting = tuple[States, Floats]
 """States to set, and the fingertip positions that the robot then drives at, shape (9,) [m]."""
-
-
-# --- where bodies are ---------------------------------------------------------------------------
-
-
-def sizes(world: Any) -> Floats:
-    """List the edge lengths of the blocks, shape (n, 3) [m]."""
-    return np.array([world[f"{name}.size"] for name in world.composition.blocks]).reshape(-1, 3)
-
-
-def above(world: Any, name: str) -> tuple[Floats, float]:
-    """Return x and y of something upright, and the height of its upper face [m]."""
-    center = world[f"{name}.cartesian_position"]
-    return np.array(center[:2]), float(center[2] + world[f"{name}.size"][2] / 2)
-
-
-def touched(
-    world: Any,
-    rng: ProbeGenerator,
-    middle: Floats,
-    bottom: float,
-    heights: tuple[float, float],
-    yaw: float,
-) -> tuple[dict[str, Value], Floats, float]:
-    """Stand the first block somewhere, with all three fingertips about to touch it.
-
-    The block is turned by up to ``yaw`` [rad], and touched between two parts of its height.
-    Return the states to set, the direction in which each finger stands [rad], and their height [m].
-    """
-    name, size = world.composition.blocks[0], sizes(world)[0]
-    angles = facing(rng)
-    height = bottom + rng.uniform(*heights) * size[2]
-    clear = float(np.hypot(size[0], size[1])) / 2 + TIP + CLEARANCE  # at any yaw
-    states = {
-        f"{name}.cartesian_position": np.array([*middle, bottom + size[2] / 2]),
-        f"{name}.euler_orientation": np.array([0.0, 0.0, rng.uniform(-yaw, yaw)]),
-        "joint_positions": joints_for(world, around(middle, clear, angles, height)),
-    }
-    return states, angles, height
-
-
-def pressed(
-    world: Any, rng: ProbeGenerator, middle: Floats, bottom: float, count: int = HIGHEST
-) -> Setting:
-    """Stack the first blocks and let the fingers press on one of them that they reach."""
-    edges = sizes(world)[:HIGHEST][:count]
-    states = stacked(world, rng, middle, bottom, count=count)
-    middles = bottom + np.cumsum(edges[:, 2]) - edges[:, 2] / 2
-    which = int(np.flatnonzero(middles >= min(REACH, middles[-1]))[0])
-    height = float(middles[which]) + rng.uniform(-0.2, 0.2) * edges[which, 2]
-    angles = facing(rng)
-    # Just beyond the faces of a block that is hardly turned.
-    across = np.abs(np.stack([np.cos(angles), np.sin(angles)], axis=-1))
-    reach = ((edges[which, :2] / 2 + TIP + LOOSE) / np.maximum(across, 1e-9)).min(axis=-1)
-    states["joint_positions"] = joints_for(world, around(middle, reach, angles, height))
-    return states, around(middle, rng.uniform(0.0, 0.01), angles + 0.4, height - 0.01)
-
-
-def stacked(
-    world: Any,
-    rng: ProbeGenerator,
-    middle: Floats,
-    bottom: float,
-    yaw: float = 0.0,
-    count: int = HIGHEST,
-) -> dict[str, Value]:
-    """Stand the first blocks on one another, not quite straight."""
-    states: dict[str, Value] = {}
-    names = world.composition.blocks[:HIGHEST][:count]
-    for name, size in zip(names, sizes(world), strict=False):
-        place = middle + rng.uniform(-0.001, 0.001, 2)
-        turn = yaw + rng.uniform(-0.05, 0.05)
-        states[f"{name}.cartesian_position"] = np.array([*place, bottom + size[2] / 2])
-        states[f"{name}.euler_orientation"] = np.array([0.0, 0.0, turn])
-        bottom += size[2]
-    return states
 
 
 # --- where fingers are --------------------------------------------------------------------------
 
 
-def facing(rng: ProbeGenerator) -> Floats:
+def facing(rng: Any) -> Floats:
     """Return the direction in which each finger stands, with a little spread [rad]."""
     tips = np.array([[-0.05945, 0.15864], [0.16711, -0.02783], [-0.10766, -0.13080]])
     directions: Floats = np.arctan2(tips[:, 1], tips[:, 0]) + rng.uniform(-0.2, 0.2, 3)
@@ -131,26 +58,122 @@ def present_tips(world: Any) -> Floats:
 
 def joints_for(world: Any, tips: Floats) -> Floats:
     """Compute joint positions for fingertip positions, near the resting pose, shape (9,) [rad]."""
-    near = np.array(hardware.REST)
-    return inverse(tips, float(world["robot_height"]), near).joint_positions
+    return inverse(tips, float(world["robot_height"]), hardware.REST).joint_positions
 
 
-def fingers_at(world: Any, rng: ProbeGenerator, tips: Floats) -> dict[str, Value]:
+def fingers_at(world: Any, rng: Any, tips: Floats) -> States:
     """Put the fingertips somewhere, and the blocks out of their way, unless it is not free."""
-    states: dict[str, Value] = {"joint_positions": joints_for(world, tips)}
+    states: States = {"joint_positions": joints_for(world, tips)}
     if not world.composition.obstacles:  # one may stand in the middle
         states |= stacked(world, rng, ORIGIN, 0.0)
     return states
 
 
-ORIGIN = np.zeros(2)
-PLACES = "obstacle_places"
+# --- where blocks are ---------------------------------------------------------------------------
 
 
-# --- one block, or none -------------------------------------------------------------------------
+def sizes(world: Any) -> Floats:
+    """Return the edge lengths of the blocks that are stacked, shape (n, 3) [m]."""
+    names = world.composition.blocks[:HIGHEST]
+    return np.array([world[f"{name}.size"] for name in names]).reshape(-1, 3)
 
 
-def touch(world: Any, rng: ProbeGenerator) -> Setting:
+def above(world: Any, name: str) -> tuple[Floats, float]:
+    """Return x and y of something upright, and the height of its upper face [m]."""
+    center = world[f"{name}.cartesian_position"]
+    return np.array(center[:2]), float(center[2] + world[f"{name}.size"][2] / 2)
+
+
+def stacked(
+    world: Any,
+    rng: Any,
+    middle: Floats,
+    bottom: float,
+    yaw: float = 0.0,
+    count: int = HIGHEST,
+) -> States:
+    """Stand the first blocks on one another, not quite straight."""
+    states: States = {}
+    for name, size in zip(world.composition.blocks, sizes(world)[:count], strict=False):
+        place = middle + rng.uniform(-0.001, 0.001, 2)
+        turn = yaw + rng.uniform(-0.05, 0.05)
+        states[f"{name}.cartesian_position"] = np.array([*place, bottom + size[2] / 2])
+        states[f"{name}.euler_orientation"] = np.array([0.0, 0.0, turn])
+        bottom += size[2]
+    return states
+
+
+def pressed(world: Any, rng: Any, middle: Floats, bottom: float, count: int = HIGHEST) -> Setting:
+    """Stack the first blocks and let the fingers press on one of them that they reach."""
+    edges = sizes(world)[:count]
+    states = stacked(world, rng, middle, bottom, count=count)
+    middles = bottom + np.cumsum(edges[:, 2]) - edges[:, 2] / 2
+    which = int(np.flatnonzero(middles >= min(REACH, middles[-1]))[0])
+    height = float(middles[which]) + rng.uniform(-0.2, 0.2) * edges[which, 2]
+    angles = facing(rng)
+    # Just beyond the faces of a block that is hardly turned.
+    across = np.abs(np.stack([np.cos(angles), np.sin(angles)], axis=-1))
+    reach = ((edges[which, :2] / 2 + TIP + LOOSE) / np.maximum(across, 1e-9)).min(axis=-1)
+    states["joint_positions"] = joints_for(world, around(middle, reach, angles, height))
+    return states, around(middle, rng.uniform(0.0, 0.01), angles + 0.4, height - 0.01)
+
+
+def touched(
+    world: Any,
+    rng: Any,
+    middle: Floats,
+    bottom: float,
+    heights: tuple[float, float],
+    yaw: float,
+) -> tuple[States, Floats, float]:
+    """Stand the first block somewhere, with all three fingertips about to touch it.
+
+    The block is turned by up to ``yaw`` [rad], and touched between two parts of its height.
+    Return the states to set, the direction in which each finger stands [rad], and their height [m].
+    """
+    name, size = world.composition.blocks[0], sizes(world)[0]
+    angles = facing(rng)
+    height = bottom + rng.uniform(*heights) * size[2]
+    clear = float(np.hypot(size[0], size[1])) / 2 + TIP + CLEARANCE  # at any yaw
+    states = {
+        f"{name}.cartesian_position": np.array([*middle, bottom + size[2] / 2]),
+        f"{name}.euler_orientation": np.array([0.0, 0.0, rng.uniform(-yaw, yaw)]),
+        "joint_positions": joints_for(world, around(middle, clear, angles, height)),
+    }
+    return states, angles, height
+
+
+# --- the robot, and one block -------------------------------------------------------------------
+
+
+def free(world: Any, rng: Any) -> Setting:
+    """Change nothing; the robot drives somewhere."""
+    return {}, present_tips(world) + rng.uniform(-0.05, 0.05, 9)
+
+
+def finger_on_floor(world: Any, rng: Any) -> Setting:
+    """Put the fingertips on the floor and let them rub it."""
+    angles, radius = facing(rng), rng.uniform(0.1, 0.13)
+    states = fingers_at(world, rng, around(ORIGIN, radius, angles, TIP + CLEARANCE))
+    return states, around(ORIGIN, radius - 0.02, angles + 0.2, -0.02)
+
+
+def finger_at_wall(world: Any, rng: Any) -> Setting:
+    """Put the fingertips at the ring wall and let them rub it."""
+    angles, height = facing(rng), rng.uniform(0.08, 0.14)
+    states = fingers_at(world, rng, around(ORIGIN, WALL_RADIUS - TIP - 3e-3, angles, height))
+    return states, around(ORIGIN, WALL_RADIUS + 0.03, angles + 0.15, height + 0.02)
+
+
+def fingers_together(world: Any, rng: Any) -> Setting:
+    """Put the fingertips side by side in the middle and let them press on one another."""
+    angles, middle = facing(rng), rng.uniform(-0.02, 0.02, 2)
+    height = rng.uniform(0.05, 0.1)
+    states = fingers_at(world, rng, around(middle, 1.3 * TIP, angles, height))
+    return states, around(middle, 0.0, angles, height + rng.uniform(-0.02, 0.02))
+
+
+def touch(world: Any, rng: Any) -> Setting:
     """Stand the first block amid the fingers and let all three press on it."""
     middle = rng.uniform(-0.02, 0.02, 2)
     states, angles, _ = touched(world, rng, middle, 0.0, (0.3, 0.8), yaw=0.8)
@@ -158,17 +181,7 @@ def touch(world: Any, rng: ProbeGenerator) -> Setting:
     return states, drive
 
 
-def on_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
-    """Stand the blocks on the first obstacle and let all three fingers press on one."""
-    center, bottom = above(world, world.composition.obstacles[0])
-    middle = center + rng.uniform(-0.002, 0.002, 2)
-    if len(world.composition.blocks) > 1:
-        return pressed(world, rng, middle, bottom)
-    states, angles, height = touched(world, rng, middle, bottom, (0.4, 0.7), yaw=0.1)
-    return states, around(middle, rng.uniform(0.0, 0.02), angles + 0.4, height - 0.02)
-
-
-def block_in_air(world: Any, rng: ProbeGenerator) -> Setting:
+def block_in_air(world: Any, rng: Any) -> Setting:
     """Drop the first block, tumbling."""
     name = world.composition.blocks[0]
     states = {
@@ -180,62 +193,43 @@ def block_in_air(world: Any, rng: ProbeGenerator) -> Setting:
     return states, present_tips(world)
 
 
-def free(world: Any, rng: ProbeGenerator) -> Setting:
-    """Change nothing; the robot drives somewhere."""
-    return {}, present_tips(world) + rng.uniform(-0.05, 0.05, 9)
-
-
-def finger_on_floor(world: Any, rng: ProbeGenerator) -> Setting:
-    """Put the fingertips on the floor and let them rub it."""
-    angles, radius = facing(rng), rng.uniform(0.1, 0.13)
-    states = fingers_at(world, rng, around(ORIGIN, radius, angles, TIP + CLEARANCE))
-    return states, around(ORIGIN, radius - 0.02, angles + 0.2, -0.02)
-
-
-def finger_at_wall(world: Any, rng: ProbeGenerator) -> Setting:
-    """Put the fingertips at the ring wall and let them rub it."""
-    angles, height = facing(rng), rng.uniform(0.08, 0.14)
-    states = fingers_at(world, rng, around(ORIGIN, WALL_RADIUS - TIP - 3e-3, angles, height))
-    return states, around(ORIGIN, WALL_RADIUS + 0.03, angles + 0.15, height + 0.02)
-
-
-def fingers_together(world: Any, rng: ProbeGenerator) -> Setting:
-    """Put the fingertips side by side in the middle and let them press on one another."""
-    angles, middle = facing(rng), rng.uniform(-0.02, 0.02, 2)
-    height = rng.uniform(0.05, 0.1)
-    states = fingers_at(world, rng, around(middle, 1.3 * TIP, angles, height))
-    return states, around(middle, 0.0, angles, height + rng.uniform(-0.02, 0.02))
-
-
 # --- all blocks ---------------------------------------------------------------------------------
 
 
-def tower(world: Any, rng: ProbeGenerator) -> Setting:
+def tower(world: Any, rng: Any) -> Setting:
     """Stand the blocks on one another and let the fingers press on one of them."""
     return pressed(world, rng, rng.uniform(-0.01, 0.01, 2), 0.0)
 
 
-def block_at_wall(world: Any, rng: ProbeGenerator) -> Setting:
+def on_obstacle(world: Any, rng: Any) -> Setting:
+    """Stand the blocks on the first obstacle and let all three fingers press on one."""
+    center, bottom = above(world, world.composition.obstacles[0])
+    middle = center + rng.uniform(-0.002, 0.002, 2)
+    if len(world.composition.blocks) > 1:
+        return pressed(world, rng, middle, bottom)
+    states, angles, height = touched(world, rng, middle, bottom, (0.4, 0.7), yaw=0.1)
+    return states, around(middle, rng.uniform(0.0, 0.02), angles + 0.4, height - 0.02)
+
+
+def block_at_wall(world: Any, rng: Any) -> Setting:
     """Slide the blocks along the wall, on one another."""
-    size = sizes(world)[0]
+    size, names = sizes(world)[0], world.composition.blocks[:HIGHEST]
     angle = rng.uniform(-np.pi, np.pi)
     out, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     radius = np.sqrt((WALL_RADIUS - 3e-3) ** 2 - (size[1] / 2) ** 2) - size[0] / 2
     velocity = 0.6 * out + rng.uniform(0.2, 0.5) * along
-    several = len(world.composition.blocks) > 1
-    inward = 4e-3 if several else 0.0  # they are not quite straight
+    inward = 4e-3 if len(names) > 1 else 0.0  # they are not quite straight
     states = stacked(world, rng, (radius - inward) * out, CLEARANCE, angle)
-    for name in world.composition.blocks[:HIGHEST]:
-        states[f"{name}.linear_velocity"] = np.array([*velocity, 0.0])
+    states |= {f"{name}.linear_velocity": np.array([*velocity, 0.0]) for name in names}
     return states, present_tips(world)
 
 
-def solved(world: Any, rng: ProbeGenerator) -> Setting:
+def solved(world: Any, rng: Any) -> Setting:
     """Begin where the goal is fulfilled."""
     return world.task.solution(world.values()), present_tips(world)
 
 
-def leaving(world: Any, rng: ProbeGenerator) -> Setting:
+def leaving(world: Any, rng: Any) -> Setting:
     """Begin where the goal is fulfilled, with the blocks on their way up."""
     states, tips = solved(world, rng)
     for name in world.composition.blocks:
@@ -247,7 +241,7 @@ def leaving(world: Any, rng: ProbeGenerator) -> Setting:
 # --- what may come into being -------------------------------------------------------------------
 
 
-def on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
+def on_newcomer(world: Any, rng: Any) -> Setting:
     """Stand some blocks where a further one would come into being, and press on one of them.
 
     High towers may be out of the fingers' reach there, so how many there are is drawn.
@@ -259,33 +253,12 @@ def on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
     return pressed(world, rng, *place, some)
 
 
-def all_on_newcomer(world: Any, rng: ProbeGenerator) -> Setting:
+def all_on_newcomer(world: Any, rng: Any) -> Setting:
     """Stand all blocks where a further one would come into being; the robot stays where it is."""
     place = _newcomer(world)
     if place is None:
         return tower(world, rng)
     return stacked(world, rng, *place), present_tips(world)
-
-
-def on_coming_obstacle(world: Any, rng: ProbeGenerator) -> Setting:
-    """Set the next obstacle into the middle, and press on blocks above it."""
-    places, here = np.array(world[PLACES]), len(world.composition.obstacles)
-    edge = numbers.OBSTACLE_SIZE[2]
-    middle = rng.uniform(-0.01, 0.01, 2)
-    places[here] = [*middle, edge / 2]
-    states, drive = pressed(world, rng, middle, edge)
-    return {PLACES: places, **states}, drive
-
-
-def obstacle_ahead(world: Any, rng: ProbeGenerator) -> Setting:
-    """Set obstacles, should there be any, to where the fingers are about to go."""
-    tips = present_tips(world).reshape(3, 3)
-    places = np.array(world[PLACES])
-    inward = -tips * [1.0, 1.0, 0.0] / np.linalg.norm(tips[:, :2], axis=1, keepdims=True)
-    each = bool(world.compiled.bundles)  # then it matters in front of which finger one comes
-    ahead = tips + inward * (TIP + rng.uniform(0.0056, 0.008 if each else 0.006))
-    places[:3] = np.roll(ahead, int(rng.uniform(0.0, 3.0)), axis=0) if each else ahead
-    return {PLACES: places}, (tips + 0.05 * inward).ravel()
 
 
 def _newcomer(world: Any) -> tuple[Floats, float] | None:
@@ -303,54 +276,63 @@ def _newcomer(world: Any) -> tuple[Floats, float] | None:
     return None
 
 
+def on_coming_obstacle(world: Any, rng: Any) -> Setting:
+    """Set the next obstacle into the middle, and press on blocks above it."""
+    places, edge = np.array(world[PLACES]), numbers.OBSTACLE_SIZE[2]
+    middle = rng.uniform(-0.01, 0.01, 2)
+    places[len(world.composition.obstacles)] = [*middle, edge / 2]
+    states, drive = pressed(world, rng, middle, edge)
+    return {PLACES: places, **states}, drive
+
+
+def obstacle_ahead(world: Any, rng: Any) -> Setting:
+    """Set obstacles, should there be any, to where the fingers are about to go."""
+    tips, places = present_tips(world).reshape(3, 3), np.array(world[PLACES])
+    inward = -tips * [1.0, 1.0, 0.0] / np.linalg.norm(tips[:, :2], axis=1, keepdims=True)
+    each = bool(world.compiled.bundles)  # then it matters in front of which finger one comes
+    ahead = tips + inward * (TIP + rng.uniform(0.0056, 0.008 if each else 0.006))
+    places[:3] = np.roll(ahead, int(rng.uniform(0.0, 3.0)), axis=0) if each else ahead
+    return {PLACES: places}, (tips + 0.05 * inward).ravel()
+
+
 # --- which there are ----------------------------------------------------------------------------
 
-Kind = tuple[Callable[[Any, ProbeGenerator], Setting], int | None]
-"""How a state is prepared, and how many control steps are then taken; see ``Scenario``."""
-
-_WITHOUT_BLOCKS: tuple[Kind, ...] = (
-    (free, None),
-    (finger_on_floor, None),
-    (finger_at_wall, None),
-    (solved, 0),
-)
-_WITH_BLOCK: tuple[Kind, ...] = (
-    (touch, None),
-    (free, None),
-    (block_at_wall, 0),  # a block hits the wall once
-    (finger_on_floor, None),
-    (touch, None),
-    (block_in_air, 0),
-    (finger_at_wall, None),
-    (solved, 0),
-    (leaving, 1),  # a goal that is fulfilled is left in one step
-)
-_WITH_BLOCKS: tuple[Kind, ...] = (
-    (tower, None),
-    *_WITH_BLOCK[:4],
-    (tower, None),
-    *_WITH_BLOCK[5:],
-)
+STEPS: dict[Callable[[Any, Any], Setting], int] = {
+    on_newcomer: 0,
+    all_on_newcomer: 0,
+    on_coming_obstacle: 0,
+    obstacle_ahead: 0,
+    block_at_wall: 0,  # a block hits the wall once
+    block_in_air: 0,
+    solved: 0,
+    leaving: 1,  # a goal that is fulfilled is left in one step
+}
+"""How many control steps are taken after a state is prepared, where they are not drawn."""
 
 
-def scenarios(world: Any) -> tuple[Scenario, ...]:
+def scenarios(world: Any) -> list[Scenario]:
     """List what can be tried in a world, the most telling first."""
-    made = world.composition
-    found = (_WITHOUT_BLOCKS, _WITH_BLOCK, _WITH_BLOCKS)[min(2, len(made.blocks))]
-    if made.blocks and world.task.decided_by:
-        found = ((on_newcomer, 0), (all_on_newcomer, 0), *found)
-    if made.blocks and made.obstacles:
-        found = ((on_obstacle, None), *found)
-    if PLACES in world.model and made.blocks:
-        found = ((on_coming_obstacle, 0), *found)
-    if PLACES in world.model:
-        found = (*found, (obstacle_ahead, 0))
-    if world.compiled.bundles and not made.blocks:  # else they act through blocks, too
-        found = (*found, (fingers_together, None))
-    return tuple(Scenario(prepare.__name__, prepare, driven, steps) for prepare, steps in found)
+    blocks, obstacles = world.composition.blocks, world.composition.obstacles
+    several, places = len(blocks) > 1, PLACES in world.model
+    found = [free, finger_on_floor, finger_at_wall, solved]
+    if blocks:
+        found = [tower] if several else []
+        found += [touch, free, block_at_wall, finger_on_floor, tower if several else touch]
+        found += [block_in_air, finger_at_wall, solved, leaving]
+    if blocks and world.task.decided_by:
+        found = [on_newcomer, all_on_newcomer, *found]
+    if blocks and obstacles:
+        found = [on_obstacle, *found]
+    if blocks and places:
+        found = [on_coming_obstacle, *found]
+    if places:
+        found.append(obstacle_ahead)
+    if world.compiled.bundles and not blocks:  # else they act through blocks, too
+        found.append(fingers_together)
+    return [(prepare, driven, STEPS.get(prepare)) for prepare in found]
 
 
-def driven(world: Any, drive: Floats, rng: ProbeGenerator) -> Floats:
+def driven(world: Any, drive: Floats, rng: Any) -> Floats:
     """Turn fingertip positions into an action of the world's mode, with a little variety."""
     if world.action_mode == "end_effector_positions":
         return np.asarray(drive + rng.uniform(-0.005, 0.005, 9))

@@ -1,39 +1,96 @@
-"""One block that should fill one goal of its shape."""
+"""The families with one block that should fill one goal of its shape."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar, final
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any, ClassVar, Unpack, final
 
 import numpy as np
 
-from scm_world._types import Floats
-from scm_world.errors import ModelError
+from scm_world._types import Floats, Value
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry import canonical, quaternion_product
 from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.hulls import Hull, extents
-from scm_world.tasks.base import checked
+from scm_world.tasks.base import checked, finite_numbers
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import Common
+from scm_world.tasks.rewards import FRACTION, Common, weighted
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import kernels, shapes
-from scm_world.tasks.trifinger.entities.blocks import (
-    ToolBlock,
-    block_mass,
+from scm_world.tasks.trifinger import kernels
+from scm_world.tasks.trifinger.base import TriFingerTask
+from scm_world.tasks.trifinger.catalogue import Causes
+from scm_world.tasks.trifinger.entities.bodies import (
+    Place,
+    Quaternion,
+    about_z,
     block_size,
+    body,
+    hull_on_the_floor,
     lowest_point,
+    obstacle,
+    orientation,
+    position,
     stand,
+    tool,
+    turned_on_the_floor,
 )
-from scm_world.tasks.trifinger.entities.goals import GoalBlock, goal_orientation
-from scm_world.tasks.trifinger.shapes import Place, Quaternion
-from scm_world.tasks.trifinger.shaping import TIPS
-from scm_world.tasks.trifinger.shaping import WAS as TIPS_WAS
-from scm_world.variables import Box, Fixed, Function, Parent, Variable
+from scm_world.tasks.trifinger.kernels import BLOCK, GOAL, TARGET, TIPS, TOOL, TURNED, WAS
+from scm_world.variables import Box, Fixed, Function, Switch, Variable
 from scm_world.variables.spaces import Bound
 
 SIZE = "block.size"
-TOOL = "tool_block"
-GOAL = "goal_block"
+
+
+def start_place(option: str, place: Place, below: float) -> tuple[float, float, float]:
+    """Read where a block begins: x and y of its center, and the height of its lowest point [m].
+
+    It stands on the floor if no z is given, and reaches so far ``below`` its center [m].
+
+    Raises:
+        UnknownOption: These are not two or three numbers, or it would reach below the floor.
+    """
+    x, y, *z = _read(option, place, (2, 3), ("x, y", "x, y, z [m]"))
+    height = z[0] - below if z else 0.0
+    if height < -1e-6:
+        raise UnknownOption(option, place, ("x, y", f"x, y and z >= {below:g} [m]"))
+    return x, y, max(height, 0.0)
+
+
+def floor_place(option: str, place: Place, height: float) -> tuple[float, float]:
+    """Read the place of something on the floor: radius [m] and angle [rad].
+
+    ``height`` is the only z of the center that can be given [m].
+
+    Raises:
+        UnknownOption: These are not two or three numbers, or it would not stand on the floor.
+    """
+    x, y, *z = _read(option, place, (2, 3), ("x, y", "x, y, z [m]"))
+    if z and abs(z[0] - height) > 1e-6:
+        raise UnknownOption(option, place, ("x, y", f"x, y, {height:g} [m]: it is on the floor"))
+    return math.hypot(x, y), math.atan2(y, x)
+
+
+def unit_quaternion(option: str, orientation: Quaternion) -> Quaternion:
+    """Read an orientation as a unit quaternion (x, y, z, w) with w >= 0.
+
+    Raises:
+        UnknownOption: These are not four numbers, or they are all zero.
+    """
+    allowed = ("a quaternion x, y, z, w",)
+    given = _read(option, orientation, (4,), allowed)
+    if not any(given):
+        raise UnknownOption(option, orientation, allowed)
+    x, y, z, w = canonical(np.array(given)).tolist()
+    return x, y, z, w
+
+
+def _read(option: str, given: Any, sizes: tuple[int, ...], allowed: tuple[str, ...]) -> list[float]:
+    numbers = finite_numbers(given)
+    if numbers is None or numbers.ndim != 1 or len(numbers) not in sizes:
+        raise UnknownOption(option, given, allowed)
+    return [*map(float, numbers)]
 
 
 class Alike(Common, total=False):
@@ -54,121 +111,97 @@ class Alike(Common, total=False):
     goal_block_orientation: Quaternion
 
 
-@final
-class OneBlock:
+class OneBlock(TriFingerTask):
     """A block and a goal of the same shape.
+
+    The blocks share the parent ``block.size``. An intervention on it keeps them alike; one on
+    the pose of one leaves the other where it is.
 
     Args:
         tool_block_position: Where the center of the block begins: x and y if it stands on the
             floor, or x, y and z [m].
-        options: Options of the task.
+        options: Of block, goal and every task; see ``Alike`` and ``Common``.
 
     Attributes:
-        common: The options that every task has.
-        shape: Shape of block and goal; None for a box.
-        targets: The goal, with the block that belongs there.
         place: x and y of the block at the start, and the height of its lowest point [m].
     """
 
-    targets: ClassVar[Mapping[str, str]] = {GOAL: TOOL}
+    options = Alike
+    targets: ClassVar[dict[str, str]] = {GOAL: TOOL}
+    ready_terms = kernels.ONE_BLOCK
 
-    def __init__(self, tool_block_position: Place, options: Alike) -> None:
-        self.common: Any = dict(options)
-        self.shape: Hull | None = self.common.pop("shape", None)
+    def __init__(self, tool_block_position: Place, **options: Unpack[Alike]) -> None:
+        common: Any = dict(options)
+        self.shape = common.pop("shape", None)
         if not (self.shape is None or isinstance(self.shape, Hull)):
             raise ModelError(
                 [f"shape must be a Hull: load_hull(path) or hull_of(points); {self.shape!r}"]
             )
-        self._corners = () if self.shape is None else (np.array(self.shape.vertices),)
-        mass = self.common.pop("tool_block_mass", numbers.BLOCK_MASS)
+        mass = common.pop("tool_block_mass", numbers.BLOCK_MASS)
         self._mass = checked("tool_block_mass", mass, numbers.BLOCK_MASSES.bounds)
-        self._turns = {name: self._turn(f"{name}_orientation") for name in (TOOL, GOAL)}
-        below = self.below(TOOL)
-        self.place = shapes.start_place("tool_block_position", tool_block_position, below)
-
-    def _turn(self, option: str) -> Quaternion:
-        """Read how a body begins turned; a hull is turned from the way its points were given."""
-        turn = shapes.unit_quaternion(option, self.common.pop(option, numbers.IDENTITY))
-        if self.shape is None:
-            return turn
-        x, y, z, w = canonical(quaternion_product(turn, self.shape.axes)).tolist()
-        return x, y, z, w
-
-    def causes(self, box: Iterable[str]) -> tuple[str, ...]:
-        """Return the variables that a goal is drawn for; a hull turns about the vertical only."""
-        turns = {} if self.shape is None else {f"{GOAL}.euler_orientation": f"{GOAL}.yaw"}
-        return tuple(turns.get(name, name) for name in box)
+        self._turns = dict[str, Quaternion]()
+        for name in (TOOL, GOAL):
+            option = f"{name}_orientation"
+            turn = unit_quaternion(option, common.pop(option, numbers.IDENTITY))
+            if self.shape is not None:  # it is turned from the way its points were given
+                x, y, z, w = canonical(quaternion_product(turn, self.shape.axes)).tolist()
+                turn = x, y, z, w
+            self._turns[name] = turn
+        self.place = start_place("tool_block_position", tool_block_position, self.below(TOOL))
+        super().__init__(**common)
+        if self.shape is not None:  # it turns about the vertical only
+            turns = {f"{GOAL}.euler_orientation": f"{GOAL}.yaw"}
+            self.goal_causes = tuple(turns.get(name, name) for name in self.goal_causes)
 
     def below(self, name: str) -> float:
         """Compute how far block or goal reaches below its center as it begins [m]."""
-        size, turn = np.array(numbers.BLOCK_SIZE), np.array(self._turns[name])
-        return lowest_point(size, turn, *self._corners)
+        corners = () if self.shape is None else (np.array(self.shape.vertices),)
+        return lowest_point(np.array(numbers.BLOCK_SIZE), np.array(self._turns[name]), *corners)
 
     def level(self, name: str) -> Bound:
         """Return the height of the center of block or goal on the floor, as a bound of a space."""
         return numbers.half_height(f"{name}.size") if self.shape is None else self.below(name)
 
-    def floor_polar(self, place: Place) -> tuple[float, float]:
-        """Turn the place of a goal on the floor into radius [m] and angle [rad]."""
-        return shapes.floor_place("goal_block_position", place, self.below(GOAL))
-
     def shared(self) -> Iterable[Variable]:
-        """One size for both, or one shape."""
+        """Declare one size, or one shape, for both."""
         if self.shape is None:
             yield block_size(SIZE)
             return
         for name in (TOOL, GOAL):
-            yield Fixed(
-                name=f"{name}.vertices",
-                unit="m",
-                shape=(len(self.shape.vertices), 3),
-                value=tuple(float(x) for corner in self.shape.vertices for x in corner),
-                doc="Corners of the convex shape, in the frame of its center of mass.",
-            )
+            doc = "Corners of the convex shape, in the frame of its center of mass."
+            yield _constant(f"{name}.vertices", self.shape.vertices, doc)
 
     def _size(self, name: str) -> Variable:
         if self.shape is None:
             return block_size(f"{name}.size", SIZE)
-        return Fixed(
-            name=f"{name}.size",
-            unit="m",
-            shape=(3,),
-            value=tuple(extents(self.shape).tolist()),
-            doc="Edge lengths of the box around the shape, in its own frame.",
-        )
+        doc = "Edge lengths of the box around the shape, in its own frame."
+        return _constant(f"{name}.size", extents(self.shape), doc)
 
-    def form(self, name: str) -> tuple[str, ...]:
-        """Name the variables that say how high block or goal is on the floor."""
-        form = "size" if self.shape is None else "vertices"
-        return f"{name}.{form}", f"{name}.orientation"
-
-    def tool(
+    def tool_block(
         self,
-        *,
+        *causes: str,
         spaces: tuple[Box, Box] | None = None,
         start: Function | None = None,
-        causes: tuple[str, ...] = (),
     ) -> Entity:
         """Describe the block.
 
         Args:
+            causes: Further causes of the place at the start, besides size, orientation and shape.
             spaces: A and B of its cylindrical position; those on the floor if None.
-            start: Where it begins, if that has further causes than size, orientation and shape.
-            causes: The further ones.
+            start: Where it begins; it stands at ``place`` if None.
         """
-        corners = () if self.shape is None else (f"{TOOL}.vertices",)
-        return ToolBlock(
+        return tool(
             TOOL,
-            size=self._size(TOOL),
-            mass=block_mass(f"{TOOL}.mass", default=self._mass),
-            spawn=start or Function(stand, constants={"place": self.place}),
-            spawn_from=(*corners, *causes),
-            spaces=spaces or numbers.places(self.level(TOOL), airborne=False),
+            self._size(TOOL),
+            numbers.BLOCK_MASSES.root(f"{TOOL}.mass", self._mass),
+            start=start or Function(stand, constants={"place": self.place}),
+            start_from=(*(() if self.shape is None else (f"{TOOL}.vertices",)), *causes),
+            turn=self._turns[TOOL],
             hull=self.shape,
-            orientation=self._turns[TOOL],
+            spaces=spaces or numbers.places(self.level(TOOL), airborne=False),
         )
 
-    def goal(
+    def goal_block(
         self,
         *place: Variable,
         spaces: tuple[Box, Box] | None = None,
@@ -182,34 +215,295 @@ class OneBlock:
             inverse: Cartesian position where a cylindrical one is set.
         """
         rest, box = self._turns[GOAL], self.shape is None
-        pose = (*place, goal_orientation(GOAL, default=rest))
+        pose = (*place, orientation(GOAL, default=rest))
         if not box:
             circle = Box(-np.pi, np.pi)
-            yaw = numbers.Range(circle, circle, circle, "rad").declare(
-                f"{GOAL}.yaw",
-                0.0,
-                "How far it is turned about the vertical from the way it rests.",
-            )
-            turn = Function(shapes.about_z, constants={"rest": rest})
-            pose = (*place, yaw, goal_orientation(GOAL, parents=(yaw.name,), mechanism=turn))
-        return GoalBlock(
-            GOAL,
-            size=self._size(GOAL),
-            pose=pose,
-            spaces=spaces or numbers.places(self.level(GOAL), airborne=False),
-            yaw=box,
-            hull=self.shape,
-            inverse=inverse,
+            doc = "How far it is turned about the vertical from the way it rests."
+            yaw = numbers.Range(circle, circle, circle, "rad").root(f"{GOAL}.yaw", 0.0, doc)
+            pose = (*place, yaw, orientation(GOAL, (about_z, yaw.name), {"rest": rest}))
+        spaces = spaces or numbers.places(self.level(GOAL), airborne=False)
+        how: dict[str, Any] = {"spaces": spaces, "yaw": box, "inverse": inverse}
+        return body("goal", GOAL, self._size(GOAL), *pose, hull=self.shape, **how)
+
+    def form(self, box: Any, hull: Any, *causes: str) -> Causes:
+        """Return a function of a box or of a hull, with its causes: these, shape, orientation."""
+        function, form = (box, "size") if self.shape is None else (hull, "vertices")
+        return function, *causes, f"{GOAL}.{form}", f"{GOAL}.orientation"
+
+
+def _constant(name: str, value: Any, doc: str) -> Variable:
+    """Declare lengths that cannot change [m]."""
+    given = np.asarray(value, dtype=np.float64)
+    return Fixed(
+        name=name, unit="m", shape=given.shape, value=tuple(given.ravel().tolist()), doc=doc
+    )
+
+
+# --- pushing --------------------------------------------------------------------------------------
+
+
+@final
+class Pushing(OneBlock):
+    """One tool block and one goal block of the same size, both on the floor.
+
+    Args:
+        tool_block_position: Where the center of the block begins: x and y if it stands on the
+            floor, or x, y and z [m].
+        goal_block_position: Default x and y of the goal, which is on the floor [m].
+        options: Of block, goal and every task; see ``Alike`` and ``Common``.
+    """
+
+    name = "pushing"
+    default_weights, dense_terms = weighted(
+        (750.0, *kernels.TIPS_TO_BLOCK),
+        (250.0, "block_to_goal", kernels.block_progress, (BLOCK, WAS, TARGET)),
+        (100.0, *TURNED),
+        fraction=1.0,
+    )
+    paper_weights = {"reward.orientation": 0.0}  # noqa: RUF012 # a constant
+    goal_causes = (f"{GOAL}.polar", f"{GOAL}.euler_orientation")
+
+    def __init__(
+        self,
+        *,
+        tool_block_position: Place = (0.0, -0.08),
+        goal_block_position: Place = (0.0, 0.08),
+        **options: Unpack[Alike],
+    ) -> None:
+        super().__init__(tool_block_position, **options)
+        self._polar = floor_place("goal_block_position", goal_block_position, self.below(GOAL))
+
+    def entities(self) -> Iterable[Entity]:
+        """A block and its goal."""
+        causes = self.form(turned_on_the_floor, hull_on_the_floor, f"{GOAL}.polar")
+        polar = numbers.POLAR.root(f"{GOAL}.polar", self._polar)
+        return self.tool_block(), self.goal_block(polar, position(GOAL, causes))
+
+
+# --- picking --------------------------------------------------------------------------------------
+
+HEIGHT = f"{GOAL}.height"
+HEIGHT_A = (0.08, 0.2)  # [m] of the center of the goal
+HEIGHT_B = (0.2, 0.25)
+
+
+def lifted(height: Value, *, place: Floats) -> Floats:
+    """Put something at a height above a place (x and y), shape (..., 3) [m]."""
+    at = np.broadcast_to(place, (*np.shape(height), 2))
+    return np.concatenate([at, np.asarray(height)[..., None]], axis=-1)
+
+
+def put(*parents: Floats, center: Floats) -> Floats:
+    """Put a block at its place, however large it is and however it is turned, shape (3,) [m].
+
+    Source: CausalWorld 1.2: in picking alone, blocks that grow reach into the floor.
+    """
+    return np.array(center)
+
+
+def above_the_center(cylindrical: Floats) -> Floats:
+    """Put a goal above the centre of the arena, at the height of a cylindrical position [m].
+
+    Source: CausalWorld 1.2, ``task_generators/picking.py``,
+    ``_handle_contradictory_interventions``; radius and azimuth are ignored.
+    """
+    return np.asarray(cylindrical, dtype=np.float64) * (0.0, 0.0, 1.0)
+
+
+@final
+class Picking(OneBlock):
+    """A block on the floor, and a goal of the same size in the air above its place.
+
+    How high the goal is does not depend on the size.
+
+    Args:
+        tool_block_position: Where the center of the block begins: x and y if it stands on the
+            floor, or x, y and z [m]. The goal is above it.
+        goal_height: Default height of the center of the goal [m].
+        options: Of block, goal and every task; see ``Alike`` and ``Common``.
+    """
+
+    name = "picking"
+    default_weights, dense_terms = weighted(
+        (250.0, "block_to_height", kernels.height_progress, (BLOCK, WAS, TARGET)),
+        (0.0, "height_error", kernels.minus_height_error, (BLOCK, TARGET)),
+        (125.0, "block_to_center", kernels.centering_progress, (BLOCK, WAS)),
+        (0.0, "center_distance", kernels.minus_eccentricity, (BLOCK,)),
+        (750.0, *kernels.TIPS_TO_BLOCK),
+        (0.0, "tips_distance", kernels.minus_tips_distance, (TIPS, BLOCK)),
+        (0.0, "grasp", kernels.minus_grasp_distance, (TIPS, BLOCK, f"{TOOL}.size")),
+        (0.005, *kernels.SMOOTHNESS),
+        fraction=1.0,
+    )
+    goal_causes = (HEIGHT,)
+
+    def __init__(
+        self,
+        *,
+        tool_block_position: Place = (0.0, 0.0),
+        goal_height: float = 0.15,
+        **options: Unpack[Alike],
+    ) -> None:
+        super().__init__(tool_block_position, **options)
+        heights = numbers.Range(Box(0.0, 0.5), Box(*HEIGHT_A), Box(*HEIGHT_B), "m")
+        self._height = heights.option(HEIGHT, goal_height, "Height of its center.", "goal_height")
+
+    def entities(self) -> Iterable[Entity]:
+        """A block and its goal."""
+        published, (x, y, z) = self.conventions.published, self.place
+        start = Function(put, constants={"center": (x, y, z + self.below(TOOL))})
+        yield self.tool_block(
+            spaces=numbers.places(self.level(TOOL), airborne=published),
+            start=start if published else None,
+        )
+        yield self.goal_block(
+            self._height,
+            position(GOAL, (lifted, HEIGHT), {"place": (x, y)}),
+            spaces=self._above(),
+            inverse=above_the_center if published else from_cylindrical,
         )
 
+    def _above(self) -> tuple[Box, Box]:
+        """Return the cylindrical positions above the block's place; at radius 0 any angle will do.
 
-BLOCK, TARGET = f"{TOOL}.cartesian_position", f"{GOAL}.cartesian_position"
-WAS = Parent(BLOCK, 1)
+        The predecessor publishes wider spaces, and moves every value that is drawn or set above the
+        centre of the arena; see ``above_the_center``.
+        """
+        if self.conventions.published:
+            return (
+                numbers.cylindrical(numbers.RADIUS_A, *HEIGHT_A),
+                numbers.cylindrical(numbers.RADIUS_B, *HEIGHT_B),
+            )
+        x, y, _ = self.place
+        radius, angle = math.hypot(x, y), math.atan2(y, x)
+        low, high = (angle, angle) if radius > 0.0 else (-math.pi, math.pi)
+        a, b = (
+            Box((radius, low, bottom), (radius, high, top)) for bottom, top in (HEIGHT_A, HEIGHT_B)
+        )
+        return a, b
 
-TIPS_TO_BLOCK = "tips_to_block", kernels.tips_progress, (TIPS, TIPS_WAS, BLOCK, WAS)
-TURNED = (
-    "orientation",
-    kernels.turn_progress,
-    (f"{TOOL}.orientation", Parent(f"{TOOL}.orientation", 1), f"{GOAL}.orientation"),
-)
-"""Reward terms of several tasks with one block."""
+
+# --- pick and place -------------------------------------------------------------------------------
+
+WALL = "obstacle"
+SIDE = "wall_side"
+
+WALL_SIZE = (0.5, 0.015, 0.065)  # [m]
+WALL_A = Box((0.5, 0.015, 0.02), (0.5, 0.015, 0.065))
+WALL_B = Box((0.5, 0.015, 0.065), (0.5, 0.015, 0.1))
+RADIUS_A = (0.07, 0.12)  # [m]
+RADIUS_B = (0.12, 0.15)
+ANGLES = (math.pi / 6, 5 * math.pi / 6)  # [rad] on the side where y > 0
+
+
+def mirrored(polar_position: Floats, side: Value) -> Floats:
+    """Reflect a radius [m] and an angle [rad] at the wall where the side is 1, shape (..., 2)."""
+    sign = 1.0 - 2.0 * np.asarray(side)
+    return polar_position * np.stack([np.ones_like(sign), sign], axis=-1)
+
+
+def goal_across(side: Value, polar_position: Floats, size: Floats, orientation: Floats) -> Floats:
+    """Put a box on the floor on its side of the wall, shape (..., 3) [m]."""
+    return turned_on_the_floor(mirrored(polar_position, side), size, orientation)
+
+
+def hull_across(
+    side: Value, polar_position: Floats, corners: Floats, orientation: Floats
+) -> Floats:
+    """Put a hull on the floor on its side of the wall, shape (..., 3) [m]."""
+    return hull_on_the_floor(mirrored(polar_position, side), corners, orientation)
+
+
+def stand_across(size: Floats, orientation: Floats, *causes: Value, place: Floats) -> Floats:
+    """Stand a body on its side of the wall, shape (3,) [m].
+
+    The last of ``causes`` is the side; ``place`` is where it stands on side 0, see ``stand``.
+    """
+    *corners, side = causes
+    sign = 1.0 - 2.0 * float(side)
+    return stand(size, orientation, *corners, place=place * [1.0, sign, 1.0])
+
+
+def wall_on_the_floor(size: Floats) -> Floats:
+    """Put a box on the floor in the middle of the arena: its center, shape (..., 3) [m]."""
+    return np.asarray(size * [0.0, 0.0, 0.5])
+
+
+@final
+class PickAndPlace(OneBlock):
+    """A wall, a block on one side of it, and a goal of the same size on the other.
+
+    The blocks share the parents ``block.size`` and ``wall_side``. Which side the block begins
+    on decides where the goal is, so that the wall is always between them; the wall stands on the
+    floor however high it is.
+
+    Args:
+        tool_block_position: Where the center of the block begins while ``wall_side`` is 0: x and
+            y if it stands on the floor, or x, y and z [m].
+        goal_block_position: Default x and y of the goal, which is on the floor, likewise [m].
+        options: Of block, goal and every task; see ``Alike`` and ``Common``.
+    """
+
+    name = "pick_and_place"
+    default_weights, dense_terms = weighted(
+        (750.0, *kernels.TIPS_TO_BLOCK),
+        (50.0, "block_to_goal", kernels.horizontal_progress, (BLOCK, WAS, TARGET)),
+        (250.0, "block_to_height", kernels.crossing_progress, (BLOCK, WAS, TARGET, f"{GOAL}.size")),
+        (0.0, *TURNED),
+        (0.005, *kernels.SMOOTHNESS),
+        fraction=0.0,
+    )
+    paper_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
+    obstacles = (WALL,)
+    goal_causes = (SIDE, f"{GOAL}.polar", f"{GOAL}.euler_orientation")
+
+    def __init__(
+        self,
+        *,
+        tool_block_position: Place = (0.0, -0.09),
+        goal_block_position: Place = (0.0, 0.09),
+        **options: Unpack[Alike],
+    ) -> None:
+        super().__init__(tool_block_position, **options)
+        self._polar = floor_place("goal_block_position", goal_block_position, self.below(GOAL))
+
+    def entities(self) -> Iterable[Entity]:
+        """A block, its goal and the wall between them."""
+        start = Function(stand_across, constants={"place": self.place})
+        yield self.tool_block(SIDE, spaces=self._sector(TOOL, sign=-1.0), start=start)
+        a, b = (Box((near, ANGLES[0]), (far, ANGLES[1])) for near, far in (RADIUS_A, RADIUS_B))
+        yield self.goal_block(
+            replace(numbers.POLAR, a=a, b=b).root(f"{GOAL}.polar", self._polar),
+            position(GOAL, self.form(goal_across, hull_across, SIDE, f"{GOAL}.polar")),
+            spaces=self._sector(GOAL, sign=1.0),
+        )
+        sizes = replace(numbers.OBSTACLE_SIZES, a=WALL_A, b=WALL_B)
+        size = sizes.root(f"{WALL}.size", WALL_SIZE)
+        center = (0.0, 0.0, WALL_SIZE[2] / 2.0)
+        place = position(WALL, default=center)  # in the predecessor it keeps its center
+        if not self.conventions.published:
+            doc = "Position of the center; it stands on the floor in the middle."
+            follows = (wall_on_the_floor, size.name)
+            place = numbers.POSITIONS.derived(f"{WALL}.cartesian_position", follows, doc)
+        yield obstacle(WALL, size, place)
+
+    def _sector(self, name: str, *, sign: float) -> tuple[Box, Box]:
+        """Return the cylindrical positions on one side of the wall; ``sign`` of y on side 0."""
+        height = self.level(name)
+        near, far = ANGLES if sign > 0.0 else (-ANGLES[1], -ANGLES[0])
+        low = Switch(parent=SIDE, below=near, above=-far)
+        high = Switch(parent=SIDE, below=far, above=-near)
+        a, b = (
+            Box((inner, low, height), (outer, high, height))
+            for inner, outer in (RADIUS_A, RADIUS_B)
+        )
+        return a, b
+
+    def shared(self) -> Iterable[Variable]:
+        """One size for both, and on which side of the wall they are."""
+        yield from super().shared()
+        yield numbers.SIDES.root(
+            SIDE,
+            0,
+            "Where the block begins: 0 is at negative y, 1 at positive y; the goal is across.",
+        )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Unpack, final
 
 import numpy as np
@@ -14,26 +15,23 @@ from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import Common, weighted
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import kernels, shapes
+from scm_world.tasks.trifinger import kernels
 from scm_world.tasks.trifinger.base import TriFingerTask
-from scm_world.tasks.trifinger.entities.blocks import (
-    ToolBlock,
-    block_mass,
+from scm_world.tasks.trifinger.entities.bodies import (
+    Place,
+    Quaternion,
     block_size,
+    body,
     coordinates,
     lowest_point,
+    orientation,
+    position,
     stand,
-)
-from scm_world.tasks.trifinger.entities.goals import (
-    GoalBlock,
-    goal_orientation,
-    goal_position,
-    polar,
+    tool,
     turned_on_the_floor,
 )
-from scm_world.tasks.trifinger.shapes import Place, Quaternion
-from scm_world.tasks.trifinger.shaping import SMOOTHNESS, TIPS, WAS
-from scm_world.tasks.trifinger.single import SIZE
+from scm_world.tasks.trifinger.kernels import SMOOTHNESS, TIPS, TIPS_WAS
+from scm_world.tasks.trifinger.single import SIZE, floor_place, start_place, unit_quaternion
 from scm_world.variables import Affine, Function, Parent
 
 TOWER = "goal_tower"
@@ -71,19 +69,6 @@ def beside(size: Floats, orientation: Floats, *, place: Floats, other: Floats) -
     return np.array([x, y, place[2] + lowest_point(size, orientation)])
 
 
-def goal_tower(place: tuple[float, float], orientation: Quaternion) -> Entity:
-    """Describe the place of a tower of two blocks: its default radius and angle, and quaternion."""
-    causes = (f"{TOWER}.polar", SIZE, f"{TOWER}.orientation")
-    spaces = numbers.places(Affine(parent=SIZE, index=2), airborne=False)
-    variables = (
-        polar(TOWER, place),
-        goal_position(TOWER, parents=causes, mechanism=Function(tower_center)),
-        goal_orientation(TOWER, default=orientation),
-        *coordinates(TOWER, spaces=spaces),
-    )
-    return Entity(TOWER, variables)
-
-
 @final
 class Stacking2(TriFingerTask):
     """Two blocks on the floor, and two goals of the same size that stand on one another.
@@ -111,7 +96,7 @@ class Stacking2(TriFingerTask):
             750.0,
             "tips_to_block",
             kernels.stacking_tips_progress,
-            (TIPS, WAS, *FIRST, *SECOND, LOWER),
+            (TIPS, TIPS_WAS, *FIRST, *SECOND, LOWER),
         ),
         (250.0, "block_to_goal", kernels.placing_progress, (*FIRST, LOWER)),
         (
@@ -153,53 +138,56 @@ class Stacking2(TriFingerTask):
         super().__init__(**common)
         self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASSES.bounds)
         edge = checked("tool_block_size", tool_block_size, numbers.BLOCK_SIZES.bounds)
-        self._size = (edge, edge, edge)
-        self.roots = (block_size(SIZE, default=self._size),)  # one for all
+        size = np.array([edge, edge, edge])
+        self.roots = (block_size(SIZE, default=(edge, edge, edge)),)  # one for all
         given = (
             (tool_block_1_position, tool_block_1_orientation),
             (tool_block_2_position, tool_block_2_orientation),
         )
-        starts = [self._start(t, *pose) for t, pose in zip(TOOLS, given, strict=True)]
-        self._places, self._turns = zip(*starts, strict=True)
-        self._tower_turn = shapes.unit_quaternion("goal_orientation", goal_orientation)
-        size, turn = np.array(self._size), np.array(self._tower_turn)
-        lower = floor_of_tower(tower_center(np.zeros(2), size, turn), size, turn, side=-1.0)
-        self._tower = shapes.floor_place("goal_position", goal_position, float(lower[2]))
-
-    def _start(
-        self, tool: str, place: Place, orientation: Quaternion
-    ) -> tuple[tuple[float, float, float], Quaternion]:
-        turn = shapes.unit_quaternion(f"{tool}_orientation", orientation)
-        below = lowest_point(np.array(self._size), np.array(turn))
-        return shapes.start_place(f"{tool}_position", place, below), turn
+        self._places, self._turns = list[tuple[float, ...]](), list[Quaternion]()
+        for name, (place, turned) in zip(TOOLS, given, strict=True):
+            turn = unit_quaternion(f"{name}_orientation", turned)
+            below = lowest_point(size, np.array(turn))
+            self._places.append(start_place(f"{name}_position", place, below))
+            self._turns.append(turn)
+        self._tower_turn = unit_quaternion("goal_orientation", goal_orientation)
+        leans = np.array(self._tower_turn)
+        lower = floor_of_tower(tower_center(np.zeros(2), size, leans), size, leans, side=-1.0)
+        self._tower = floor_place("goal_position", goal_position, float(lower[2]))
 
     def entities(self) -> Iterable[Entity]:
         """Two blocks, a tower, and its two floors."""
         first, second = self._places
-        yield self._tool(0, Function(stand, constants={"place": first}))
-        yield self._tool(1, Function(beside, constants={"place": second, "other": first}))
-        yield goal_tower(self._tower, self._tower_turn)
-        causes = (f"{TOWER}.cartesian_position", SIZE, f"{TOWER}.orientation")
-        for name, side in zip(GOALS, (-1.0, 1.0), strict=True):
-            center = Function(floor_of_tower, constants={"side": side})
-            yield GoalBlock(
+        starts = (
+            Function(stand, constants={"place": first}),
+            Function(beside, constants={"place": second, "other": first}),
+        )
+        sizes = replace(numbers.BLOCK_SIZES, a=None, b=None)
+        airborne = self.conventions.published
+        for name, start, turn in zip(TOOLS, starts, self._turns, strict=True):
+            yield tool(
                 name,
-                size=block_size(f"{name}.size", SIZE, spaces=False),
-                pose=(
-                    goal_position(name, parents=causes, mechanism=center),
-                    goal_orientation(name, parents=(f"{TOWER}.orientation",)),
-                ),
+                sizes.derived(f"{name}.size", SIZE),
+                numbers.BLOCK_MASSES.root(f"{name}.mass", self._mass),
+                start=start,
+                turn=turn,
+                spaces=numbers.places(numbers.half_height(f"{name}.size"), airborne=airborne),
+            )
+        center, turned = f"{TOWER}.cartesian_position", f"{TOWER}.orientation"
+        spaces = numbers.places(Affine(parent=SIZE, index=2), airborne=False)
+        tower = (
+            numbers.POLAR.root(f"{TOWER}.polar", self._tower),
+            position(TOWER, (tower_center, f"{TOWER}.polar", SIZE, turned)),
+            orientation(TOWER, default=self._tower_turn),
+            *coordinates(TOWER, spaces=spaces),
+        )
+        yield Entity(TOWER, tower)
+        for name, side in zip(GOALS, (-1.0, 1.0), strict=True):
+            yield body(
+                "goal",
+                name,
+                sizes.derived(f"{name}.size", SIZE),
+                position(name, (floor_of_tower, center, SIZE, turned), {"side": side}),
+                orientation(name, turned),
                 yaw=False,
             )
-
-    def _tool(self, index: int, start: Function) -> Entity:
-        name, size = TOOLS[index], block_size(f"{TOOLS[index]}.size", SIZE, spaces=False)
-        low, airborne = numbers.half_height(size.name), self.conventions.published_spaces
-        return ToolBlock(
-            name,
-            size=size,
-            mass=block_mass(f"{name}.mass", default=self._mass),
-            spawn=start,
-            spaces=numbers.places(low, airborne=airborne),
-            orientation=self._turns[index],
-        )

@@ -10,6 +10,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import UnknownOption
+from scm_world.geometry import canonical, quaternion_product
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import N_FINGERS
 
@@ -62,11 +63,7 @@ def turned(values: Mapping[str, Value], names: Iterable[str], thirds: int) -> di
         if name in VECTORS or part in ("cartesian_position", "linear_velocity", "position"):
             return axes @ value
         if part == "orientation":
-            x, y, z, w = value.tolist()
-            turn = np.array(
-                [rest * x - half * y, rest * y + half * x, rest * z + half * w, rest * w - half * z]
-            )
-            return turn if turn[3] >= 0.0 else -turn
+            return canonical(quaternion_product((0.0, 0.0, half, rest), value))
         if part in ("polar", "cylindrical_position"):
             around = value + np.eye(len(value))[1] * angle
             around[1] = math.remainder(around[1], 2.0 * math.pi)

@@ -34,8 +34,8 @@ from scm_world.backends.mujoco.slots import Finder, Slot, first, place, turn
 from scm_world.backends.mujoco.trees import NOTHING, Couplings, Effect
 from scm_world.geometry.hulls import Hull
 from scm_world.models.model import Model, Parameter
-from scm_world.models.scene import State
-from scm_world.tasks.trifinger import fake, hardware
+from scm_world.models.scene import Parameters, State
+from scm_world.tasks.trifinger import hardware, published
 from scm_world.tasks.trifinger.cameras import VIEWS
 from scm_world.tasks.trifinger.hardware import (
     FAST,
@@ -47,20 +47,14 @@ from scm_world.tasks.trifinger.hardware import (
     WALL_RADIUS,
     WALL_SEGMENTS,
     WALL_THICKNESS,
-    ControllerSpec,
     Preset,
     joints_of,
     link_name,
 )
-from scm_world.tasks.trifinger.published import SIDES, alter, restore, spinning_weights, touching
-from scm_world.tasks.trifinger.state import PhysicalState
 
-FLOOR = "floor"
-STAGE = "stage"
+FLOOR, STAGE = "floor", "stage"
 ROBOT = "robot"  # the hub that carries the fingers; nothing touches it
 UNSEEN = 3  # the first group of shapes that no picture shows
-HUB_COLOR = (0.35, 0.35, 0.38, 1.0)
-HUB_HALVES = (0.034, 0.034, 0.012)  # [m] of an ellipsoid
 MOUNT = hardware.Capsule((0.012, 0.0, 0.0), (-0.004, 0.0, 0.0), 0.0235)
 """How link 0 looks; its published mesh is a frame that hides the arena from above."""
 
@@ -68,25 +62,78 @@ SHAPES = ("upper", "middle", "lower", "tip")  # in the order of the links 1, 2, 
 LINK_SHAPES = (("base",), ("upper",), ("middle",), ("lower", "tip"))
 """The shapes of links 0 to 3 of a finger; the base touches nothing."""
 
-CONTACT = {"fast": (0.010, 1.0), "precise": (0.004, 1.0)}
-"""Time constant [s] and damping ratio of contacts, by preset."""
-
-SLIDING = {"fast": (0.04, 1.0), "precise": (0.02, 1.0)}
-"""The same for friction between blocks, floor and stage."""
-
-IMPRATIO = 100.0  # stiffness of friction over stiffness of the normal
 MANY = 8
 """From more blocks than this on, the Jacobian of the constraints is a sparse matrix."""
+SPINNING_LIMIT = 1.0
+"""At most this many times its sliding friction is the spinning friction of a pair [m]. Above about
+five times the solver of the engine speeds a spinning body up, tenfold and more in a step; a real
+patch of contact gives two thirds of its radius."""
+
+START = "start"
+"""The keyframe in which fingers and blocks are clear of one another."""
 
 _PLANE = mujoco.mjtGeom.mjGEOM_PLANE  # has no end where it collides, whatever its size
+_BOX = mujoco.mjtGeom.mjGEOM_BOX
 _BLOCK_HALF = 0.0325  # [m] any positive size and mass do: parameters follow
 _BLOCK_MASS = 0.02  # [kg]
-_SPEC = ControllerSpec()
-_OBSTACLE_POSE = {"pos": (0.1, 0.2, 0.3), "quat": (0.9, 0.1, 0.2, 0.3)}
-"""MuJoCo fixes poses of zero for good."""
+_JOINT_NAMES = tuple(link_name(finger, index) for finger in FINGERS for index in (1, 2, 3))
 
-AHEAD = (0.0, 0.0, 0.0, 1.0)  # the orientation of something that is not turned
-_ROLLING_FRICTION = 1e-4  # not in force: contacts have four dimensions
+
+@final
+class PhysicalState(State):
+    """What moves.
+
+    The vector is ``[joint positions (9) | joint velocities (9) | joint torques (9) | block 0 (13)
+    | block 1 (13) | …]`` and a block is ``[position (3) | orientation (4) | linear velocity (3) |
+    angular velocity (3)]``. All properties are views: writing into them writes the vector.
+
+    Positions are in the world frame with the table top at z = 0 [m], orientations are unit
+    quaternions (x, y, z, w) with w >= 0, velocities are those of the center in the world frame
+    [m/s], [rad/s]. Joint torques [N m] are the ones of the last physics step; they can be read
+    but not set.
+    """
+
+    __slots__ = ()
+
+    @property
+    def joint_positions(self) -> Floats:
+        """Shape (9,) [rad]."""
+        return self.vector[:9]
+
+    @property
+    def joint_velocities(self) -> Floats:
+        """Shape (9,) [rad/s]."""
+        return self.vector[9:18]
+
+    @property
+    def joint_torques(self) -> Floats:
+        """Shape (9,) [N m]."""
+        return self.vector[18:27]
+
+    @property
+    def blocks(self) -> Floats:
+        """Shape (n, 13)."""
+        return self.vector[27:].reshape(-1, 13)
+
+    @property
+    def positions(self) -> Floats:
+        """Shape (n, 3) [m]."""
+        return self.blocks[:, 0:3]
+
+    @property
+    def orientations(self) -> Floats:
+        """Shape (n, 4)."""
+        return self.blocks[:, 3:7]
+
+    @property
+    def linear_velocities(self) -> Floats:
+        """Shape (n, 3) [m/s]."""
+        return self.blocks[:, 7:10]
+
+    @property
+    def angular_velocities(self) -> Floats:
+        """Shape (n, 3) [rad/s]."""
+        return self.blocks[:, 10:13]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,19 +172,37 @@ class TriFinger(Model, Assembly):
     @property
     def with_(self) -> Callable[..., TriFinger]:
         """A function that makes this model with some arguments of ``trifinger`` replaced."""
-        return partial(trifinger, **{name: getattr(self, name) for name in _PARTS})
+        parts = Assembly.__dataclass_fields__
+        return partial(trifinger, **{name: getattr(self, name) for name in parts})
 
     def empty_state(self) -> State:
         """Return a state to read into."""
         return PhysicalState(self.layout)
 
+    def move(self, state: PhysicalState, command: Floats, seconds: float) -> None:
+        """Let blocks drift, without physics; let joints jump, or stay where torques are commanded.
 
-_PARTS = tuple(Assembly.__dataclass_fields__)
-START = "start"
-"""The keyframe in which fingers and blocks are clear of one another."""
-COLUMNS, ROWS = 3, 2
-SPACING = 0.1  # [m] between the centers of blocks that stand side by side
-LAYER = 0.07  # [m] between the centers of blocks that stand on one another
+        See ``backends.fake``, as for the two below.
+        """
+        if not self.torques:
+            state.joint_positions[:] = command
+            state.joint_torques[:] = 0.0
+        else:
+            state.joint_torques[:] = command
+        state.positions[:] += seconds * state.linear_velocities
+
+    def settle(self, state: PhysicalState) -> None:
+        """Turn quaternions so that w is not negative."""
+        state.orientations[state.orientations[:, 3] < 0.0] *= -1.0
+
+    def inertia(self, parameters: Parameters, body: str) -> Floats:
+        """Compute the principal moments of inertia of a block or a link, shape (3,) [kg m²]."""
+        mass, hull = parameters[body, "mass"], dict(self.hulls).get(body)
+        if hull is None and body not in hardware.LINK_NAMES:
+            squares = parameters[body, "size"] ** 2
+            return np.asarray(mass / 12.0 * (squares.sum() - squares))
+        per_mass = hull.moments if hull else hardware.INERTIAL[int(body[-1])].per_mass
+        return np.asarray(mass * np.array(per_mass))
 
 
 @lru_cache(maxsize=64)
@@ -146,10 +211,7 @@ def trifinger(
     preset: Preset = FAST,
     obstacles: tuple[str, ...] = (),
     hulls: tuple[tuple[str, Hull], ...] = (),
-    *,
-    torques: bool = False,
-    resolution: str = RESOLUTIONS[0],
-    published: bool = False,
+    **options: Any,
 ) -> TriFinger:
     """Return the model of the robot with some blocks and obstacles; it is made once in a process.
 
@@ -163,7 +225,7 @@ def trifinger(
     ``robot``               ``height`` [m], ``friction``, ``joint_damping`` [N m s/rad]
     ``controller``          ``position_gains`` (3,) [N m/rad], ``velocity_gains`` (3,)
                             [N m s/rad], ``safety_damping`` (3,) [N m s/rad],
-                            ``torque_limit`` [N m]; see ``ControllerSpec``
+                            ``torque_limit`` [N m]; see ``hardware``
     ``robot_finger_F_link_i``  ``mass`` [kg], ``color`` (3,)
     ``floor``, ``stage``    ``friction``, ``color`` (3,)
     every block             ``mass`` [kg], ``size`` (3,) [m], ``friction``, ``color`` (3,);
@@ -172,21 +234,12 @@ def trifinger(
                             [m], ``orientation`` (4,)
     ======================  ==========================================
     """
-    parts = Assembly(
-        blocks=blocks,
-        preset=preset,
-        obstacles=obstacles,
-        hulls=hulls,
-        torques=torques,
-        resolution=resolution,
-        published=published,
-    )
+    parts = Assembly(blocks=blocks, preset=preset, obstacles=obstacles, hulls=hulls, **options)
     read = _read(replace(parts, published=False))
     described = {name: getattr(read, name) for name in read.__dataclass_fields__}
-    described["digest"] += f" {published}"
-    instead = partial(_read, parts) if published else None
-    described |= {"instead": instead, "views": VIEWS, "fake": fake}
-    return TriFinger(**described, **vars(parts))
+    described["digest"] += f" {parts.published}"
+    described["instead"] = partial(_read, parts) if parts.published else None
+    return TriFinger(**described | vars(parts) | {"views": VIEWS})
 
 
 @lru_cache(maxsize=64)
@@ -195,26 +248,19 @@ def _read(parts: Assembly) -> Model:
     states: dict[str, list[str]] = {}
     for index, what in enumerate(("position", "velocity", "actuator_torque")):
         for group in joints_of(parts.resolution):
-            joints = range(group.where.start, group.where.stop)
-            states[group.names[index]] = [f"{_JOINT_NAMES[i]}.{what}" for i in joints]
-    for block in parts.blocks:
-        names = (f"{block}.{what}" for what in MOTION)
-        states |= {name: [name] for name in names}
+            states[group.names[index]] = [f"{joint}.{what}" for joint in _JOINT_NAMES[group.where]]
+    moves = ("cartesian_position", "orientation", "linear_velocity", "angular_velocity")
+    states |= {f"{block}.{what}": [f"{block}.{what}"] for block in parts.blocks for what in moves}
     return read_model(
         _compiled(parts),
         name="trifinger",
         keyframe=START,
         states=states,
-        controls=[f"{joint}_servo" for joint in _JOINT_NAMES],
-        bindings=lambda mj, data, trees: (one for one, _ in _rows(mj, data, trees, parts)),
+        controls=N_JOINTS,
+        bindings=partial(_rows, parts),
         frame="world",
         part_of={tip_name(finger): link_name(finger, 3) for finger in FINGERS},
     )
-
-
-MOTION = ("cartesian_position", "orientation", "linear_velocity", "angular_velocity")
-"""The states of a block, in the order of the state vector."""
-_JOINT_NAMES = tuple(link_name(finger, index) for finger in FINGERS for index in (1, 2, 3))
 
 
 def _compiled(parts: Assembly) -> mujoco.MjModel:
@@ -227,9 +273,10 @@ def _compiled(parts: Assembly) -> mujoco.MjModel:
     _write_options(spec, parts)
     floor = spec.worldbody.add_body(name=FLOOR)
     floor.add_geom(name=FLOOR, type=_PLANE, size=(WALL_RADIUS, WALL_RADIUS, 0.1))
-    box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": (_BLOCK_HALF,) * 3}
+    box = {"type": _BOX, "size": (_BLOCK_HALF,) * 3}
+    pose = {"pos": (0.1, 0.2, 0.3), "quat": (0.9, 0.1, 0.2, 0.3)}  # zeros would be fixed for good
     for name in parts.obstacles:
-        spec.worldbody.add_body(name=name).add_geom(name=name, **box, **_OBSTACLE_POSE)
+        spec.worldbody.add_body(name=name).add_geom(name=name, **box, **pose)
     _add_wall(spec.worldbody)
     _add_robot(spec, parts)
     for name in parts.blocks:
@@ -248,29 +295,27 @@ def _compiled(parts: Assembly) -> mujoco.MjModel:
     spec.add_numeric(name="bullet_explicit_servos", size=1, data=[1.0])
     pairs = contact_pairs(parts)
     if parts.published:
-        alter(spec)
-        pairs = touching(parts.blocks, parts.obstacles)
-    contact, sliding = (table[parts.preset.name] for table in (CONTACT, SLIDING))
-    pair = spec.default.pair
+        published.alter(spec)
+        pairs = published.touching(parts.blocks, parts.obstacles)
+    pair, contact = spec.default.pair, parts.preset.contact
     pair.condim, pair.margin, pair.gap, pair.solref = 4, 0.0, 0.0, contact
-    pair.friction = (1.0, 1.0, SPINNING_FRICTION, _ROLLING_FRICTION, _ROLLING_FRICTION)
+    pair.friction = (1.0, 1.0, SPINNING_FRICTION, 1e-4, 1e-4)  # rolling is not in force
     for one, other, slides in pairs:
-        reference = sliding if slides else contact
+        reference = parts.preset.sliding if slides else contact
         spec.add_pair(geomname1=one, geomname2=other, solreffriction=reference)
     start = [*hardware.REST]
-    for index in range(len(parts.blocks)):
-        layer, spot = divmod(index, COLUMNS * ROWS)
-        row, column = divmod(spot, COLUMNS)
-        x = SPACING * (column - (min(len(parts.blocks), COLUMNS) - 1) / 2)
-        start += [x, 0.09 * row, _BLOCK_HALF + LAYER * layer, 1.0, 0.0, 0.0, 0.0]
+    for index in range(len(parts.blocks)):  # in layers of two rows of three
+        layer, spot = divmod(index, 6)
+        row, column = divmod(spot, 3)
+        x = 0.1 * (column - (min(len(parts.blocks), 3) - 1) / 2)
+        start += [x, 0.09 * row, _BLOCK_HALF + 0.07 * layer, 1.0, 0.0, 0.0, 0.0]
     spec.add_key(name=START, qpos=start)
     model = spec.compile()
     if parts.published:
-        restore(model)
+        published.restore(model)
     scratch = mujoco.MjData(model)
-    for bound, default in _rows(model, scratch, Couplings(model), parts):
-        slot = bound.slot(model, scratch)  # type: ignore[misc] # every binding has one
-        slot.write(np.asarray(default, dtype=np.float64))
+    for _ in _rows(parts, model, scratch, Couplings(model)):
+        pass  # each has written its default
     couple(model)
     mujoco.mj_setConst(model, scratch)
     return model
@@ -314,7 +359,7 @@ def _write_options(spec: mujoco.MjSpec, parts: Assembly) -> None:
     # The only one besides Euler in which bodies that do not touch are solved apart, to the last
     # digit; ``discrete`` scales by the masses of all of them.
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.impratio = IMPRATIO
+    option.impratio = 100.0  # stiffness of friction over that of the normal
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     # MuJoCo 4.0.0 factors the Hessian wrongly where the Jacobian is sparse (#3767). The price of a
@@ -342,7 +387,7 @@ def _add_wall(world: mujoco.MjsBody) -> None:
         angle = 2 * math.pi * i / WALL_SEGMENTS
         stage.add_geom(
             name=f"{STAGE}/{i}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
+            type=_BOX,
             pos=(center * math.cos(angle), center * math.sin(angle), WALL_HEIGHT / 2),
             quat=_yaw(angle),
             size=half,
@@ -364,11 +409,12 @@ def _add_robot(spec: mujoco.MjSpec, parts: Assembly) -> None:
     MuJoCo works in the frame of the center of mass of a kinematic tree. With a tree per finger,
     and the links that cannot move outside of them, no mass changes the roundings elsewhere.
     """
-    contact = CONTACT[parts.preset.name]
     height, world = hardware.NOMINAL_HEIGHT - hardware.TABLE_OFFSET, spec.worldbody
+    strongest = hardware.TORQUE_LIMIT
     hub = world.add_body(name=ROBOT, pos=(0.0, 0.0, height))
     ellipsoid = mujoco.mjtGeom.mjGEOM_ELLIPSOID
-    hub.add_geom(name=ROBOT, type=ellipsoid, size=HUB_HALVES, rgba=HUB_COLOR)
+    color, halves = (0.35, 0.35, 0.38, 1.0), (0.034, 0.034, 0.012)
+    hub.add_geom(name=ROBOT, type=ellipsoid, size=halves, rgba=color)
     cos, sin = math.cos(hardware.WORLD_YAW), math.sin(hardware.WORLD_YAW)
     for finger, (x, y, z), yaw in zip(
         FINGERS, hardware.FINGER_OFFSET, hardware.FINGER_YAW, strict=True
@@ -388,13 +434,10 @@ def _add_robot(spec: mujoco.MjSpec, parts: Assembly) -> None:
             reach = hardware.ENGINE_LIMITS[index - 1]
             body.add_joint(
                 name=name,
-                type=mujoco.mjtJoint.mjJNT_HINGE,
                 axis=hardware.JOINT_AXES[index - 1],
-                limited=True,
                 range=(-reach, reach),
-                solref_limit=contact,
-                actfrclimited=True,  # the joint clips the sum of servo and damper
-                actfrcrange=(-_SPEC.limit, _SPEC.limit),
+                solref_limit=parts.preset.contact,
+                actfrcrange=(-strongest, strongest),  # the joint clips the sum of servo and damper
             )
             name = SHAPES[index - 1]
             _add_capsule(body, f"{finger}/{name}", hardware.COLLISION[name])
@@ -403,17 +446,15 @@ def _add_robot(spec: mujoco.MjSpec, parts: Assembly) -> None:
         tip.ipos = (0.0, 0.0, 0.0)  # MuJoCo takes ``pos`` where none is said
         tip.add_site(name=tip_name(finger), group=UNSEEN)
         _add_capsule(tip, f"{finger}/tip", hardware.COLLISION["tip"])
-    for purpose, limit in (("servo", _SPEC.limit), ("safety", 0.0)):
+    for purpose, limit in (("servo", strongest), ("safety", 0.0)):
         motor = float(parts.torques and purpose == "servo")
         for joint in _JOINT_NAMES:
             spec.add_actuator(  # without gains: they are parameters and follow
                 name=f"{joint}_{purpose}",
                 trntype=mujoco.mjtTrn.mjTRN_JOINT,
                 target=joint,
-                gaintype=mujoco.mjtGain.mjGAIN_FIXED,
                 gainprm=[motor, *[0.0] * 9],
                 biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-                forcelimited=limit > 0.0,
                 forcerange=(-limit, limit),
             )
 
@@ -441,107 +482,114 @@ def _yaw(angle: float) -> tuple[float, float, float, float]:
 # --- bindings ----------------------------------------------------------------------------------
 
 
-GAINS: tuple[tuple[Any, ...], ...] = (
-    ("position_gains", _SPEC.kp, "N m/rad", ("gainprm", 0, 0, 1.0), ("biasprm", 0, 1, -1.0)),
-    ("safety_damping", _SPEC.safety, "N m s/rad", ("biasprm", N_JOINTS, 2, -1.0)),
-    ("velocity_gains", _SPEC.kd, "N m s/rad", ("biasprm", 0, 2, -1.0)),
-)
-"""Name, default and unit; then array, first actuator, column and sign of each place."""
-
-Row = tuple[Parameter, object]
-"""A parameter, and its default."""
-
-
 def _rows(
-    mj: mujoco.MjModel, data: mujoco.MjData, trees: Couplings, parts: Assembly
-) -> Iterator[Row]:
-    """List the parameters: what each is, where it is written, on which trees it acts, default."""
+    parts: Assembly, mj: mujoco.MjModel, data: mujoco.MjData, trees: Couplings
+) -> Iterator[Parameter]:
+    """Describe the parameters, and on which trees each acts; write the default of each."""
     fingers = [trees.tree(mj.body(link_name(finger, 1)).id) for finger in FINGERS]
     everything, touching = trees.always(trees.every), trees.touching(trees.every)
     touched, robot = trees.touching(fingers), trees.always(fingers)
 
     def row(
-        name: str, default: object, unit: str, slot: Finder, effect: Effect, doc: str, **rest: Any
-    ) -> Row:
-        now, (always, contact) = slot(mj, data).read(), effect
+        name: str, default: Any, unit: str, effect: Effect, doc: str, find: Finder, **rest: Any
+    ) -> Parameter:
+        slot, (always, contact) = find(mj, data), effect
+        slot.write(np.asarray(default, dtype=np.float64))
+        now = slot.read()
         bounds = numbers(now), -math.inf, math.inf
-        made = Parameter(name, unit, now.shape, *bounds, doc, always, contact, slot=slot, **rest)
-        return made, default
+        return Parameter(name, unit, now.shape, *bounds, doc, always, contact, slot=find, **rest)
 
-    def color(element: str, default: object, shapes: Sequence[str]) -> Row:
-        slot, doc = partial(_color, shapes=tuple(shapes)), "Red, green and blue."
-        return row(f"{element}.color", default, "1", slot, NOTHING, doc, visual=True)
+    def color(element: str, default: Any, shapes: Sequence[str]) -> Parameter:
+        find, doc = _of_shapes(shapes, "geom_rgba", slice(3)), "Red, green and blue."
+        return row(f"{element}.color", default, "1", NOTHING, doc, find, visual=True)
 
-    def friction(element: str, default: float, shapes: Sequence[str], effect: Effect) -> Row:
-        slot, doc = partial(_friction, shapes=tuple(shapes)), "Factor of all its contacts."
-        return row(f"{element}.friction", default, "1", slot, effect, doc)
+    def friction(element: str, default: float, shapes: Sequence[str], effect: Effect) -> Parameter:
+        # Contact pairs get products; the factors rest in the shapes.
+        find = _of_shapes(shapes, "geom_friction", 0, follow_up=couple)
+        return row(f"{element}.friction", default, "1", effect, "Factor of all its contacts.", find)
 
-    down, free = (0.0, 0.0, -9.81), "Acceleration of free fall."
-    yield row("world.gravity", down, "m/s^2", _gravity, everything, free)
-    rigid = partial(_restitution, rigid=CONTACT[parts.preset.name])
-    doc = "Speed after an impact over that before."
-    yield row("world.restitution", 0.0, "1", rigid, touching, doc)
-    spins, doc = partial(_spinning, parts=parts), "Torsional, of every contact."
-    yield row("world.spinning_friction", SPINNING_FRICTION, "m", spins, touching, doc)
+    doc, down = "Acceleration of free fall.", (0.0, 0.0, -9.81)
+    yield row("world.gravity", down, "m/s^2", everything, doc, lambda mj, _: place(mj.opt.gravity))
+    doc, find = "Speed after an impact over that before.", _restitution(*parts.preset.contact)
+    yield row("world.restitution", 0.0, "1", touching, doc, find)
+    doc, find = "Torsional, of every contact.", partial(_spinning, parts)
+    yield row("world.spinning_friction", SPINNING_FRICTION, "m", touching, doc, find)
     doc = "Height of the base; see ``hardware``."
-    yield row("robot.height", hardware.NOMINAL_HEIGHT, "m", _height, touched, doc)
+    yield row("robot.height", hardware.NOMINAL_HEIGHT, "m", touched, doc, _height)
     links = [f"{f}/{shape}" for f in FINGERS for shapes in LINK_SHAPES for shape in shapes]
     yield friction("robot", 0.5, links, touched)
-    yield row("robot.joint_damping", 0.0, "N m s/rad", _damping, robot, "Of every joint.")
-    for name, gain, unit, *places in GAINS[1:2] if parts.torques else GAINS:
-        slot, doc = partial(_gains, places=places), "Of the three joints of a finger."
-        yield row(f"controller.{name}", gain, unit, slot, robot, doc)
-    doc = "Largest torque of a joint."
-    yield row("controller.torque_limit", _SPEC.limit, "N m", _limit, robot, doc)
+    yield row(
+        "robot.joint_damping", 0.0, "N m s/rad", robot, "Of every joint.",
+        lambda mj, _: place(mj.dof_damping[:N_JOINTS], back=first),
+    )  # fmt: skip
+    gains: tuple[tuple[Any, ...], ...] = (  # array, first actuator, column and sign of each place
+        ("position_gains", "N m/rad", ("gainprm", 0, 0, 1.0), ("biasprm", 0, 1, -1.0)),
+        ("safety_damping", "N m s/rad", ("biasprm", N_JOINTS, 2, -1.0)),
+        ("velocity_gains", "N m s/rad", ("biasprm", 0, 2, -1.0)),
+    )
+    for name, unit, *places in gains[1:2] if parts.torques else gains:
+        default, doc = getattr(hardware, name.upper()), "Of the three joints of a finger."
+        yield row(f"controller.{name}", default, unit, robot, doc, partial(_gains, places))
+    doc, limit = "Largest torque of a joint.", hardware.TORQUE_LIMIT
+    yield row("controller.torque_limit", limit, "N m", robot, doc, _limit)
     for tree, finger in zip(fingers, FINGERS, strict=True):
         for index, inertial in enumerate(hardware.INERTIAL):
             link, mass = link_name(finger, index), hardware.LINK_MASS[index]
-            scaled = partial(_scaled_mass, body=link, per_mass=inertial.per_mass)
-            effect = trees.always([tree]) if index else NOTHING
-            yield row(f"{link}.mass", mass, "kg", scaled, effect, "Its inertia scales with it.")
+            effect, doc = trees.always([tree]) if index else NOTHING, "Its inertia scales with it."
+            find = _solid(link, "mass", inertial.per_mass)
+            yield row(f"{link}.mass", mass, "kg", effect, doc, find)
             shapes = [f"{finger}/{shape}" for shape in LINK_SHAPES[index]]
             yield color(link, hardware.LINK_COLORS[finger], shapes)
-    walls = [f"{STAGE}/{i}" for i in range(SIDES if parts.published else WALL_SEGMENTS)]
-    insides = [f"{STAGE}/{i}/inside" for i in range(WALL_SEGMENTS)]
+    segments = published.SIDES if parts.published else WALL_SEGMENTS
     yield friction(FLOOR, 0.5, [FLOOR], touching)
     yield color(FLOOR, (0.31, 0.27, 0.25), [FLOOR])
-    yield friction(STAGE, 0.5, walls, touching)
-    yield color(STAGE, (0.95, 0.95, 0.95), insides)
+    yield friction(STAGE, 0.5, [f"{STAGE}/{i}" for i in range(segments)], touching)
+    yield color(STAGE, (0.95,) * 3, [f"{STAGE}/{i}/inside" for i in range(WALL_SEGMENTS)])
     hulls, size = dict(parts.hulls), (2.0 * _BLOCK_HALF,) * 3
     for name in parts.blocks:
-        tree, slot = trees.tree(mj.body(name).id), partial(_box, name=name, quantity="mass")
+        tree = trees.tree(mj.body(name).id)
         own, contact = trees.always([tree]), trees.touching([tree])
-        if name in hulls:
-            slot = partial(_scaled_mass, body=name, per_mass=hulls[name].moments)
+        find = _solid(name, "mass", hulls[name].moments if name in hulls else None)
         # A free body falls and tumbles as it does whatever its mass is.
-        yield row(f"{name}.mass", _BLOCK_MASS, "kg", slot, contact, "Its inertia follows.")
+        yield row(f"{name}.mass", _BLOCK_MASS, "kg", contact, "Its inertia follows.", find)
         if name not in hulls:
-            slot = partial(_box, name=name, quantity="size")
             doc = "Full edge lengths; the inertia follows."
-            yield row(f"{name}.size", size, "m", slot, own, doc)
+            yield row(f"{name}.size", size, "m", own, doc, _solid(name, "size"))
         yield friction(name, 1.0, [name], contact)
         yield color(name, (1.0, 0.0, 0.0), [name])
     for index, name in enumerate(parts.obstacles):
-        effect = trees.contact_of(mj.geom(name).id)
-        center = (0.02 * index - 0.1, 0.15, 0.005)
-        for what, default in (("size", (0.01,) * 3), ("position", center), ("orientation", AHEAD)):
-            unit = "m" if default is not AHEAD else "1"
-            nature: Any = "real" if default is not AHEAD else "rotation"
-            slot = partial(_obstacle, name=name, quantity=what)
-            yield row(f"{name}.{what}", default, unit, slot, effect, "Of the box.", kind=nature)
+        effect, center = trees.contact_of(mj.geom(name).id), (0.02 * index - 0.1, 0.15, 0.005)
+        half, double = lambda v: 0.5 * v, lambda v: 2.0 * v
+        find = _of_shapes([name], "geom_size", to=half, back=double, constant=True)
+        yield row(f"{name}.size", (0.01,) * 3, "m", effect, "Of the box.", find)
+        find = _of_shapes([name], "geom_pos", constant=True)
+        yield row(f"{name}.position", center, "m", effect, "Of the box.", find)
+        find, ahead = _of_shapes([name], "geom_quat", form=turn), (0.0, 0.0, 0.0, 1.0)
+        yield row(f"{name}.orientation", ahead, "1", effect, "Of the box.", find, kind="rotation")
         yield friction(name, 0.5, [name], effect)
         yield color(name, (0.0,) * 3, [name])
 
 
-def _gravity(mj: mujoco.MjModel, _: Any) -> Slot:
-    return place(mj.opt.gravity)
+def _of_shapes(
+    shapes: Sequence[str],
+    array: str,
+    columns: int | slice = slice(None),
+    form: Callable[..., Slot] = place,
+    **how: Any,
+) -> Finder:
+    """Return what finds columns of an array that are alike for some shapes."""
+
+    def find(mj: mujoco.MjModel, _: Any) -> Slot:
+        rows = getattr(mj, array)
+        return form(*(rows[mj.geom(shape).id, columns, ...] for shape in shapes), **how)
+
+    return find
 
 
-def _spinning(mj: mujoco.MjModel, _: Any, *, parts: Assembly) -> Slot:
+def _spinning(parts: Assembly, mj: mujoco.MjModel, _: Any) -> Slot:
+    weights = np.ones(mj.ngeom)
     if parts.published:
-        weights = spinning_weights(mj, parts.blocks, parts.obstacles)
-    else:
-        weights = np.ones(mj.ngeom)
+        weights = published.spinning_weights(mj, parts.blocks, parts.obstacles)
     view, base = mj.geom_friction[:, 1], mj.geom(f"{FINGERS[0]}/base").id
     own = view[base, ...]
 
@@ -558,17 +606,13 @@ def _height(mj: mujoco.MjModel, _: Any) -> Slot:
     return place(*heights, to=lambda z: z - offset, back=lambda z: z + offset, constant=True)
 
 
-def _damping(mj: mujoco.MjModel, _: Any) -> Slot:
-    return place(mj.dof_damping[:N_JOINTS], back=first)
-
-
 def _limit(mj: mujoco.MjModel, _: Any) -> Slot:
     """Find the limit of servo and joint: the joint clips the sum of servo and damper."""
     ranges = mj.actuator_forcerange[:N_JOINTS], mj.jnt_actfrcrange[:N_JOINTS]
     return place(*ranges, to=lambda limit: np.array([-limit, limit]), back=lambda r: r[0, 1])
 
 
-def _gains(mj: mujoco.MjModel, _: Any, *, places: Sequence[tuple[str, int, int, float]]) -> Slot:
+def _gains(places: Sequence[tuple[str, int, int, float]], mj: mujoco.MjModel, _: Any) -> Slot:
     """Find a number for each joint of a finger, shape (3,); all fingers have the same."""
     views = [
         (getattr(mj, f"actuator_{array}")[start : start + N_JOINTS, column], sign)
@@ -583,87 +627,61 @@ def _gains(mj: mujoco.MjModel, _: Any, *, places: Sequence[tuple[str, int, int, 
     return Slot(write, lambda: sign * view[: N_JOINTS // len(FINGERS)])
 
 
-def _friction(mj: mujoco.MjModel, _: Any, *, shapes: tuple[str, ...]) -> Slot:
-    """Find the factor of one body. Contact pairs get products; the factors rest in the shapes."""
-    views = (mj.geom_friction[mj.geom(name).id, 0, ...] for name in shapes)
-    return place(*views, follow_up=couple)
+def _solid(body: str, quantity: str, per_mass: Sequence[float] | None = None) -> Finder:
+    """Return what finds mass [kg] or full edge lengths [m] of a body; its inertia follows both.
+
+    Its moments of inertia are those of a box, unless they are given as multiples of the mass [m²].
+    """
+
+    def find(mj: mujoco.MjModel, _: Any) -> Slot:
+        index = mj.body(body).id
+        mass, inertia = mj.body_mass[index, ...], mj.body_inertia[index]
+        half = mj.geom_size[mj.body_geomadr[index]]
+
+        def write(value: Floats) -> None:
+            if quantity == "mass":
+                mass[...] = value
+            else:
+                half[:] = 0.5 * value
+            if per_mass is not None:
+                inertia[:] = value * np.array(per_mass)
+                return
+            (x, y, z), third = (half * half).tolist(), float(mass) / 3.0
+            inertia[:] = third * (y + z), third * (z + x), third * (x + y)  # m/12 (b² + c²)
+
+        read = mass.copy if quantity == "mass" else lambda: 2.0 * half
+        return Slot(write, read, constant=True)
+
+    return find
 
 
-def _color(mj: mujoco.MjModel, _: Any, *, shapes: tuple[str, ...]) -> Slot:
-    """Find red, green, blue, shape (3,); MuJoCo keeps 32 bits of each."""
-    return place(*(mj.geom_rgba[mj.geom(name).id, :3] for name in shapes))
-
-
-def _scaled_mass(mj: mujoco.MjModel, _: Any, *, body: str, per_mass: tuple[float, ...]) -> Slot:
-    """Find the mass of a link or a hull [kg]; its moments of inertia scale with it."""
-    index, moments = mj.body(body).id, np.array(per_mass)
-    mass, inertia = mj.body_mass[index, ...], mj.body_inertia[index]
-
-    def write(value: Floats) -> None:
-        mass[...] = value
-        inertia[:] = value * moments
-
-    return Slot(write, mass.copy, constant=True)
-
-
-def _box(mj: mujoco.MjModel, _: Any, *, name: str, quantity: str) -> Slot:
-    """Find mass [kg] or full edge lengths [m] of a solid box; its inertia follows both."""
-    body = mj.body(name).id
-    mass, inertia = mj.body_mass[body, ...], mj.body_inertia[body]
-    half = mj.geom_size[mj.geom(name).id]
-
-    def write(value: Floats) -> None:
-        if quantity == "mass":
-            mass[...] = value
-        else:
-            half[:] = 0.5 * value
-        (x, y, z), third = (half * half).tolist(), float(mass) / 3.0
-        inertia[:] = third * (y + z), third * (z + x), third * (x + y)  # m/12 (b² + c²)
-
-    read = mass.copy if quantity == "mass" else lambda: 2.0 * half
-    return Slot(write, read, constant=True)
-
-
-def _obstacle(mj: mujoco.MjModel, _: Any, *, name: str, quantity: str) -> Slot:
-    """Find edge lengths [m], center [m] or orientation of a box that nothing moves."""
-    shape = mj.geom(name).id
-    if quantity == "position":
-        return place(mj.geom_pos[shape], constant=True)
-    if quantity == "orientation":
-        return turn(mj.geom_quat[shape])
-    return place(mj.geom_size[shape], to=lambda v: 0.5 * v, back=lambda v: 2.0 * v, constant=True)
-
-
-def _restitution(mj: mujoco.MjModel, _: Any, *, rigid: tuple[float, float]) -> Slot:
-    """Find how much of its speed a body keeps when it bounces, in [0, 1).
+def _restitution(time: float, ratio: float) -> Finder:
+    """Return what finds how much of its speed a body keeps when it bounces, in [0, 1).
 
     A contact is a spring and a damper. A damping ratio z leaves ``exp(-pi z / sqrt(1 - z²))`` of
     the speed after half a period; the frequency stays, and with it how far a body sinks in.
 
-    ``rigid`` has time constant [s] and damping ratio of a contact without restitution, which is
-    critically damped.
+    ``time`` [s] and ``ratio`` are time constant and damping ratio of a contact without restitution,
+    which is critically damped.
     """
-    time, ratio = rigid
-    references = mj.pair_solref
 
-    def write(value: Floats) -> None:
-        loss = -math.log(value) if value > 0.0 else math.inf
-        damping = loss / math.hypot(math.pi, loss) if loss < math.inf else 1.0
-        references[:, 0], references[:, 1] = time / damping, ratio * damping
+    def find(mj: mujoco.MjModel, _: Any) -> Slot:
+        references = mj.pair_solref
 
-    def read() -> Floats:
-        damping = float(references[0, 1]) / ratio
-        if damping >= 1.0:
-            return np.array(0.0)
-        return np.array(math.exp(-math.pi * damping / math.sqrt(1.0 - damping * damping)))
+        def write(value: Floats) -> None:
+            loss = -math.log(value) if value > 0.0 else math.inf
+            damping = loss / math.hypot(math.pi, loss) if loss < math.inf else 1.0
+            references[:, 0], references[:, 1] = time / damping, ratio * damping
 
-    return Slot(write, read)
+        def read() -> Floats:
+            damping = float(references[0, 1]) / ratio
+            if damping >= 1.0:
+                return np.array(0.0)
+            return np.array(math.exp(-math.pi * damping / math.sqrt(1.0 - damping * damping)))
 
+        return Slot(write, read)
 
-SPINNING_LIMIT = 1.0
-"""At most this many times its sliding friction is the spinning friction of a pair [m]. Above about
-five times the solver of the engine speeds a spinning body up, tenfold and more in a step; a real
-patch of contact gives two thirds of its radius."""
+    return find
 
 
 def couple(mj: mujoco.MjModel) -> None:

@@ -1,24 +1,34 @@
-"""A block as a hand sees it: in a frame that is the same however the block's own axes are named.
+"""Blocks as a hand and as a planner see them.
 
-A box looks the same after half a turn, and after a quarter with two edges exchanged. What is
-observed of its pose is not: a learner has to find out that four quaternions are one place. With the
-task option ``views=True`` each block that has a goal has a readout ``BLOCK.view`` without that
-ambiguity. Its axes are those of the block's vertical sides, the first one within 45 degrees of x.
+The view of a hand is in a frame that is the same however the block's own axes are named. A box
+looks the same after half a turn, and after a quarter with two edges exchanged. What is observed of
+its pose is not: a learner has to find out that four quaternions are one place. With the task option
+``views=True`` each block that has a goal has a readout ``BLOCK.view`` without that ambiguity. Its
+axes are those of the block's vertical sides, the first one within 45 degrees of x.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numba import njit
 
-from scm_world._types import Floats
-from scm_world.geometry.rotations import rotation_kernel
+from scm_world._types import Floats, Values
+from scm_world.geometry.rotations import rotation_kernel, rotation_matrix
+from scm_world.tasks.trifinger.kernels import POSE, TIPS
 
 QUARTER = 0.5 * math.pi
 SIZE = 20
 """Of a view."""
+
+NEAR = 0.1
+"""What a meter between fingertips and block counts beside one between block and goal."""
+
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+"""Of a cube with edges of length one, shape (8, 3)."""
 
 
 @njit(cache=True)
@@ -78,3 +88,40 @@ def view(
     out[17] = turn - QUARTER * round(turn / QUARTER)
     out[18], out[19] = cos * lean_x + sin * lean_y, cos * lean_y - sin * lean_x
     return out
+
+
+def view_of(
+    targets: Mapping[str, str],
+) -> tuple[tuple[str, ...], int, Callable[[Values], Floats]]:
+    """Describe the view of the boxes that have goals, in their own frames."""
+    parts = [
+        (TIPS, *(f"{tool}.{part}" for part in POSE), *(f"{goal}.{p}" for p in POSE[1:]))
+        for goal, tool in targets.items()
+    ]
+
+    def seen(values: Values) -> Floats:
+        return np.concatenate([view(*(values[name] for name in names)) for names in parts])
+
+    return tuple(dict.fromkeys(itertools.chain(*parts))), SIZE * len(parts), seen
+
+
+def boxes_apart(tips: Floats, *values: Floats) -> Floats:
+    """Compute minus the distances of boxes, given as size, position and quaternion each."""
+    half = len(values) // 2
+    total = np.zeros(tips.shape[:-1])
+    fingers = tips.reshape(*tips.shape[:-1], 3, 3)
+    for first in range(0, half, 3):
+        box, goal = (values[at : at + 3] for at in (first, half + first))
+        gaps = np.linalg.norm(corners(*box) - corners(*goal), axis=-1)
+        reach = np.linalg.norm(fingers - box[1][..., None, :], axis=-1)
+        total += gaps.mean(axis=-1) + NEAR * reach.mean(axis=-1)
+    return -total / (half // 3)
+
+
+def corners(size: Floats, position: Floats, orientation: Floats) -> Floats:
+    """Compute the corners of boxes, shape (..., 8, 3) [m]."""
+    body = CORNERS * size[..., None, :]
+    found: Floats = position[..., None, :] + body @ np.swapaxes(
+        rotation_matrix(orientation), -1, -2
+    )
+    return found

@@ -1,26 +1,42 @@
-"""The robot, blocks, obstacles and goals together."""
+"""The robot, blocks, obstacles and goals together, and which of them are in one place."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, final
 
-from scm_world._types import Values
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from scm_world._types import Floats, Values
+from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models import GoalRegion, Light, ParameterKey, Scene
-from scm_world.models.camera import Camera
-from scm_world.models.scene import Overlap
+from scm_world.models.camera import Camera, camera_from
+from scm_world.models.scene import TOLERANCE, Overlap
 from scm_world.tasks.base import Timing
 from scm_world.tasks.composition import Composition, Entity
 from scm_world.tasks.model import causes_of
-from scm_world.tasks.trifinger.conventions import TriFingerConventions
+from scm_world.tasks.trifinger.cameras import CAMERAS
 from scm_world.tasks.trifinger.entities.robot import RobotCommands, acted_on
-from scm_world.tasks.trifinger.entities.stage import cameras_of, light_of
-from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
-from scm_world.tasks.trifinger.hardware import FINGERS, LINK_NAMES, PRESET_NAMES, preset
+from scm_world.tasks.trifinger.grasping.hand import deepest_kernel
+from scm_world.tasks.trifinger.hardware import (
+    FINGERS,
+    LINK_NAMES,
+    N_JOINTS,
+    PRESETS,
+    WALL_HEIGHT,
+    WALL_RADIUS,
+    link_name,
+)
+from scm_world.tasks.trifinger.kinematics import forward, forward_kernel
 from scm_world.variables import Variable
 from scm_world.variables.kinds import Coupled
 from scm_world.variables.reserved import PRESET
+
+if TYPE_CHECKING:
+    from scm_world.tasks.trifinger.system import TriFinger
 
 PARAMETERS = {
     "gravity": ("world", "gravity"),
@@ -40,18 +56,70 @@ PARAMETERS = {
 }
 """Variables that are parameters of the model, as far as it has them, under other names."""
 
-QUANTITIES = {
-    "mass": "mass",
-    "size": "size",
-    "friction": "friction",
-    "color": "color",
-    "cartesian_position": "position",
-    "orientation": "orientation",
-}
-"""Quantities of bodies that are parameters, as far as the model has them, and its names of them."""
+QUANTITIES = ("mass", "size", "friction", "color", "cartesian_position", "orientation")
+"""Quantities of bodies that are parameters, as far as the model has them; ``position`` in it."""
 
-if TYPE_CHECKING:
-    from scm_world.tasks.trifinger.system import TriFinger
+BALLS_MARGIN = 1e-3  # [m] by which balls of two legs may be deeper in one another than capsules
+
+
+def overlaps(scene: Scene, *, tolerance: float, enough: float = math.inf) -> tuple[Overlap, ...]:
+    """List all pairs of bodies that lie deeper in one another than a tolerance.
+
+    Compared are blocks with everything; the middle and lower links of different fingers with one
+    another; both with the floor and obstacles; the tips with the ring. What has its center beyond
+    the ring has left the arena, and lies in the stage: a block at any height, a tip below the
+    upper end.
+
+    Args:
+        scene: With complete parameters.
+        tolerance: How deep is too deep [m].
+        enough: Where some lie deeper than this in one another, those alone may be listed [m].
+
+    Returns:
+        One entry for each pair of names, blocks first.
+
+    Example:
+        >>> from scm_world.tasks.trifinger.system import trifinger
+        >>> scene = trifinger(("tool_block",)).default_scene()
+        >>> overlaps(scene, tolerance=1e-4)
+        ()
+        >>> scene.state.positions[0, 2] = 0.03
+        >>> print(*overlaps(scene, tolerance=1e-4))
+        'tool_block' lies 2.5 mm deep in 'floor'
+    """
+    from scm_world.backends.mujoco import overlaps as engine
+
+    found, state = engine.overlaps(scene, tolerance, enough=enough), scene.state
+    if any(overlap.depth > enough for overlap in found):
+        return found
+    tips = forward(state.joint_positions, float(scene.parameters["robot", "height"])).reshape(3, 3)
+    centers = np.vstack([state.positions, tips])
+    beyond = np.hypot(centers[:, 0], centers[:, 1]) - WALL_RADIUS
+    beyond[len(state.positions) :][tips[:, 2] > WALL_HEIGHT] = 0.0
+    if beyond.max() <= tolerance:
+        return found
+    names = *scene.structure.blocks, *(link_name(f, 3) for f in FINGERS)
+    deepest = {overlap.bodies: overlap.depth for overlap in found}
+    for name, depth in zip(names, beyond.tolist(), strict=True):
+        if depth > tolerance:
+            deepest[name, "stage"] = max(depth, deepest.get((name, "stage"), 0.0))
+    return tuple(Overlap(bodies, depth) for bodies, depth in deepest.items())
+
+
+@njit(cache=True)
+def _clear(joints: Floats, heights: Floats, limit: float) -> NDArray[np.bool_]:
+    """Return for each row of joints whether fingers may be clear of one another and of the ring.
+
+    Rows with True have to be looked at with ``overlaps``.
+    """
+    found, none = np.empty(len(joints), dtype=np.bool_), np.empty((0, 3, 5))
+    for row in range(len(joints)):
+        tips, apart = forward_kernel(joints[row], heights[row]), True
+        for x, y, z in tips.reshape(3, 3):
+            apart &= z > WALL_HEIGHT or math.hypot(x, y) - WALL_RADIUS <= limit
+        most = limit + BALLS_MARGIN
+        found[row] = apart and deepest_kernel(joints[row], heights[row], none) <= most
+    return found
 
 
 @final
@@ -61,53 +129,46 @@ class BlockWorld(Composition):
     Args:
         entities: In the order of the observation.
         shared: Variables that belong to no single entity.
-        deciding: Variables that decide which entities there are. A body that comes or goes acts
-            on the others by contact, so they do.
+        task: Its conventions say how deep bodies may lie in one another after an intervention, and
+            whether Bullet has the physics of the predecessor. A body that comes or goes acts on the
+            others by contact, so the variables of ``decided_by`` do.
         timing: Says how the robot is commanded, and how finely joints are cut.
-        conventions: Say how deep bodies may lie in one another after an intervention, and
-            whether Bullet has the physics of the predecessor.
-        unchecked: Entities on which an intervention is accepted however deep it puts bodies.
     """
 
     solid = True
 
     def __init__(
-        self,
-        entities: tuple[Entity, ...],
-        shared: tuple[Variable, ...],
-        deciding: tuple[str, ...],
-        timing: Timing,
-        conventions: TriFingerConventions,
-        unchecked: tuple[str, ...] = (),
+        self, entities: tuple[Entity, ...], shared: tuple[Variable, ...], task: Any, timing: Timing
     ) -> None:
-        self.entities, self._shared, self._deciding = entities, shared, deciding
-        self._timing, self._conventions, self._unchecked = timing, conventions, unchecked
+        self.entities, self._shared, self._timing = entities, shared, timing
+        self._deciding, self._conventions = task.decided_by, task.conventions
+        self._unchecked = task.unchecked if self._conventions.published else ()
         self.blocks = tuple(e.name for e in entities if e.kind == "block")
         self.obstacles = tuple(e.name for e in entities if e.kind == "obstacle")
         blocks = (e for e in entities if e.kind == "block")
         self.hulls = tuple((e.name, e.hull) for e in blocks if e.hull is not None)
         self.bodies, self.hides_goals = (*self.blocks, *self.obstacles), bool(self.obstacles)
-        self._systems: dict[str, TriFinger] = {}
-        super().__init__(self._system(PRESET_NAMES[0]), RobotCommands(timing.action_mode))
+        self._systems: dict[int, TriFinger] = {}
+        super().__init__(self._system(0), RobotCommands(timing.action_mode))
 
     def structure(self, values: Values) -> TriFinger:
         """Return the model of the bodies, with the settings that a preset stands for."""
-        return self._system(PRESET_NAMES[int(values[PRESET])])
+        return self._system(int(values[PRESET]))
 
-    def _system(self, name: str) -> TriFinger:
-        if name not in self._systems:
+    def _system(self, number: int) -> TriFinger:
+        if number not in self._systems:
             from scm_world.tasks.trifinger.system import trifinger  # it loads an engine
 
-            self._systems[name] = trifinger(
+            self._systems[number] = trifinger(
                 self.blocks,
-                preset(name),
+                [*PRESETS.values()][number],
                 self.obstacles,
                 self.hulls,
                 torques=self._timing.action_mode == "joint_torques",
                 resolution=self._timing.resolution,
-                published=self._conventions.published_physics,
+                published=self._conventions.published,
             )
-        return self._systems[name]
+        return self._systems[number]
 
     def overlaps(
         self,
@@ -130,8 +191,15 @@ class BlockWorld(Composition):
         )
 
     def thin(self, candidates: Any, limit: float) -> None:
-        """Leave out candidates whose fingers cross one another."""
-        thin(candidates, max(limit, self._conventions.robot_tolerance))
+        """Leave out candidates whose fingers lie deep in one another, or beyond the ring.
+
+        Most draws of the joints are of this kind.
+        """
+        joints = candidates.state(slice(0, N_JOINTS))
+        if len(joints) > 1:
+            heights = np.broadcast_to(candidates.parameter(("robot", "height")), len(joints))
+            limit = max(limit, self._conventions.robot_tolerance)
+            candidates.keep(_clear(joints, np.ascontiguousarray(heights), limit))
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable; edges into states follow from the kinematic trees."""
@@ -167,20 +235,28 @@ class BlockWorld(Composition):
         """Return which variable sets which physical parameter."""
         known, found = {row.key for row in self.system.parameters}, dict[str, ParameterKey]()
         for entity in self.entities:
-            names = dict.fromkeys(variable.name for variable in entity.variables)
-            found |= {name: key for name, key in PARAMETERS.items() if name in names}
-            split = [name.rpartition(".") for name in names]
-            found |= {
-                f"{body}.{ours}": (body, its)
-                for ours, its in QUANTITIES.items()
-                for body, _, quantity in split
-                if quantity == ours
-            }
+            names = [variable.name for variable in entity.variables]
+            found |= {name: PARAMETERS[name] for name in names if name in PARAMETERS}
+            for part in QUANTITIES:
+                bodies = (
+                    name.removesuffix(f".{part}") for name in names if name.endswith(f".{part}")
+                )
+                its = part.removeprefix("cartesian_")
+                found |= {f"{body}.{part}": (body, its) for body in bodies}
         return {name: key for name, key in found.items() if key in known}
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
-        """List goals that lie in an obstacle."""
-        return buried_goals(scene, names)
+        """List goals that lie deeper than ``TOLERANCE`` in an obstacle: nothing can fill them."""
+        found, obstacles = list[Overlap](), scene.structure.obstacles
+        goals = [goal for goal in scene.goals if obstacles and goal.name in names]
+        for goal in (goal for goal in goals if goal.shape == "sphere"):
+            inside = (Overlap((goal.name, o), _depth_in_box(goal, scene, o)) for o in obstacles)
+            found += [overlap for overlap in inside if overlap.depth > TOLERANCE]
+        solid = [goal for goal in goals if goal.shape != "sphere"]
+        if solid:
+            listed = overlaps(_filled(solid, scene.parameters, obstacles), tolerance=TOLERANCE)
+            found += [overlap for overlap in listed if overlap.bodies[1] in obstacles]
+        return tuple(found)
 
     def movers(self) -> tuple[str, ...]:
         """Name the fingers, then the blocks. The bases of fingers are fixed."""
@@ -191,9 +267,9 @@ class BlockWorld(Composition):
         bodies = self.touched()
         return {name: body for name, (body, _) in self.parameters().items() if body in bodies}
 
-    def goals(self, values: Values) -> tuple[GoalRegion, ...]:
-        """Describe all goals."""
-        return tuple(
+    def looks(self, values: Values) -> tuple[tuple[GoalRegion, ...], Light]:
+        """Describe all goals, and the light of pictures."""
+        goals = tuple(
             GoalRegion(
                 name=entity.name,
                 shape=entity.shape if entity.hull is None else "hull",
@@ -206,11 +282,53 @@ class BlockWorld(Composition):
             for entity in self.entities
             if entity.kind == "goal"
         )
-
-    def light(self, values: Values) -> Light:
-        """Describe the light of pictures."""
-        return light_of(values)
+        x, y, z = values["light_direction"].tolist()
+        return goals, Light((x, y, z), float(values["light_ambient"]))
 
     def cameras(self, values: Values) -> tuple[Camera, ...]:
-        """Describe the three cameras of the robot."""
-        return cameras_of(values)
+        """Describe the three cameras of the robot, with pictures of 128 x 128 pixels."""
+        return tuple(
+            camera_from(
+                camera.name,
+                values[f"camera_{camera.name}.position"],
+                values[f"camera_{camera.name}.orientation"],
+                float(values[f"camera_{camera.name}.field_of_view"]),
+            )
+            for camera in CAMERAS
+        )
+
+
+def _filled(
+    goals: Sequence[GoalRegion], parameters: Mapping[Any, Any], obstacles: tuple[str, ...] = ()
+) -> Scene:
+    """Return a scene with blocks in the places of goals."""
+    from scm_world.tasks.trifinger.system import trifinger  # it loads an engine
+
+    hulls = tuple((goal.name, goal.hull) for goal in goals if goal.hull is not None)
+    blocks = tuple(goal.name for goal in goals)
+    scene = trifinger(blocks, obstacles=obstacles, hulls=hulls).default_scene()
+    sizes = {(goal.name, "size"): goal.size for goal in goals if goal.hull is None}
+    for pose, goal in zip(scene.state.blocks, goals, strict=True):
+        pose[:3], pose[3:7] = goal.position, goal.orientation
+    return scene.with_(parameters={**scene.parameters, **parameters, **sizes})
+
+
+def _depth_in_box(goal: GoalRegion, scene: Scene, obstacle: str) -> float:
+    """Measure how far a sphere would have to be moved out of an obstacle [m]."""
+    size, place, turn = (
+        scene.parameters[obstacle, what] for what in ("size", "position", "orientation")
+    )
+    beyond = np.abs((goal.position - place) @ rotation_matrix(turn)) - 0.5 * size
+    distance = np.linalg.norm(np.maximum(beyond, 0.0)) + min(beyond.max(), 0.0)
+    return 0.5 * float(goal.size[0]) - float(distance)
+
+
+def fingers_reach(
+    size: Floats, position: Floats, orientation: Floats, joints: Floats, height: float
+) -> bool:
+    """Return whether a finger lies in a box with these edges and this pose, at given joints."""
+    box = GoalRegion("box", "box", size, position, orientation, color=np.zeros(3))
+    scene = _filled([box], {("robot", "height"): height})
+    scene.state.joint_positions[:] = joints
+    found = overlaps(scene, tolerance=TOLERANCE)
+    return any("box" in o.bodies and o.bodies[1] in LINK_NAMES for o in found)

@@ -21,12 +21,12 @@ from scm_world.tasks.trifinger.hardware import (
     N_JOINTS,
     QUANTITIES,
     RESOLUTIONS,
-    ControllerSpec,
     JointGroup,
     joints_of,
 )
 from scm_world.tasks.trifinger.kinematics import forward_kernel, inverse_kernel, tip_kernel
 from scm_world.variables import Action, Box, Function, Measured, Normal, Variable, bundle
+from scm_world.variables.mechanisms import Stacked
 from scm_world.variables.reserved import ACTUATOR_NOISE
 
 ACTIONS = {
@@ -36,32 +36,34 @@ ACTIONS = {
 }
 """Unit and range of each way to command the robot."""
 
-_SPEC = ControllerSpec()
-
 HIDDEN = (
-    numbers.FRICTION.declare(
+    numbers.FRICTION.root(
         "finger_friction",
-        numbers.FINGER_FRICTION,
+        numbers.SURFACE_FRICTION,
         "Friction of all links; a contact has the product of two frictions.",
     ),
-    numbers.JOINT_DAMPING.declare("joint_damping", 0.0, "Passive damping of every joint."),
-    numbers.POSITION_GAINS.declare(
-        "position_gains", _SPEC.kp, "Proportional gain of the three joints of a finger."
+    numbers.JOINT_DAMPING.root("joint_damping", 0.0, "Passive damping of every joint."),
+    numbers.POSITION_GAINS.root(
+        "position_gains",
+        hardware.POSITION_GAINS,
+        "Proportional gain of the three joints of a finger.",
     ),
-    numbers.VELOCITY_GAINS.declare(
-        "velocity_gains", _SPEC.kd, "Derivative gain of the three joints of a finger."
+    numbers.VELOCITY_GAINS.root(
+        "velocity_gains",
+        hardware.VELOCITY_GAINS,
+        "Derivative gain of the three joints of a finger.",
     ),
-    numbers.SAFETY_DAMPING.declare(
+    numbers.SAFETY_DAMPING.root(
         "safety_damping",
-        _SPEC.safety,
+        hardware.SAFETY_DAMPING,
         "Damping of the safety filter, for the three joints of a finger.",
     ),
-    numbers.TORQUE.declare(
+    numbers.TORQUE.root(
         "torque_limit",
-        _SPEC.limit,
+        hardware.TORQUE_LIMIT,
         "Largest torque of a joint. Torques that are commanded end at 0.36 N m for any value.",
     ),
-    numbers.NOISE.declare(
+    numbers.NOISE.root(
         ACTUATOR_NOISE,
         0.0,
         "Standard deviation of a command, as a fraction of half the range of an action.",
@@ -84,17 +86,11 @@ def tips(joint_positions: Floats, robot_height: Value) -> Floats:
     return found
 
 
+@Stacked
 @njit(cache=True)
-def finger_tip(joint_positions: Floats, robot_height: Value, finger: float) -> Floats:
-    """Compute the tip of one finger from its three joints, shape (3,) [m]."""
-    return np.array(tip_kernel(int(finger), joint_positions, scalar(robot_height)))
-
-
-@njit(cache=True)
-def joints_tip(q0: Value, q1: Value, q2: Value, robot_height: Value, finger: float) -> Floats:
-    """Compute the tip of one finger from the angle of each joint, shape (3,) [m]."""
-    angles = np.array([scalar(q0), scalar(q1), scalar(q2)])
-    return np.array(tip_kernel(int(finger), angles, scalar(robot_height)))
+def finger_tip(numbers: Floats, finger: float) -> Floats:
+    """Compute the tip of a finger, shape (3,) [m], from its three joints and the robot's height."""
+    return np.array(tip_kernel(int(finger), numbers[:3], numbers[3]))
 
 
 STREAM = "actuators"
@@ -160,7 +156,7 @@ def robot(
         whole = bundle("action", actions, bounds=range_, doc="What the policy commands.")
         variables.append(whole)
     variables.append(
-        numbers.ROBOT_HEIGHT.declare(
+        numbers.ROBOT_HEIGHT.root(
             "robot_height",
             hardware.NOMINAL_HEIGHT,
             "Height of the robot's base above a plane 0.011 m below the table top.",
@@ -170,8 +166,8 @@ def robot(
         link = hardware.link_name(finger, index)
         still = " It is fixed to the base, so nothing depends on it." if index == 0 else ""
         doc = f"Mass of the link; its inertia scales with it.{still}"
-        variables.append(numbers.LINK_MASSES.declare(f"{link}.mass", mass, doc))
-        variables.append(numbers.color(f"{link}.color", hardware.LINK_COLORS[finger]))
+        variables.append(numbers.LINK_MASSES.root(f"{link}.mass", mass, doc))
+        variables.append(numbers.COLOR.root(f"{link}.color", hardware.LINK_COLORS[finger]))
     variables += [*HIDDEN, *_tips(groups)]
     if len(groups) > 1:
         for index, (name, (kind, doc)) in enumerate(zip(QUANTITIES, MOVES, strict=True)):
@@ -209,16 +205,15 @@ def _moving(quantity: int, joints: JointGroup, start: tuple[float, ...]) -> Meas
     if quantity == 0 and not joints.shape:
         doc = "Angle of {}."
     default = start[joints.where] if quantity == 0 else (0.0,) * len(start[joints.where])
-    spaces: dict[str, Any] = {}
+    cut: dict[str, Any] = {}
     if quantity == 0:
-        whole = {"bounds": kind.bounds, "a": kind.a, "b": kind.b}
-        spaces = {space: joints.cut(box) for space, box in whole.items()}
+        cut = {space: joints.cut(getattr(kind, space)) for space in ("bounds", "a", "b")}
     return replace(kind, shape=joints.shape).state(
         joints.names[quantity],
         default if joints.shape else default[0],
         doc.format(joints.of),
         settable_state=quantity < 2,
-        **spaces,
+        **cut,
     )
 
 
@@ -230,19 +225,16 @@ def _tips(groups: tuple[JointGroup, ...]) -> Iterable[Variable]:
         parents = ("joint_positions", "robot_height")
         yield Measured(name=name, shape=(9,), parents=parents, mechanism=tips, doc=doc, **fields)
         return
-    found = []
-    for index, finger in enumerate(FINGERS):
-        angles = [joints.names[0] for joints in groups if finger in joints.fingers]
-        function = finger_tip if len(angles) == 1 else joints_tip
-        found.append(
-            Measured(
-                name=f"finger_{finger}.end_effector_position",
-                shape=(3,),
-                parents=(*angles, "robot_height"),
-                mechanism=Function(function, constants={"finger": float(index)}),
-                doc=f"The tip of finger {finger}.",
-                **fields,
-            )
+    found = [
+        Measured(
+            name=f"finger_{finger}.end_effector_position",
+            shape=(3,),
+            parents=(*(j.names[0] for j in groups if finger in j.fingers), "robot_height"),
+            mechanism=Function(finger_tip, constants={"finger": float(index)}),
+            doc=f"The tip of finger {finger}.",
+            **fields,
         )
+        for index, finger in enumerate(FINGERS)
+    ]
     yield from found
     yield bundle(name, found, doc=doc, **fields)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
-from scm_world._types import Values
 from scm_world.geometry import from_rotation_vector, to_rotation_vector
 from scm_world.models import Light
-from scm_world.models.camera import Camera, camera_from
+from scm_world.models.camera import Camera
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger.cameras import CAMERAS, published_poses
-from scm_world.tasks.trifinger.hardware import PRESET_NAMES
+from scm_world.tasks.trifinger.cameras import CAMERAS, POSES
+from scm_world.tasks.trifinger.hardware import PRESETS, SPINNING_FRICTION
 from scm_world.variables import Box, Variable
 from scm_world.variables.reserved import PRESET, SENSOR_NOISE
 
@@ -19,7 +19,7 @@ from scm_world.variables.reserved import PRESET, SENSOR_NOISE
 def stage(preset: str) -> Entity:
     """Describe what the robot and the blocks stand in, with the settings that a preset names."""
     frictions = (
-        numbers.FRICTION.declare(
+        numbers.FRICTION.root(
             f"{surface}_friction",
             numbers.SURFACE_FRICTION,
             f"Friction of {what}; a contact has the product of two frictions.",
@@ -27,28 +27,28 @@ def stage(preset: str) -> Entity:
         for surface, what in (("floor", "the table"), ("stage", "the ring wall"))
     )
     variables = (
-        numbers.GRAVITIES.declare(
-            "gravity", numbers.GRAVITY, "Acceleration of free fall; it pulls the fingers too."
+        numbers.GRAVITIES.root(
+            "gravity", (0.0, 0.0, -9.81), "Acceleration of free fall; it pulls the fingers too."
         ),
         *frictions,
-        numbers.color("floor_color", numbers.FLOOR_COLOR),
-        numbers.color("stage_color", numbers.STAGE_COLOR),
-        numbers.RESTITUTION.declare(
+        numbers.COLOR.root("floor_color", (0.31, 0.27, 0.25)),
+        numbers.COLOR.root("stage_color", (0.95, 0.95, 0.95)),
+        numbers.RESTITUTION.root(
             "restitution",
             0.0,
             "Speed after a head-on impact over speed before it, for every contact.",
         ),
-        numbers.SPINNING.declare(
+        numbers.SPINNING.root(
             "spinning_friction",
-            numbers.SPINNING_FRICTION,
+            SPINNING_FRICTION,
             "Friction of every contact against turning about its normal.",
         ),
-        numbers.PRESETS.declare(
+        numbers.PRESETS.root(
             PRESET,
-            PRESET_NAMES.index(preset),
+            [*PRESETS].index(preset),
             "How finely time is cut: 0 is fast (4 ms), 1 is precise (2 ms).",
         ),
-        numbers.NOISE.declare(
+        numbers.NOISE.root(
             SENSOR_NOISE,
             0.0,
             "Standard deviation of every observed number, as a fraction of half its range.",
@@ -70,12 +70,12 @@ def light_and_cameras() -> Entity:
             Box((0.0, -1.0, 0.5), (1.0, 0.0, 1.0)),
             Box((-1.0, 0.0, 0.5), (0.0, 1.0, 1.0)),
             shape=(3,),
-        ).declare(
+        ).root(
             "light_direction",
             _DEFAULT.direction,
             "Direction towards the light, of any length; only pictures depend on it.",
         ),
-        numbers.Range(Box(0.0, 1.0), Box(0.2, 0.4), Box(0.4, 0.7)).declare(
+        numbers.Range(Box(0.0, 1.0), Box(0.2, 0.4), Box(0.4, 0.7)).root(
             "light_ambient",
             _DEFAULT.ambient,
             "Brightness of what the light does not reach; only pictures depend on it.",
@@ -88,16 +88,16 @@ def light_and_cameras() -> Entity:
 def _camera(camera: Camera) -> Iterable[Variable]:
     """Declare the pose of a camera, and its opening angle; A and B are near the usual ones."""
     name = f"camera_{camera.name}"
-    position, orientation = (pose.tolist() for pose in published_poses()[camera.name])
+    position, orientation = (pose.tolist() for pose in POSES[camera.name])
     x, y, z = position
     a = Box((x - _NEAR, y - _NEAR, z - _NEAR), (x + _NEAR, y + _NEAR, z + _NEAR))
     b = Box((x - _NEAR, y - _NEAR, z + _NEAR), (x + _NEAR, y + _NEAR, z + _FAR))
-    yield numbers.Range(Box(-2.0, 2.0), a, b, "m", (3,)).declare(
+    yield numbers.Range(Box(-2.0, 2.0), a, b, "m", (3,)).root(
         f"{name}.position",
         tuple(position),
         "Where the camera stands; only pictures depend on it.",
     )
-    yield numbers.ORIENTATIONS.declare(
+    yield numbers.ORIENTATIONS.root(
         f"{name}.orientation",
         tuple(orientation),
         "Quaternion (x, y, z, w) of its axes right, down and forward.",
@@ -106,35 +106,13 @@ def _camera(camera: Camera) -> Iterable[Variable]:
     low, high = usual - _TURN, usual + _TURN
     far_low, far_high = (*low[:2], high[2]), (*high[:2], usual[2] + 3.0 * _TURN)
     a, b = Box(tuple(low), tuple(high)), Box(far_low, far_high)
-    yield numbers.Range(None, a, b, "rad", (3,)).declare(
+    yield replace(numbers.YAWS, a=a, b=b).derived(
         f"{name}.euler_orientation",
-        None,
-        "Orientation as a rotation vector; setting it sets the quaternion.",
-        (f"{name}.orientation",),
-        to_rotation_vector,
+        (to_rotation_vector, f"{name}.orientation"),
         inverse=from_rotation_vector,
     )
-    yield numbers.Range(Box(5.0, 150.0), Box(50.0, 54.0), Box(54.0, 60.0), "deg").declare(
+    yield numbers.Range(Box(5.0, 150.0), Box(50.0, 54.0), Box(54.0, 60.0), "deg").root(
         f"{name}.field_of_view",
         camera.field_of_view,
         "Vertical opening angle; only pictures depend on it.",
-    )
-
-
-def light_of(values: Values) -> Light:
-    """Describe the light."""
-    x, y, z = values["light_direction"].tolist()
-    return Light((x, y, z), float(values["light_ambient"]))
-
-
-def cameras_of(values: Values) -> tuple[Camera, ...]:
-    """Describe the three cameras, with pictures of 128 x 128 pixels."""
-    return tuple(
-        camera_from(
-            camera.name,
-            values[f"camera_{camera.name}.position"],
-            values[f"camera_{camera.name}.orientation"],
-            float(values[f"camera_{camera.name}.field_of_view"]),
-        )
-        for camera in CAMERAS
     )

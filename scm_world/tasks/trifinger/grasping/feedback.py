@@ -9,26 +9,21 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from scm_world._types import ArrayLike, Floats
+from scm_world._types import Floats
 from scm_world.errors import ActionError
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.grasping.bodies import (
-    Cuboid,
-    Sight,
-    instant,
-    smallest,
-    turn_about_z,
-)
-from scm_world.tasks.trifinger.grasping.choice import Choice
-from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand
-from scm_world.tasks.trifinger.grasping.ways import (
+from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, turn_about_z
+from scm_world.tasks.trifinger.grasping.choice import (
     CLEARANCE,
     EDGE,
     OPENINGS,
     SAMPLES,
+    Choice,
     Grip,
     Move,
+    passing,
 )
+from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS
 
 FREE = np.zeros((3, 3))
 TRAVEL, CLOSE = 0.022, 0.006  # [m] per control step, of fingertips far from a block, and beside it
@@ -53,7 +48,7 @@ LAG, TWIST = 0.015, 0.2  # [m], [rad] that a held block may be behind its comman
 OFF = 0.001, 0.007  # [m] above the floor, between which a block begins to follow fingertips
 BACK = 0.0005  # [m] by which slipping fingertips are brought back
 PUSHED = 0.06  # [rad] that a command changes in a step while fingers press
-ARRIVED = np.array([0.005, 0.06])  # [m, rad] of a block that is let go of, at once
+ARRIVED, ALIGNED = 0.005, 0.06  # [m], [rad] of a block that is let go of
 AGAIN, STUCK, RETREAT = 25, 100, 14
 """Control steps until another plan, until fingers count as stuck, and that they then go back."""
 
@@ -71,7 +66,10 @@ class Feedback:
 
     What it does follows from where things are and from its last command, not from the time. So a
     network can imitate it, and it goes on from wherever somebody else has led. It remembers which
-    block it takes, by which grip, and where to.
+    block it takes, by which grip, and where to; all else is read in each step: fingertips go above
+    the grip, down, towards the faces, and press; then the block goes towards its goal, higher than
+    that as long as it is away from it. A command is the command before, corrected by a share of the
+    error: so forces need not be known exactly.
 
     One instance serves any number of episodes and of worlds.
 
@@ -83,14 +81,14 @@ class Feedback:
     """
 
     def __init__(self) -> None:
-        self._programs: WeakKeyDictionary[Any, Program] = WeakKeyDictionary()
+        self._programs: WeakKeyDictionary[Any, tuple[Any, Program]] = WeakKeyDictionary()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle without what is going on."""
         return Feedback, ()
 
     def __call__(self, world: Any) -> Floats:
-        """Give the action of the present step.
+        """Return the action of the present step.
 
         Raises:
             ActionError: Actions are torques, or the task has no blocks that have goals.
@@ -98,14 +96,17 @@ class Feedback:
         if world.action_mode == "joint_torques":
             problem = "a grasp needs joint or fingertip positions as actions, not torques"
             raise ActionError(problem, world.action_mode)
-        program = self._programs.get(world)
-        if program is None or program.next != instant(world):
-            program = self._programs[world] = Program(world)
+        episode, index = (world.noise.seed, world.episode), world.index
+        expected, program = self._programs.get(world, (None, None))
+        if program is None or expected != (episode, index):
+            program = Program(world)
+        self._programs[world] = (episode, index + 1), program
         command = program.command(world)
-        return program.hand.tips(command) if "effector" in world.action_mode else command
+        tips = "effector" in world.action_mode
+        return program.sight.tips_at(command).ravel() if tips else command
 
     def memory(self, world: Any) -> Floats:
-        """Say what it remembers after the action of the present step, by -1 for no and 1 for yes.
+        """Return what it remembers after the action of the present step: -1 for no, 1 for yes.
 
         Where a finger touches, and where the block is taken to, is not among it.
 
@@ -113,143 +114,100 @@ class Feedback:
             Shape (n + 5,) where there are n blocks with goals: which of them it takes, which
             fingers take part, whether they let go, and whether they go back since they were stuck.
         """
-        return self._programs[world].memory()
+        _, program = self._programs[world]
+        move, pairs = program.move, program.sight.pairs
+        used = move.grip.used if move is not None else (False,) * 3
+        taken = [move is not None and tool == move.end.name for tool, _ in pairs]
+        return np.where([*taken, *used, program.opens, program.back > 0], 1.0, -1.0)
 
 
 @final
 class Program:
-    """What is done in one episode, step by step.
-
-    The only memory is the job: which block is taken, by which grip, and where to. All else is read
-    from the world in each step: fingertips go above the grip, down, towards the faces, and press;
-    then the block goes towards its goal, higher than that as long as it is away from it. The last
-    block is not let go of. A command is the command before, corrected by a share of the error: so
-    forces need not be known exactly.
-
-    Args:
-        world: With blocks that have goals.
-
-    Attributes:
-        next: The instant whose command comes next.
-    """
+    """The policy in one episode, and its memory: the job."""
 
     def __init__(self, world: Any) -> None:
-        self._sight = Sight(world)
-        self._move: Move | None = None
-        self._goals = np.empty((0, 4))  # for which the job was chosen
-        self._idle = self._waiting = self._back = 0
-        self._opens = False
-        self.next = instant(world)
-
-    @property
-    def hand(self) -> Hand:
-        """The robot."""
-        return self._sight.hand
-
-    def memory(self) -> Floats:
-        """Say what is remembered; see ``Feedback.memory``."""
-        used = self._move.grip.used if self._move is not None else (False,) * 3
-        name = self._move.start.name if self._move is not None else None
-        taken = [tool == name for tool, _ in self._sight.pairs]
-        return np.where([*taken, *used, self._opens, self._back > 0], 1.0, -1.0)
+        self.sight = Sight(world)
+        self.move: Move | None = None
+        self.opens = False  # whether fingers let go
+        self.back = 0  # control steps for which they still go back since they were stuck
+        self._goals: Any = None  # for which the job was chosen
+        self._idle = self._waiting = 0
 
     def command(self, world: Any) -> Floats:
-        """Give the joint positions to command now, shape (9,) [rad]."""
-        sight, (seed, episode, index) = self._sight, self.next
-        self.next = seed, episode, index + 1
+        """Compute the joint positions to command now, shape (9,) [rad]."""
+        sight = self.sight
         sight.look(world)
-        hand, joints = sight.hand, sight.joints
-        before = _commanded(world, sight)
-        tips = hand.tips(joints).reshape(3, 3)
-        move = self._planned()
-        if self._back > 0:
-            self._back -= 1
-            place = hand.tips(np.array(hardware.REST)).reshape(3, 3)
-            place[:, 2] = 0.12
-            return self._to(place, TRAVEL, tips, before)
-        if move is None:
-            place = tips.copy()
-            place[:, 2] = np.maximum(tips[:, 2], 0.09)
-            return self._to(place, TRAVEL, tips, before)
-        body, grip, used = sight.body(move.start.name), move.grip, move.grip.used
+        move, tips = self._planned(), sight.tips
+        if self.back > 0 or move is None:
+            place = sight.tips_at(np.array(hardware.REST)) if self.back > 0 else tips.copy()
+            place[:, 2] = 0.12 if self.back > 0 else np.maximum(tips[:, 2], 0.09)
+            self.back = max(self.back - 1, 0)
+            return self._to(place, TRAVEL)
+        body, grip = sight.body(move.end.name), move.grip
         own = body.own(tips)
         inward, away = np.sign(grip.inward), own - grip.touch
         across = -(away * inward).sum(axis=1)
         along = np.linalg.norm(away + across[:, None] * inward, axis=1)
-        gap, side = across[used].max(), along[used].max()
-        if self._opens:
+        gap, side = across[grip.used].max(), along[grip.used].max()
+        if self.opens:
             self._waiting += 1
-            return self._to(self._place(move, body, grip.opening), CLOSE, tips, before)
+            return self._to(grip.place(sight, body, grip.opening), CLOSE)
         holds = gap < TOUCHING and side < SLIPPED
         other = None if holds else held(body, own)
         if other is not None and (other.firm or not grip.firm):
             holds, move = True, replace(move, grip=other)
-            self._move = move
+            self.move = move
         if holds:
             self._waiting = 0
-            return self._carry(move, body, tips, before)
+            return self._carry(move, body)
         self._waiting += 1
         if gap < grip.opening + BESIDE and side < ASIDE:
             opening = float(np.interp(side, (STRAIGHT, OBLIQUE), (-INTO, float(grip.opening))))
-            return self._to(self._place(move, body, opening), CLOSE, tips, before)
-        return self._to(self._way(move, body, tips, own), TRAVEL, tips, before)
-
-    # --- which block, and where to -----------------------------------------------------------
+            return self._to(grip.place(sight, body, opening), CLOSE)
+        return self._to(self._way(move, body), TRAVEL)
 
     def _planned(self) -> Move | None:
         """Keep the job until the block has arrived or has fallen over, or a goal moves.
 
         Fingers that are stuck go back first.
         """
-        move, self._idle = self._move, self._idle - 1
-        pairs = self._sight.pairs
-        goals = np.array([[*g.place, g.yaw] for g in (self._sight.body(goal) for _, goal in pairs)])
+        sight, move, self._idle = self.sight, self.move, self._idle - 1
+        goals = [(*goal.place, goal.yaw) for goal in (sight.body(name) for _, name in sight.pairs)]
         if move is not None:
-            body = self._sight.body(move.start.name)
-            error = math.dist(move.end.place, body.place), abs(self._turn(move, body))
+            body, grip = sight.body(move.end.name), move.grip
             stuck = self._waiting > STUCK
             if stuck:
-                self._back = RETREAT
-            self._opens |= move.release and bool((np.array(error) < ARRIVED).all())
-            tips = self._sight.hand.tips(self._sight.joints).reshape(3, 3)
-            away = np.abs(tips - self._place(move, body, 0.0))[move.grip.used].max(axis=1)
-            done = self._opens and away.min() > 0.8 * move.grip.opening
-            moved = not np.array_equal(goals, self._goals)
-            if stuck or done or moved or math.hypot(*body.lean) > 0.6:
-                move = self._move = None
+                self.back = RETREAT
+            arrived = math.dist(move.end.place, body.place) < ARRIVED
+            self.opens |= move.release and arrived and abs(_turn(move, body)) < ALIGNED
+            away = np.abs(sight.tips - grip.place(sight, body, 0.0))[grip.used].max(axis=1)
+            done = self.opens and away.min() > 0.8 * grip.opening
+            if stuck or done or goals != self._goals or math.hypot(*body.lean) > 0.6:
+                move = self.move = None
                 self._idle = 0
-        if move is None and self._idle <= 0 and self._back <= 0:
-            self._idle, self._waiting, self._opens = AGAIN, 0, False
-            self._move, self._goals = Choice(self._sight).move(), goals
-        return self._move
-
-    @staticmethod
-    def _turn(move: Move, body: Cuboid) -> float:
-        """Say how far a block has still to be turned [rad]."""
-        return smallest(move.start.yaw + move.turn - body.yaw)
+        if move is None and self._idle <= 0 and self.back <= 0:
+            self._idle, self._waiting, self.opens = AGAIN, 0, False
+            self.move, self._goals = Choice(sight).move(), goals
+        return self.move
 
     # --- fingers without a block -------------------------------------------------------------
 
-    def _place(self, move: Move, body: Cuboid, opening: ArrayLike) -> Floats:
-        return move.grip.place(self._sight.hand, body, opening)
-
-    def _to(self, place: Floats, rate: float, tips: Floats, before: Floats) -> Floats:
+    def _to(self, place: Floats, rate: float) -> Floats:
         """Bring fingertips nearer to places, shape (3, 3) [m]."""
-        hand, joints = self._sight.hand, self._sight.joints
-        more = hand.more(joints, FREE)
-        last = tips + np.clip(hand.tips(before - more).reshape(3, 3) - tips, -AHEAD, AHEAD)
+        sight, tips = self.sight, self.sight.tips
+        more = sight.more(FREE)
+        last = tips + np.clip(sight.tips_at(sight.before - more) - tips, -AHEAD, AHEAD)
         way = place - tips
         farthest = float(np.linalg.norm(way, axis=1).max())
-        aim = last + way * min(FREE_GAIN, rate / max(farthest, 1e-9))
-        return hand.bounded(hand.solve(aim.ravel(), joints) + more)
+        return sight.command(last + way * min(FREE_GAIN, rate / max(farthest, 1e-9)), more)
 
-    def _way(self, move: Move, body: Cuboid, tips: Floats, own: Floats) -> Floats:
-        """Say where fingertips go that are not beside the block yet, shape (3, 3) [m].
+    def _way(self, move: Move, body: Cuboid) -> Floats:
+        """Choose where fingertips go that are not beside the block yet, shape (3, 3) [m].
 
         They go away from faces first, then up, then above the grip, then down a funnel.
         """
-        used = move.grip.used
-        place = self._place(move, body, move.grip.opening)
+        tips, used = self.sight.tips, move.grip.used
+        place = move.grip.place(self.sight, body, move.grip.opening)
         far = float(np.linalg.norm((place - tips)[used, :2], axis=1).max())
         rise = np.minimum(move.above - place[used, 2], FUNNEL * max(far - NEAR, 0.0))
         place[used, 2] += rise
@@ -258,6 +216,7 @@ class Program:
         free = min(max((float(tips[used, 2].min()) - move.above + 0.035) / 0.02, 0.0), 1.0)
         if free == 1.0:
             return place
+        own = body.own(tips)
         outside = np.abs(own[:, :2]) - body.half[:2]
         axis, each = outside.argmax(axis=1), np.arange(3)
         clear = outside[each, axis] - TIP_RADIUS
@@ -273,15 +232,14 @@ class Program:
 
     # --- fingers with a block ----------------------------------------------------------------
 
-    def _carry(self, move: Move, body: Cuboid, tips: Floats, before: Floats) -> Floats:
+    def _carry(self, move: Move, body: Cuboid) -> Floats:
         """Press, and bring the block nearer to its end."""
-        sight, grip = self._sight, move.grip
-        hand, joints, tool = sight.hand, sight.joints, body.name
+        sight, grip, tool = self.sight, move.grip, body.name
         used, shares = grip.used, np.abs(grip.inward).max(axis=1)
         wanted, strength, follows = sight.wanted(tool), move.strength, 1.0
         turn = turn_about_z(body.yaw).T
         if sight.walls:  # a block that is carried over a wall must not slip
-            strength = float(hand.strengths(joints[None], (grip.inward @ turn)[None])[0])
+            strength = float(sight.strengths(sight.joints[None], (grip.inward @ turn)[None])[0])
             follows = float(np.interp(body.bottom, OFF, (0.0, 1.0)))
         press = min(PRESS if wanted < LIGHT else FIRMLY * wanted, strength)
         far = math.dist(body.place[:2], move.end.place[:2])
@@ -290,10 +248,10 @@ class Program:
             press *= 1.0 - SOFT * min(math.hypot(*body.lean) / TILTED, 1.0)
         forces = press * grip.inward @ turn
         forces[:, 2] += sight.weight(tool) * shares / shares.sum()
-        more = hand.more(joints, forces)
-        own = body.own(tips)
+        more = sight.more(forces)
+        own = body.own(sight.tips)
         at = body.world(own + np.clip(grip.touch - own, -BACK, BACK))
-        last = hand.tips(before - more).reshape(3, 3)
+        last = sight.tips_at(sight.before - more)
         lag = np.clip((last - at)[used].mean(axis=0), -LAG, LAG)
         lag[:2] *= follows
         middle = at[used].mean(axis=0)
@@ -307,23 +265,27 @@ class Program:
         lean = 2.0 * GAIN * body.lean
         aim[:, :2] -= arms[:, 2:] * lean
         aim[:, 2] += arms[:, :2] @ lean
-        aim[~used] = self._place(move, body, 0.0)[~used]
-        found = hand.bounded(hand.solve(aim.ravel(), joints) + more)
-        return np.clip(found, before - PUSHED, before + PUSHED)
+        aim[~used] = grip.place(sight, body, 0.0)[~used]
+        return np.clip(sight.command(aim, more), sight.before - PUSHED, sight.before + PUSHED)
 
     def _speed(self, move: Move, body: Cuboid, press: float) -> tuple[Floats, float]:
         """Choose how a block moves in this control step, shape (3,) [m], and turns [rad]."""
-        error, turn = move.end.place - body.place, self._turn(move, body)
+        sight, error, turn = self.sight, move.end.place - body.place, _turn(move, body)
         far = math.hypot(error[0], error[1])
-        burden = self._sight.burden(body.name) / max(press, 1e-9)
+        burden = sight.burden(body.name) / max(press, 1e-9)
         pace = CARRY * max(min(max((0.7 - burden) / 0.5, 0.0), 1.0) ** 2, 0.3)
         height, most, least = move.height, RISE, RISE
         below = height - float(body.place[2])
-        if move.over and self._sight.walls:
-            soon = self._passing(body, error, min(SOON, far))
-            height = max(self._passing(body, error, far), float(body.half[2]) + CLEARANCE)
+        if move.over and sight.walls:
+            walls = [sight.body(wall) for wall in sight.walls]
+            ahead = np.array([*error[:2] / max(far, 1e-9), 0.0])
+            soon, whole = (
+                passing(body, np.linspace(0.0, reach, SAMPLES)[:, None] * ahead, walls)
+                for reach in (min(SOON, far), far)
+            )
+            height = max(whole, float(body.half[2]) + CLEARANCE)
             below = soon - float(body.place[2]) if soon > 0.0 else 0.014 - body.bottom
-            spare = self._sight.friction(body.name) * press * max(1.0 - burden, 0.0)
+            spare = sight.friction(body.name) * press * max(1.0 - burden, 0.0)
             most, least = min(max(spare / STIFF, SLOWEST), FASTEST), SINK
         elif not move.over:
             below = min(below, 0.014 - body.bottom)
@@ -334,23 +296,6 @@ class Program:
         rise = min(max(GAIN * (aim - body.place[2]), -least), most)
         turning = min(max(GAIN * turn, -TURN), TURN) * lifted * pace / CARRY
         return np.array([*flat, rise]), turning
-
-    def _passing(self, body: Cuboid, way: Floats, reach: float) -> float:
-        """Find how high a block must be to pass over walls on the next part of its way [m].
-
-        Args:
-            body: The block.
-            way: To its end, shape (3,) [m].
-            reach: How much of it is looked at, as seen from above [m].
-        """
-        height, ahead = 0.0, way[:2] / max(math.hypot(way[0], way[1]), 1e-9)
-        walls = [self._sight.body(wall) for wall in self._sight.walls]
-        for far in np.linspace(0.0, reach, SAMPLES):
-            on = body.at(body.place + np.array([*far * ahead, 0.0]), body.yaw)
-            for wall in walls:
-                if on.depth_in(wall, margin=CLEARANCE, flat=True) > 0.0:
-                    height = max(height, wall.top + float(body.half[2]) + CLEARANCE)
-        return height
 
 
 def held(body: Cuboid, own: Floats) -> Grip | None:
@@ -370,9 +315,6 @@ def held(body: Cuboid, own: Floats) -> Grip | None:
     return None
 
 
-def _commanded(world: Any, sight: Sight) -> Floats:
-    """Give the joint positions that were commanded last, shape (9,) [rad]."""
-    if world.index == 0:
-        return sight.joints
-    last: Floats = np.array(world.evaluate(("action",))["action"])
-    return sight.hand.solve(last, sight.joints) if "effector" in world.action_mode else last
+def _turn(move: Move, body: Cuboid) -> float:
+    """Compute how far a block has still to be turned [rad]."""
+    return math.remainder(move.end.yaw - body.yaw, math.tau)

@@ -1,35 +1,21 @@
-"""Three fingertips that press: which command makes them, and what they would run into."""
+"""Three fingers: the torques with which they press, and what they would run into."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import final
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from scm_world._types import Floats, Value
+from scm_world._types import Floats
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.kinematics import (
-    N_FINGERS,
-    forward_kernel,
-    inverse_kernel,
-    point_kernel,
-)
+from scm_world.tasks.trifinger.kinematics import N_FINGERS, inverse_kernel, point_kernel
 
 TIP_RADIUS = hardware.COLLISION["tip"].radius
-STRENGTH = 0.97
-"""Share of the largest torque that a finger may be asked for."""
-
-LEAST_GAIN = 1e-3  # [N m/rad] of a controller that can be commanded
-BALLS = 17
-"""How many balls stand for a leg, 10 mm from one another."""
-
+BALLS = 17  # that stand for a leg, 10 mm from one another
 NUDGE = 1e-6  # [rad] by which joints are moved to find out how points of the fingers move
 
-_LOW, _HIGH = np.array(hardware.JOINT_LOW), np.array(hardware.JOINT_HIGH)
 _LEG, _TIP = hardware.LEG_LENGTH, -hardware.LATERAL_OFFSET
 _SHOULDER, _KNEE = (hardware.JOINT_ORIGINS[joint][1] for joint in (1, 2))
 _RADII = (TIP_RADIUS, hardware.COLLISION["middle"].radius)
@@ -45,10 +31,8 @@ _MASSES = (
 
 
 @njit(cache=True)
-def deepest_kernel(
-    joints: Floats, height: float, halves: Floats, centers: Floats, turns: Floats
-) -> float:
-    """Compute how deep any leg lies in a box or in a leg of another finger.
+def deepest_kernel(joints: Floats, height: float, boxes: Floats) -> float:
+    """Compute how deep any leg lies in a box or in a leg of another finger [m]; negative: apart.
 
     A leg, lower or middle, counts as a row of balls; what lies between two of them is up to 1.4 mm
     deeper.
@@ -56,12 +40,7 @@ def deepest_kernel(
     Args:
         joints: Shape (9,) [rad].
         height: Of the robot [m].
-        halves: Half edges of the boxes, shape (n, 3) [m].
-        centers: Shape (n, 3) [m].
-        turns: Axes of the boxes as columns, shape (n, 3, 3).
-
-    Returns:
-        The depth [m]; negative where all are apart.
+        boxes: Half edges [m], center [m] and the three axes of each as columns, shape (n, 3, 5).
     """
     legs, deepest = np.empty((2 * N_FINGERS, BALLS, 3)), -math.inf
     for leg in range(2 * N_FINGERS):
@@ -72,13 +51,13 @@ def deepest_kernel(
         for i, ball in enumerate(legs[leg]):
             for k in range(3):
                 ball[k] = first[k] + (knee[k] - first[k]) * i / (BALLS - 1)
-            for box in range(len(halves)):
+            for box in boxes:
                 outside, inside = 0.0, -math.inf
                 for axis in range(3):
                     along = 0.0
                     for k in range(3):
-                        along += (ball[k] - centers[box, k]) * turns[box, k, axis]
-                    beyond = abs(along) - halves[box, axis]
+                        along += (ball[k] - box[k, 1]) * box[k, 2 + axis]
+                    beyond = abs(along) - box[axis, 0]
                     outside, inside = outside + max(beyond, 0.0) ** 2, max(inside, beyond)
                 deepest = max(deepest, radius - math.sqrt(outside) - min(inside, 0.0))
         for other in range(2 * finger):
@@ -93,12 +72,9 @@ def deepest_kernel(
 
 @njit(cache=True)
 def torques(joints: Floats, height: float, forces: Floats) -> Floats:
-    """Compute the torques with which fingers exert forces, shape (n, 9) [N m].
+    """Compute the torques with which fingers exert forces at joints (n, 9) [rad], alike [N m].
 
-    Args:
-        joints: Shape (n, 9) [rad].
-        height: Of the robot [m].
-        forces: Of middle link, lower link and tip of each finger, shape (n, 3, 3, 3) [N].
+    The forces are those of middle link, lower link and tip of each finger, shape (n, 3, 3, 3) [N].
     """
     out = np.empty(joints.shape)
     for row in range(len(joints)):
@@ -119,96 +95,17 @@ def torques(joints: Floats, height: float, forces: Floats) -> Floats:
 
 @njit(cache=True)
 def poses(
-    tips: Floats, near: Floats, height: float, halves: Floats, centers: Floats, turns: Floats
+    tips: Floats, near: Floats, height: float, boxes: Floats
 ) -> tuple[Floats, NDArray[np.bool_], Floats]:
-    """Find joints for fingertips, and how deep fingers then lie in one another and in boxes.
+    """Find joints for fingertips [m], near others, all of shape (n, 9) [rad].
 
-    Args:
-        tips: Shape (n, 9) [m].
-        near: Joint positions to stay close to, shape (n, 9) [rad].
-        height: Of the robot [m].
-        halves: Half edges of m boxes that they may run into, shape (m, 3) [m].
-        centers: Of the boxes, shape (m, 3) [m].
-        turns: Axes of the boxes as columns, shape (m, 3, 3).
-
-    Returns:
-        Joints, shape (n, 9) [rad]; whether all fingertips are reached, shape (n,); and the
-        depths, shape (n,) [m].
+    Also return whether all fingertips are reached, and how deep legs lie in boxes or in one another
+    [m], shape (n,); see ``deepest_kernel``.
     """
     joints, reached = np.empty(tips.shape), np.empty(len(tips), dtype=np.bool_)
     depths = np.empty(len(tips))
     for row in range(len(tips)):
         found, fingers = inverse_kernel(tips[row], height, near[row])
         joints[row], reached[row] = found, fingers.all()
-        depths[row] = deepest_kernel(found, height, halves, centers, turns)
+        depths[row] = deepest_kernel(found, height, boxes)
     return joints, reached, depths
-
-
-@final
-class Hand:
-    """The robot as it is at the moment: its height, its weight and its controller.
-
-    Args:
-        values: Of the variables of a world.
-
-    Attributes:
-        weights: Forces that carry the fingers themselves, shape (3, 3, 3) [N]; see ``torques``.
-        aside: Where unused fingertips are, shape (3, 3) [m].
-    """
-
-    def __init__(self, values: Mapping[str, Value]) -> None:
-        self.height = float(values["robot_height"])
-        self._gains = np.tile(np.maximum(values["position_gains"], LEAST_GAIN), N_FINGERS)
-        self._limit = STRENGTH * float(values["torque_limit"])
-        self.weights = np.zeros((N_FINGERS, 3, 3))
-        for finger, name in enumerate(hardware.FINGERS):
-            links = [values[f"{hardware.link_name(name, link)}.mass"] for link in (2, 3)]
-            masses = np.array([*links, hardware.TIP_MASS], dtype=np.float64)
-            self.weights[finger, :, 2] = -float(values["gravity"][2]) * masses
-        self.aside = self.tips(np.array(hardware.ASIDE)).reshape(3, 3)
-
-    def solve(self, tips: Floats, near: Floats) -> Floats:
-        """Compute the joints for fingertips, shape (9,) [m], as near as they are reached."""
-        joints: Floats = inverse_kernel(tips, self.height, near)[0]
-        return joints
-
-    def tips(self, joints: Floats) -> Floats:
-        """Place the fingertips, shape (9,) [m]."""
-        tips: Floats = forward_kernel(joints, self.height)
-        return tips
-
-    def more(self, joints: Floats, forces: Floats) -> Floats:
-        """Compute what joints need in addition to carry the fingers and press, shape (9,) [rad].
-
-        The controller is a damped spring without gravity compensation.
-
-        Args:
-            joints: Shape (9,) [rad].
-            forces: On what fingertips touch, shape (3, 3) [N].
-        """
-        exerted = self.weights.copy()
-        exerted[:, 2] += forces
-        (needed,) = torques(joints[None], self.height, exerted[None])
-        added: Floats = np.minimum(np.maximum(needed, -self._limit), self._limit) / self._gains
-        return added
-
-    def bounded(self, joints: Floats) -> Floats:
-        """Bring joint positions within the bounds of a command, shape (9,) [rad]."""
-        clipped: Floats = np.minimum(np.maximum(joints, _LOW), _HIGH)
-        return clipped
-
-    def strengths(self, joints: Floats, forces: Floats) -> Floats:
-        """Compute how many times some forces the fingers can exert, shape (n,).
-
-        Args:
-            joints: Shape (n, 9) [rad].
-            forces: Of the fingertips, shape (n, 3, 3).
-        """
-        exerted = np.zeros((len(joints), N_FINGERS, 3, 3))
-        own = torques(joints, self.height, exerted + self.weights)
-        exerted[:, :, 2] = forces
-        unit = torques(joints, self.height, exerted)
-        room, need = self._limit - own * np.sign(unit), np.abs(unit)
-        times = np.divide(room, need, out=np.full_like(need, math.inf), where=need > 1e-9)
-        strengths: Floats = np.maximum(times.min(axis=1), 0.0)
-        return strengths
