@@ -135,11 +135,11 @@ def _pictures(scenes: Sequence[Any]) -> list[Any]:
 
 def _write_picture(path: Path, frames: Sequence[Any]) -> None:
     """Write a file with one picture, or several side by side."""
-    from scm_world.backends.renderer import write_png
+    from scm_world.backends.renderer import png
 
     white = np.full((frames[0].shape[0], DIVIDER, 3), 255, dtype=np.uint8)
     strip = [part for frame in frames for part in (frame, white)]
-    write_png(path, np.concatenate(strip[:-1], axis=1))
+    path.write_bytes(png(np.concatenate(strip[:-1], axis=1)))
 
 
 def effect(

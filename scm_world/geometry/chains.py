@@ -90,15 +90,7 @@ def _normalize(q: Floats) -> None:
 
 @njit(cache=True)
 def end_of_chain(numbers: Floats, links: Floats) -> Floats:
-    """Compute where the end of a chain is; see ``Chain``.
-
-    Args:
-        numbers: Positions of the joints.
-        links: What the chain is.
-
-    Returns:
-        Shape (3,) [m], or (4,).
-    """
+    """Compute where the end of a chain is, shape (3,) [m] or (4,); see ``Chain``."""
     place, turn, ball = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.empty(4)
     for step in range((links.size - 1) // WIDTH):
         at = links[1 + step * WIDTH : 1 + (step + 1) * WIDTH]
@@ -116,12 +108,8 @@ def end_of_chain(numbers: Floats, links: Floats) -> Floats:
         elif at[0] == SLIDE:
             _add_turned(place, turn, at[2], at[3], at[4], numbers[i] - at[8])
         elif at[0] == BALL:
-            ball[0], ball[1], ball[2], ball[3] = (
-                numbers[i + 3],
-                numbers[i],
-                numbers[i + 1],
-                numbers[i + 2],
-            )
+            ball[0] = numbers[i + 3]
+            ball[1:] = numbers[i : i + 3]
             _normalize(ball)
             _add_turned(place, turn, at[2], at[3], at[4], 1.0)
             _product(turn, ball[0], ball[1], ball[2], ball[3])

@@ -35,17 +35,12 @@ _CUBE = np.array(
 
 
 @njit(cache=True)
-def box_kernel(
+def _box(
     size: Floats, position: Floats, orientation: Floats, edges: Floats, planes: Floats
 ) -> None:
     """Write the edges of a box, shape (24, 7), and its planes, shape (6, 4).
 
-    Args:
-        size: Full edge lengths, shape (3,) [m].
-        position: Center, shape (3,) [m].
-        orientation: Quaternion (x, y, z, w), of any length.
-        edges: See the module.
-        planes: Unit outward normals and offsets; inside is ``normal · x <= offset``.
+    Planes are unit outward normals and offsets; inside is ``normal · x <= offset``.
     """
     rotation = np.empty((3, 3))
     rotation_kernel(orientation, rotation)
@@ -226,10 +221,10 @@ def overlap_fraction(
     edges, planes = np.empty((n + m, 24, 7)), np.empty((n + m, 6, 4))
     for b in range(n):  # the last one first: what comes before block and goal lies side by side
         at = n - 1 - b
-        box_kernel(sizes[b], positions[b], orientations[b], edges[at], planes[at])
+        _box(sizes[b], positions[b], orientations[b], edges[at], planes[at])
     for g in range(m):
         at = n + g
-        box_kernel(goal_sizes[g], goal_positions[g], goal_orientations[g], edges[at], planes[at])
+        _box(goal_sizes[g], goal_positions[g], goal_orientations[g], edges[at], planes[at])
     wanted, filled = 0.0, 0.0
     for g in range(m):
         wanted += remainder_kernel(edges[n + g], planes[n + g][:0], planes[n : n + g])
@@ -260,13 +255,7 @@ def aabb_overlap_fraction(
     A block that is turned covers more than it fills, and a goal that is turned is larger than
     it is. Use it only to compare with published numbers.
 
-    Args:
-        sizes: Full edge lengths of the blocks, shape (n, 3) [m].
-        positions: Centers of the blocks, shape (n, 3) [m].
-        orientations: Quaternions (x, y, z, w) of the blocks, shape (n, 4).
-        goal_sizes: As ``sizes``, of the goals, shape (m, 3) [m].
-        goal_positions: Shape (m, 3) [m].
-        goal_orientations: Shape (m, 4).
+    The arguments are those of ``overlap_fraction``.
 
     Returns:
         The fraction, at least zero; above one where blocks share a goal. Without goals, 1.0.

@@ -13,7 +13,7 @@ import numpy as np
 from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.geometry.filling import remainder_kernel
-from scm_world.geometry.rotations import from_rotation_matrix, rotation_matrix
+from scm_world.geometry.rotations import rotation_matrix
 
 Vector = tuple[float, float, float]
 
@@ -21,8 +21,6 @@ MOST_VERTICES = 256
 FORMATS = ("obj", "stl")
 THINNEST = 1e-6  # of the greatest extent: what is thinner has no volume
 ROUGHNESS = 3e-7  # of the greatest extent: what sticks out less is the rounding of a file
-SAME_NORMAL = 1e-5  # [rad] sides that differ by less are one side
-SAME_OFFSET = 1e-6  # of the greatest extent
 SAME_MOMENT = 1e-6  # of the greatest second moment: axes of equal ones can be chosen freely
 
 
@@ -63,7 +61,6 @@ def hull_of(points: ArrayLike) -> Hull:
 
     Raises:
         ModelError: The points are not finite, lie in one plane, or have too many corners.
-        MissingExtra: The extra ``mesh`` is not installed.
 
     Example:
         >>> from itertools import product
@@ -78,6 +75,8 @@ def hull_of(points: ArrayLike) -> Hull:
         raise ModelError(
             [f"the points of a hull must be finite numbers of shape (n, 3), got {cloud.shape}"]
         )
+    from scipy.spatial.transform import Rotation  # takes a fifth of a second
+
     vertices, faces, planes = _polyhedron(cloud)
     center, spread, volume = _second_moments(vertices, faces)
     axes = _principal_axes(spread)
@@ -90,7 +89,7 @@ def hull_of(points: ArrayLike) -> Hull:
         tuple(map(tuple, np.column_stack([planes[:, :3] @ axes, offsets]).tolist())),
         volume,
         tuple((along.sum() - along).tolist()),
-        tuple(from_rotation_matrix(axes).tolist()),
+        tuple(Rotation.from_matrix(axes).as_quat(canonical=True).tolist()),
     )
 
 
@@ -145,13 +144,8 @@ def hull_overlap(
 ) -> float:
     """Compute the volume that two convex polyhedra share, exact to rounding.
 
-    Args:
-        hull_a: The first one.
-        position_a: Its center of mass, shape (3,) [m].
-        orientation_a: Its quaternion (x, y, z, w), of any length.
-        hull_b: As ``hull_a``, of the second one.
-        position_b: As ``position_a``.
-        orientation_b: As ``orientation_a``.
+    Positions are centers of mass, shape (3,) [m], and orientations quaternions (x, y, z, w) of any
+    length.
 
     Returns:
         The volume [m³], at least zero and at most that of the smaller one.
@@ -180,7 +174,7 @@ def _polyhedron(cloud: Floats) -> tuple[Floats, Integers, Floats]:
     thickness = np.linalg.svd((cloud - middle) / extent, compute_uv=False)
     if thickness[2] <= THINNEST * thickness[0]:
         raise ModelError(["the points lie in one plane and have no volume"])
-    from scipy.spatial import ConvexHull, QhullError  # takes a fifth of a second
+    from scipy.spatial import ConvexHull, QhullError
 
     try:
         wrapped = ConvexHull((cloud - middle) / extent, qhull_options=f"Qt C-{ROUGHNESS}")
@@ -211,22 +205,17 @@ def _polyhedron(cloud: Floats) -> tuple[Floats, Integers, Floats]:
 
 
 def _sides(points: Floats, triangles: Integers, planes: Floats) -> list[tuple[Floats, list[int]]]:
-    """Join triangles in one plane: normal and corners of each flat side, counterclockwise."""
-    groups: list[list[int]] = []
-    for t, plane in enumerate(planes):
-        for group in groups:
-            first = planes[group[0]]
-            near = np.linalg.norm(plane[:3] - first[:3]) <= SAME_NORMAL
-            if near and abs(plane[3] - first[3]) <= SAME_OFFSET:
-                group.append(t)
-                break
-        else:
-            groups.append([t])
-    members = [np.unique(triangles[group]) for group in groups]
+    """Join triangles in one plane: normal and corners of each flat side, counterclockwise.
+
+    The triangles of a side of Qhull's all have its plane, to the last bit.
+    """
+    _, first, group = np.unique(planes, axis=0, return_index=True, return_inverse=True)
+    first = np.sort(first)
+    members = [np.unique(triangles[group == group[t]]) for t in first]
     count = np.bincount(np.concatenate(members), minlength=len(points))
     sides = []
-    for group, corners in zip(groups, members, strict=True):
-        normal = planes[group[0], :3]
+    for t, corners in zip(first, members, strict=True):
+        normal = planes[t, :3]
         kept = corners[count[corners] >= 3]  # others lie inside an edge or a side
         spokes = points[kept] - points[kept].mean(axis=0)
         right = spokes[np.argmax(np.linalg.norm(spokes, axis=1))]

@@ -131,33 +131,6 @@ def rotation_matrix(quaternion: ArrayLike) -> Floats:
     return matrices
 
 
-def from_rotation_matrix(matrix: ArrayLike) -> Floats:
-    """Turn a rotation matrix into a quaternion (x, y, z, w) with w >= 0, shape (4,).
-
-    Args:
-        matrix: Shape (3, 3).
-
-    Source:
-        The outer product of the quaternion with itself is linear in the matrix; the row of its
-        largest entry is the most exact.
-
-    Example:
-        >>> from_rotation_matrix([[0, -1, 0], [1, 0, 0], [0, 0, 1]]).round(3)
-        array([0.   , 0.   , 0.707, 0.707])
-    """
-    (a, b, c), (d, e, f), (g, h, i) = np.asarray(matrix, dtype=np.float64).tolist()
-    squares = np.array([1 + a - e - i, 1 - a + e - i, 1 - a - e + i, 1 + a + e + i])
-    outer = np.array(
-        [
-            [squares[0], b + d, c + g, h - f],
-            [b + d, squares[1], f + h, c - g],
-            [c + g, f + h, squares[2], d - b],
-            [h - f, c - g, d - b, squares[3]],
-        ]
-    )
-    return canonical(outer[np.argmax(squares)])
-
-
 def from_rotation_vector(vector: ArrayLike) -> Floats:
     """Give the quaternion of a rotation vector.
 

@@ -18,8 +18,8 @@ from scm_world.backends.renderer import (
     NOTHING,
     RenderedImage,
     body_names,
+    png,
     render,
-    write_png,
 )
 from scm_world.errors import UnknownOption
 from scm_world.models import GoalRegion, ParameterKey, Scene
@@ -366,7 +366,7 @@ def test_pictures_are_equal_between_processes(scene: Scene) -> None:
 def test_png_keeps_every_pixel(scene: Scene, tmp_path: Path) -> None:
     """A written picture reads back as it was."""
     image = render(scene, SMALL)
-    write_png(tmp_path / "picture.png", image.rgb)
+    (tmp_path / "picture.png").write_bytes(png(image.rgb))
 
     read = np.rint(imread(tmp_path / "picture.png")[..., :3] * 255.0).astype(np.uint8)
     np.testing.assert_array_equal(read, image.rgb)

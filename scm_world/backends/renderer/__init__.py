@@ -15,7 +15,6 @@ from scm_world.backends.renderer.picture import (
     scene_camera,
     shapes_of,
     views_of,
-    write_png,
 )
 from scm_world.backends.renderer.shapes import NOTHING
 
@@ -35,5 +34,4 @@ __all__ = [
     "scene_camera",
     "shapes_of",
     "views_of",
-    "write_png",
 ]

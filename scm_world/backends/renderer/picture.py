@@ -7,8 +7,6 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -171,12 +169,12 @@ def render(
         raise ValueError(f"samples: expected a positive number, got {samples}")
     parts = parted(background_of(scene) if goals_only else shapes_of(scene), shadows=True)
     canvas = draw_parts(parts, camera, scene.light, colors=colors)
-    fine = canvas
+    rgb = np.ascontiguousarray(canvas.rgb.transpose(1, 2, 0))
     if colors and samples > 1:
-        fine = draw_parts(parts, camera, scene.light, samples)
-    shown = _average(np.ascontiguousarray(fine.rgb.transpose(1, 2, 0)), samples)
-    names = body_names(scene.structure)
-    return RenderedImage(shown, canvas.depth, canvas.owners, names)
+        fine = draw_parts(parts, camera, scene.light, samples).rgb.transpose(1, 2, 0)
+        blocks = fine.reshape(camera.height, samples, camera.width, samples, 3)
+        rgb = np.rint(blocks.mean(axis=(1, 3), dtype=np.float64)).astype(np.uint8)
+    return RenderedImage(rgb, canvas.depth, canvas.owners, body_names(scene.structure))
 
 
 def picture(
@@ -315,21 +313,6 @@ def png(rgb: NDArray[np.uint8]) -> bytes:
         for kind, data in parts
     )
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
-
-
-def write_png(path: str | PathLike[str], rgb: NDArray[np.uint8]) -> None:
-    """Write a picture to a file."""
-    Path(path).write_bytes(png(rgb))
-
-
-def _average(fine: NDArray[np.uint8], samples: int) -> NDArray[np.uint8]:
-    """Average the samples of every pixel."""
-    if samples == 1:
-        return fine
-    height, width = fine.shape[0] // samples, fine.shape[1] // samples
-    blocks = fine.reshape(height, samples, width, samples, 3).astype(np.float64)
-    average: NDArray[np.uint8] = np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
-    return average
 
 
 @final
