@@ -110,9 +110,6 @@ def read_model(source: Any, **options: Any) -> Model:
         >>> read_model(f"<mujoco><worldbody>{ball}</worldbody></mujoco>").layout.names[:2]
         ('ball.cartesian_position', 'ball.orientation')
     """
-    from scm_world.backends.mujoco import check_installation
-
-    check_installation()
     from scm_world.backends.mujoco.reading import read_model as read
 
     return read(source, **options)

@@ -178,7 +178,6 @@ class StepModel:
         return result
 
     def _failure(self, what: str) -> EngineFailure:
-        """Return an error about the function."""
         return EngineFailure(f"the step function of {self.name!r} {what}", StepFunction.name)
 
     def _named(self, kind: str, numbers: Floats) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from scm_world.curricula.combinations import (
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
 from scm_world.curricula.parts import (
     Follow,
-    Goal,
+    Goals,
     Interpolate,
     Resample,
     everything,
@@ -55,7 +55,7 @@ __all__ = [
     "CurriculumVectorEnv",
     "Do",
     "Follow",
-    "Goal",
+    "Goals",
     "Interpolate",
     "Memory",
     "Part",

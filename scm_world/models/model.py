@@ -237,8 +237,8 @@ class Model:
         """Names of all bodies; the first is the world."""
         return tuple(body.name for body in self.bodies)
 
-    def places(self, array: str) -> tuple[Integers, Integers]:
-        """Return places in an array of MuJoCo's data, in order, and those in the state vector."""
+    def places(self, array: str) -> Integers:
+        """Return places in an array of MuJoCo's data, in order, and in the vector, shape (2, n)."""
         starts = self.layout.slices
         pairs = sorted(
             (number, place)
@@ -246,8 +246,7 @@ class Model:
             if row.array == array
             for place, number in enumerate(row.numbers, starts[row.name].start)
         )
-        found = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-        return found[:, 0].copy(), found[:, 1].copy()
+        return np.ascontiguousarray(np.array(pairs, dtype=np.int64).reshape(-1, 2).T)
 
     def empty_state(self) -> State:
         """Return a state to read into."""

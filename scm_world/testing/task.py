@@ -181,11 +181,12 @@ class TaskConformance(ABC):
                 assert float(measure(achieved, desired)) == pytest.approx(float(world[name]))
 
 
-def _seen(world: Simulation) -> str:
-    """Return the bodies, their properties, the goals, the light and the cameras as a text."""
+def _seen(world: Simulation) -> tuple[Any, ...]:
+    """Return the bodies, their properties, the goals, the light and the cameras, comparable."""
     scene = world.scene()
-    with np.printoptions(threshold=10**6, precision=17):
-        return repr((scene, scene.state.vector, world.cameras()))
+    numbers = {key: value.tobytes() for key, value in scene.parameters.items()}
+    shown = repr((scene.goals, scene.light, world.cameras()))
+    return scene.structure, numbers, scene.state.vector.tobytes(), shown
 
 
 def _meant(variable: Variable, value: Value) -> tuple[Value, ...]:

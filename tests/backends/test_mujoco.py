@@ -44,8 +44,7 @@ def fields(model: mujoco.MjModel) -> dict[str, bytes]:
 def test_no_engine_is_imported_before_it_is_used() -> None:
     """Importing the backends imports neither MuJoCo nor Bullet."""
     code = (
-        "import sys, scm_world.backends, scm_world.backends.mujoco;"
-        "print({'mujoco', 'pybullet'} & set(sys.modules))"
+        "import sys, scm_world, scm_world.backends;print({'mujoco', 'pybullet'} & set(sys.modules))"
     )
     child = subprocess.run(  # noqa: S603 # our own interpreter, our own code
         [sys.executable, "-c", code], capture_output=True, check=True, text=True

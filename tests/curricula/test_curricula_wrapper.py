@@ -45,7 +45,7 @@ from scm_world.errors import (
     UnreadableFile,
 )
 from scm_world.models.scene import TOLERANCE
-from scm_world.tasks.trifinger.feasibility import overlaps
+from scm_world.tasks.trifinger.entities.block_world import overlaps
 
 MASS, POSITION = "tool_block.mass", "tool_block.cartesian_position"
 

@@ -19,7 +19,7 @@ from scm_world.curricula import (
 from scm_world.env import IDS
 from scm_world.errors import UnknownOption
 from scm_world.models.scene import TOLERANCE
-from scm_world.tasks.trifinger.feasibility import overlaps
+from scm_world.tasks.trifinger.entities.block_world import overlaps
 from scm_world.variables.checks import check_space
 from scm_world.world import Simulation
 

@@ -12,7 +12,7 @@ from scm_world.env.arguments import asked
 from scm_world.errors import Infeasible, InterventionError, OutOfSpace, UnknownOption
 from scm_world.models.scene import TOLERANCE
 from scm_world.tasks import Pushing
-from scm_world.tasks.trifinger.feasibility import overlaps
+from scm_world.tasks.trifinger.entities.block_world import overlaps
 from scm_world.world import Simulation
 from scm_world.world.plan import merged
 

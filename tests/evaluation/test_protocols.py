@@ -21,7 +21,7 @@ from scm_world.evaluation.players import as_player
 from scm_world.evaluation.protocols import REACHING as REACHING_ROW
 from scm_world.evaluation.protocols import ROLES, ROWS
 from scm_world.tasks import TASKS
-from scm_world.tasks.trifinger.feasibility import overlaps
+from scm_world.tasks.trifinger.entities.block_world import overlaps
 
 TWELVE = [f"P{k}" for k in range(12)]
 CONVENTIONS = ("causal_world", "scm_world")

@@ -254,13 +254,13 @@ def test_strength_ends_where_a_joint_does_all_it_can() -> None:
 
 def test_legs_lie_in_what_their_tips_are_in() -> None:
     """A box about a fingertip, and one that the tip has just left."""
-    sight, axes = Sight(world_of("picking", "fake")), np.eye(3)[None]
+    sight = Sight(world_of("picking", "fake"))
     tips = sight.tips_at(np.array(hardware.REST)).ravel()
     for below, depth in ((0.0, 0.01 + TIP_RADIUS), (0.011 + TIP_RADIUS, -0.001)):
         center = tips[:3] - [0.0, 0.0, below]
-        boxes = np.full((1, 3), 0.01), center[None], axes
+        boxes = np.c_[np.full(3, 0.01), center, np.eye(3)][None]
         near = np.array([hardware.REST])
-        _, reached, depths = poses(tips[None], near, sight.height, *boxes)
+        _, reached, depths = poses(tips[None], near, sight.height, boxes)
         assert reached.all()
         assert depths[0] == pytest.approx(depth, abs=1e-6)
 

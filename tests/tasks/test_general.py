@@ -9,7 +9,7 @@ import pytest
 
 from scm_world._types import Floats
 from scm_world.tasks import General
-from scm_world.tasks.trifinger.feasibility import overlaps
+from scm_world.tasks.trifinger.entities.block_world import overlaps
 from scm_world.tasks.trifinger.general import MOST, pile
 from scm_world.variables import Draw
 from scm_world.world import Simulation

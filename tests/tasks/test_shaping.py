@@ -14,7 +14,7 @@ import scm_world  # noqa: F401 # registers the environments
 from scm_world.errors import UnknownOption
 from scm_world.geometry import from_rotation_vector, rotation_matrix
 from scm_world.tasks import TASKS
-from scm_world.tasks.trifinger import shaping
+from scm_world.tasks.trifinger import kernels
 
 SIZE = np.array([0.065, 0.05, 0.08])
 GOAL = np.array([0.05, -0.02, 0.0325])
@@ -42,17 +42,17 @@ def test_the_kernel_of_the_corners_is_the_published_one(seed: int) -> None:
     """4 / (e^(s d) + 2 + e^(-s d)) of the mean distance of eight corners."""
     (here, turn), (there, goal_turn) = pose(seed), pose(seed + 10)
     far = np.linalg.norm(corners(here, turn) - corners(there, goal_turn), axis=-1).mean()
-    found = shaping.goal_kernel(SIZE, here, turn, SIZE, there, goal_turn, sharpness=30.0)
+    found = kernels.goal_kernel(SIZE, here, turn, SIZE, there, goal_turn, sharpness=30.0)
     assert found == pytest.approx(4.0 / (np.exp(30.0 * far) + 2.0 + np.exp(-30.0 * far)))
 
 
 def test_a_kernel_ends_at_one_and_at_zero() -> None:
     """Where block and goal are one, and where they are far apart."""
     here, turn = pose(0)
-    found = shaping.goal_kernel(SIZE, here, turn, SIZE, here, -turn, sharpness=30.0)
+    found = kernels.goal_kernel(SIZE, here, turn, SIZE, here, -turn, sharpness=30.0)
     assert found == pytest.approx(1.0)
-    assert shaping.logistic(100.0, shaping.FINE) == pytest.approx(0.0, abs=1e-300)
-    assert shaping.logistic(np.log(3 + np.sqrt(8)) / shaping.COARSE, shaping.COARSE) == (
+    assert kernels.logistic(100.0, kernels.FINE) == pytest.approx(0.0, abs=1e-300)
+    assert kernels.logistic(np.log(3 + np.sqrt(8)) / kernels.COARSE, kernels.COARSE) == (
         pytest.approx(0.5)
     )
 
@@ -61,9 +61,9 @@ def test_corners_come_nearer() -> None:
     """By what the block moves, if it does not turn; turning it back counts as well."""
     still, turned = np.array([0.0, 0.0, 0.0, 1.0]), from_rotation_vector(np.array([0, 0, 0.5]))
     want = (SIZE, np.zeros(3), still)
-    moved = shaping.corners_progress(SIZE, GOAL / 2, still, GOAL, still, *want)
+    moved = kernels.corners_progress(SIZE, GOAL / 2, still, GOAL, still, *want)
     assert moved == pytest.approx(np.linalg.norm(GOAL) / 2)
-    assert shaping.corners_progress(SIZE, np.zeros(3), still, np.zeros(3), turned, *want) > 0.01
+    assert kernels.corners_progress(SIZE, np.zeros(3), still, np.zeros(3), turned, *want) > 0.01
 
 
 def test_a_block_is_pushed_from_behind() -> None:
@@ -71,11 +71,11 @@ def test_a_block_is_pushed_from_behind() -> None:
     block, goal = np.array([0.0, -0.08, 0.03]), np.array([0.0, 0.02, 0.03])
     behind = np.array([0.0, -0.13, 0.03])
     tips = np.concatenate([behind, behind + 1.0, behind - 1.0])
-    assert shaping.pushing_distance(tips, block, goal) == pytest.approx(0.0, abs=1e-12)
+    assert kernels.pushing_distance(tips, block, goal) == pytest.approx(0.0, abs=1e-12)
     away = tips + np.tile([0.03, 0.0, 0.04], 3)
-    assert shaping.pushing_progress(tips, away, block, block, goal) == pytest.approx(0.05)
+    assert kernels.pushing_progress(tips, away, block, block, goal) == pytest.approx(0.05)
     there = np.concatenate([goal, goal, goal])
-    assert shaping.pushing_distance(there, goal, goal) == 0.0
+    assert kernels.pushing_distance(there, goal, goal) == 0.0
 
 
 def test_the_fingertips_have_a_kernel_each() -> None:
@@ -83,8 +83,8 @@ def test_the_fingertips_have_a_kernel_each() -> None:
     tips, goals = np.arange(9) / 100, np.zeros((3, 3))
     far = np.linalg.norm(tips.reshape(3, 3), axis=1)
     expected = np.mean(4.0 / (np.exp(30.0 * far) + 2.0 + np.exp(-30.0 * far)))
-    assert shaping.reach_kernel(tips, *goals, sharpness=30.0) == pytest.approx(expected)
-    assert shaping.minus_length(np.array([3.0, 0.0, 4.0])) == -5.0
+    assert kernels.reach_kernel(tips, *goals, sharpness=30.0) == pytest.approx(expected)
+    assert kernels.minus_length(np.array([3.0, 0.0, 4.0])) == -5.0
 
 
 @pytest.mark.parametrize("name", TASKS)

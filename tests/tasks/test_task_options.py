@@ -12,7 +12,6 @@ from scm_world.errors import Infeasible, InterventionError, ModelError, UnknownO
 from scm_world.evaluation import evaluate
 from scm_world.geometry import rotation_matrix
 from scm_world.tasks import TASKS, term
-from scm_world.tasks.trifinger.feasibility import buried_goals
 from scm_world.tasks.trifinger.single import Pushing
 from scm_world.variables import Box, Draw, Function, Measured
 from scm_world.variables.kinds import SpaceName
@@ -159,7 +158,7 @@ def test_goals_are_drawn_outside_of_obstacles() -> None:
     inside = Draw(Box((0.0, 0.0), (0.15, 1.5)))
     for seed in range(30):
         world.reset(seed=seed, do={"goal_block.polar": inside})
-        assert buried_goals(world.scene(), {"goal_block"}) == ()
+        assert world.composition.buried(world.scene(), {"goal_block"}) == ()
     with pytest.raises(Infeasible, match="none of 1,000 draws"):
         world.reset(seed=0, do={"goal_block.polar": Draw(Box((0.0, 0.0), (0.001, 0.0)))})
 

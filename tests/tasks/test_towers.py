@@ -11,7 +11,7 @@ from scm_world._types import Floats
 from scm_world.errors import SeveralProblems, UnknownOption
 from scm_world.tasks import Towers
 from scm_world.tasks.trifinger.building import start
-from scm_world.tasks.trifinger.feasibility import overlaps
+from scm_world.tasks.trifinger.entities.block_world import overlaps
 from scm_world.variables import Draw
 from scm_world.world import Simulation
 

@@ -8,7 +8,7 @@ import pytest
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.tasks import CreativeStackedBlocks, StackedBlocks
-from scm_world.tasks.trifinger.feasibility import overlaps
+from scm_world.tasks.trifinger.entities.block_world import overlaps
 from scm_world.tasks.trifinger.walls import MAX_LEVELS, SHAPE, layout
 from scm_world.variables import Draw
 from scm_world.world import Simulation

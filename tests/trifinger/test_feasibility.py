@@ -13,7 +13,7 @@ from scm_world.geometry import from_rotation_vector
 from scm_world.geometry.hulls import Hull
 from scm_world.models import Scene
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.feasibility import overlaps
+from scm_world.tasks.trifinger.entities.block_world import overlaps
 from scm_world.tasks.trifinger.hardware import WALL_HEIGHT, WALL_RADIUS
 from scm_world.tasks.trifinger.kinematics import inverse
 from scm_world.tasks.trifinger.system import trifinger

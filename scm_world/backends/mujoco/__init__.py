@@ -1,4 +1,4 @@
-"""The MuJoCo engine. It is checked and imported when ``MujocoBackend`` is first asked for.
+"""The MuJoCo engine. Its installation is checked before it is imported.
 
 Beside a package that asks for ``mujoco``, pip may put ``mujoco`` 3.17 over ``mujoco-core`` 4.0.1
 into one folder, without a complaint from ``pip check``. The mixture fails on import, or worse,
@@ -10,27 +10,13 @@ from __future__ import annotations
 import re
 from contextlib import suppress
 from importlib import metadata
-from typing import TYPE_CHECKING
 
 from scm_world.errors import MissingEngine, MixedInstallation
-
-if TYPE_CHECKING:
-    from scm_world.backends.mujoco.backend import MujocoBackend
 
 OLDEST = (3, 17)
 REQUIREMENT = "mujoco>=3.17,<5"
 REPAIR = f"pip uninstall -y mujoco mujoco-core mujoco-studio && pip install '{REQUIREMENT}'"
 DISTRIBUTIONS = ("mujoco", "mujoco-core", "mujoco-studio")
-
-
-def __getattr__(name: str) -> object:
-    if name != "MujocoBackend":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    check_installation()
-    from scm_world.backends.mujoco.backend import MujocoBackend
-
-    globals()[name] = MujocoBackend
-    return MujocoBackend
 
 
 def check_installation() -> None:
@@ -51,5 +37,9 @@ def check_installation() -> None:
         old = f"{found.popitem()[1]} is too old" if found else ""
         raise MissingEngine("mujoco", f"pip install '{REQUIREMENT}'", old)
 
+
+check_installation()
+
+from scm_world.backends.mujoco.backend import MujocoBackend  # noqa: E402 # see above
 
 __all__ = ["MujocoBackend", "check_installation"]

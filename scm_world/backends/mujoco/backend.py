@@ -88,11 +88,7 @@ class MujocoBackend(Backend):
             self.realization.place(difference.state.vector)
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Read parameters back from the arrays of the model.
-
-        Raises:
-            UnknownOption: There is no such parameter.
-        """
+        """Read parameters back from the arrays of the model."""
         return self.realization.parameters(keys)
 
     def read(self, into: Any = None) -> Any:
@@ -107,24 +103,14 @@ class MujocoBackend(Backend):
         """Hold a command for some physics steps.
 
         Raises:
-            EngineFailure: A number is not finite afterwards, memory did not suffice, or a callback
-                of the user is in use.
+            EngineFailure: Also where memory did not suffice, or a callback of the user is in use.
         """
         if self.slot is not None:
             self._return()
         if found := callbacks():
             raise EngineFailure("; ".join(found), self.name)
-        now = self.realization
-        now.command[:] = command
-        now.forget()
         self._touches = None
-        try:
-            mujoco.mj_step(now.model, now.data, substeps)
-        except (mujoco.FatalError, mujoco.UnexpectedError) as error:
-            now.recover()
-            raise EngineFailure(f"MuJoCo: {error}", self.name) from error
-        problem = now.problem()
-        if problem:
+        if problem := self.realization.step(command, substeps):
             raise EngineFailure(problem, self.name)
 
     def contacts(self) -> tuple[ContactPoint, ...]:
@@ -177,8 +163,7 @@ class MujocoBackend(Backend):
 
     def close(self) -> None:
         """Free the model and its data."""
-        for name in list(vars(self)):
-            delattr(self, name)
+        vars(self).clear()
 
     def _realized(self, structure: Any, parameters: Parameters) -> Realization:
         """Return the present realization, edited, or a new one."""

@@ -39,16 +39,19 @@ class Touches:
         return tuple(found)
 
 
+def shapes_of(model: mujoco.MjModel, data: mujoco.MjData) -> Integers:
+    """Copy the numbers of the shapes of each contact: the geoms, then the flexes, shape (k, 2)."""
+    shapes: Integers = data.contact.geom.astype(np.int64)
+    return np.where(shapes < 0, model.ngeom + data.contact.flex, shapes) if model.nflex else shapes
+
+
 def touches(model: mujoco.MjModel, data: mujoco.MjData, owners: tuple[str, ...]) -> Touches:
     """Copy the contacts of the last physics step.
 
     Their force is the sum of those on the edges of a pyramid, or the first one of an elliptic cone;
     contacts within a gap have none.
     """
-    contact = data.contact
-    shapes = contact.geom.astype(np.int64)
-    if model.nflex:
-        shapes = np.where(shapes < 0, model.ngeom + contact.flex, shapes)
+    contact, shapes = data.contact, shapes_of(model, data)
     numbers = np.zeros((len(shapes), 8))
     numbers[:, :3], numbers[:, 3:6] = contact.pos, contact.frame[:, :3]
     numbers[:, 6], forces = contact.dist, numbers[:, 7]

@@ -14,7 +14,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any, Literal, final
+from itertools import chain, count
+from typing import Any, final
 
 import mujoco
 import numpy as np
@@ -161,13 +162,12 @@ class Element:
         constant: bool = False,
         low: Numbers = -math.inf,
         high: Numbers = math.inf,
-        kind: Literal["real", "rotation", "inertia", "switch"] = "real",
         usual: Any = True,
-        visual: bool = False,
         off: str = "",
         acts: Any = True,
         reason: str = "",
         effect: Effect | None = None,
+        **rest: Any,
     ) -> Parameter:
         """Return a parameter with its value in the model, and in the data.
 
@@ -213,11 +213,10 @@ class Element:
             always=always,
             contact=contact,
             slot=slot,
-            kind=kind,
-            visual=visual,
             body=self.body if self.kind in ("body", "geom") else -1,
             usual=bool(usual),
             refusal=refusal,
+            **rest,
         )
 
     def turn(self, doc: str, array: str, index: Any = None, **rest: Any) -> Parameter:
@@ -260,9 +259,9 @@ _SIZES = {
 }
 
 
-def _columns(count: int) -> Any:
+def _columns(n: int) -> Any:
     """Return the first columns of an array: a number, or a slice of several."""
-    return 0 if count == 1 else slice(count)
+    return 0 if n == 1 else slice(n)
 
 
 # fmt: off
@@ -305,8 +304,8 @@ def _body(e: Element) -> Rows:
 
 def _joint(e: Element) -> Rows:
     kind, first, position = int(e["type"]), int(e["dofadr"]), int(e["qposadr"])
-    count, usual = {FREE: 6, BALL: 3}.get(kind, 1), kind != FREE and e.moves  # FREE mixes units
-    dofs: Any = first if count == 1 else slice(first, first + count)
+    axes, usual = {FREE: 6, BALL: 3}.get(kind, 1), kind != FREE and e.moves  # FREE mixes units
+    dofs: Any = first if axes == 1 else slice(first, first + axes)
     for attribute, unit, doc, constant, off in (
         ("damping", "{F} s/{L}", "Force against the motion, for each unit of velocity.", False,
             "damper"),
@@ -368,10 +367,10 @@ def _shape(e: Element) -> Rows:
     yield from e.solver(**touches)
     kind, effect = int(e["type"]), e.trees.geom(e.i)
     if kind in _SIZES:
-        count, what = _SIZES[kind]
+        columns, what = _SIZES[kind]
         word = mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
         yield e.row("size", "m", f"{what} of the {word}; mass and inertia stay as they are.",
-            "geom_size", (e.i, _columns(count)), constant=True, low=SMALLEST, usual=any(effect),
+            "geom_size", (e.i, _columns(columns)), constant=True, low=SMALLEST, usual=any(effect),
             visual=not any(effect), effect=effect)
     else:
         yield e.row("size", "m", "", reason="belongs to a shape that only another file can change")
@@ -519,12 +518,12 @@ def table(mj: mujoco.MjModel, data: mujoco.MjData, trees: Couplings) -> list[Par
     for name, body, kind in zip(names["joint"], mj.jnt_bodyid, mj.jnt_type, strict=True):
         owner = names["body"][int(body)] if kind == FREE else name
         states.add(f"{owner}.{'position' if kind in (SLIDE, HINGE) else 'orientation'}")
-    count = Counter(row.name for _, row in found)
+    alike = Counter(row.name for _, row in found)
     usual = Counter(row.name for _, row in found if row.usual and not row.refusal)
     return [
         row
         if row.name not in states
-        and (count[row.name] == 1 or (usual[row.name] == 1 and row.usual and not row.refusal))
+        and (alike[row.name] == 1 or (usual[row.name] == 1 and row.usual and not row.refusal))
         else replace(row, name=f"{kind}:{row.name}")
         for kind, row in found
     ]
@@ -543,6 +542,12 @@ def clean(name: str) -> str:
     return re.sub(r"[^\w-]", "_", name)
 
 
+_NAMED = (
+    "body", "joint", "geom", "site", "tendon", "equality", "actuator", "pair", "sensor", "flex",
+)  # fmt: skip
+"""An order in which those come first after which others are named."""
+
+
 @lru_cache(maxsize=32)
 def element_names(mj: mujoco.MjModel) -> Mapping[str, tuple[str, ...]]:
     """Return the names of elements by kind: their own, cleaned, or names made from their body."""
@@ -550,28 +555,14 @@ def element_names(mj: mujoco.MjModel) -> Mapping[str, tuple[str, ...]]:
     for kind in _NAMED:
         obj, size = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), f"n{prefix(kind)}"
         given = [mujoco.mj_id2name(mj, obj, i) or "" for i in range(getattr(mj, size))]
-        taken: set[str] = set()
-        names = [_free(clean(name), taken) if name else "" for name in given]
-        for i, name in enumerate(names):
-            names[i] = name or _free(_made(mj, kind, i, names, found), taken)
+        names, taken = [""] * len(given), set[str]()
+        for i in sorted(range(len(given)), key=lambda i: not given[i]):  # those with names first
+            plain = clean(given[i]) if given[i] else _made(mj, kind, i, names, found)
+            numbered = (f"{plain}_{n}" for n in count(2))
+            names[i] = next(name for name in chain([plain], numbered) if name not in taken)
+            taken.add(names[i])
         found[kind] = tuple(names)
     return found
-
-
-_NAMED = (
-    "body", "joint", "geom", "site", "tendon", "equality", "actuator", "pair", "sensor", "flex",
-)  # fmt: skip
-"""An order in which those come first after which others are named."""
-
-
-def _free(name: str, taken: set[str]) -> str:
-    """Return a name that is not taken, with a number if need be, and take it."""
-    free, n = name, 1
-    while free in taken:
-        n += 1
-        free = f"{name}_{n}"
-    taken.add(free)
-    return free
 
 
 def _made(

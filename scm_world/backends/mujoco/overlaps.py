@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from scm_world._types import Floats, Integers
+from scm_world.backends.mujoco.contacts import shapes_of
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.models.scene import SURFACES, Overlap, ParameterKey, Scene
 
@@ -55,11 +56,7 @@ class _Scratch:
         if model.nflex:
             mujoco.mj_flex(model, data)
         mujoco.mj_collision(model, data)
-        contact = data.contact
-        shapes = contact.geom
-        if model.nflex:
-            shapes = np.where(shapes < 0, model.ngeom + contact.flex, shapes)
-        return shapes, -contact.dist
+        return shapes_of(model, data), -data.contact.dist
 
 
 def touching(scene: Scene, tolerance: float) -> frozenset[Shapes]:

@@ -143,9 +143,9 @@ def read_model(
     medium = [p for p in patterns or () if p != "*" and fnmatch.filter(MEDIUM, p)]
     trees = Couplings(mj, fluid=bool(medium))
     names = element_names(mj)
-    elements = {row.name: row for row in _states(mj, names, trees, start, frame)}
+    elements, commands = _moving(mj, names, trees, start, frame)
     moving = _grouped(elements, states, [reported] if isinstance(reported, str) else [*reported])
-    inputs = tuple(_inputs(mj, names, trees, start))[:controls]
+    inputs = tuple(commands[:controls])
     rows = tuple((bindings or table)(mj, start, trees))
     chosen = {row.name for row in rows} if bindings else _exposed(rows, patterns)
     parameters = tuple(row for row in rows if row.name in chosen)
@@ -154,7 +154,7 @@ def read_model(
         raise ModelError([f"{where}: {'.'.join(key)}: {REVERSED}" for key in wrong])
     touch = mj.nflex > 0 or bool(trees.touches.any())
     staged = touch and int(mj.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
-    drift = tuple(_drift(mj, sealed, start))
+    drift = tuple(_drift(mj, sealed, start, elements.values()))
     for note in drift:
         warnings.warn(note, stacklevel=3)
     keys = "\0".join(f"{row.name}\0{row.key}" for row in parameters)
@@ -271,7 +271,9 @@ DRIFT = 1e-4
 """Differences that are worth a note [m] or [rad]."""
 
 
-def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator[str]:
+def _drift(
+    mj: mujoco.MjModel, source: Source, start: mujoco.MjData, elements: Iterable[StateRow]
+) -> Iterator[str]:
     """Measure how far plain MuJoCo, with its warm start, differs where iterations are few."""
     if mj.opt.iterations >= FEW:
         return
@@ -285,14 +287,13 @@ def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator
         ends.append(data.qpos.copy())
     apart = np.empty(mj.nv)
     mujoco.mj_differentiatePos(mj, apart, 1.0, *ends)
-    kinds = mj.jnt_type[mj.dof_jntid]
-    place = np.arange(mj.nv) - mj.jnt_dofadr[mj.dof_jntid]
-    slides = (kinds == int(_JNT.mjJNT_SLIDE)) | ((kinds == int(_JNT.mjJNT_FREE)) & (place < 3))
-    found = [
-        f"{np.abs(apart[which]).max():.2g} {unit}"
-        for which, unit in ((~slides, "rad"), (slides, "m"))
-        if np.abs(apart[which]).max(initial=0.0) > DRIFT or not np.isfinite(apart[which]).all()
-    ]
+    found = []
+    for unit in ("rad", "m"):
+        rows = (row for row in elements if row.array == "qvel" and row.unit == f"{unit}/s")
+        dofs = [number for row in rows for number in row.numbers]
+        most = np.abs(apart[dofs]).max(initial=0.0)
+        if not most <= DRIFT:
+            found.append(f"{most:.2g} {unit}")
     if found:
         few = mj.opt.iterations
         yield (
@@ -392,15 +393,18 @@ def _ends(limited: Any, ends: Any) -> tuple[float, float]:
     return (float(ends[0]), float(ends[1])) if limited else (-math.inf, math.inf)
 
 
-def _states(
+def _moving(
     mj: mujoco.MjModel,
     names: Mapping[str, tuple[str, ...]],
     trees: Couplings,
     data: mujoco.MjData,
     frame: Literal["body", "world"],
-) -> list[StateRow]:
-    """Describe what moves, in MuJoCo's order, then what is reported; the data are the start."""
-    found: list[tuple[str, StateRow]] = []
+) -> tuple[dict[str, StateRow], list[Row]]:
+    """Describe what moves, in MuJoCo's order, what is reported, and the components of a command.
+
+    The data are those of the beginning.
+    """
+    found, inputs = list[tuple[str, StateRow]](), list[Row]()
 
     def add(
         kind: str, name: str, array: str, places: list[int], ends: tuple[float, float], **rest: Any
@@ -438,23 +442,33 @@ def _states(
                 unit=unit, doc=_IN_WORLD[attribute] if turned else doc, always=always,
                 contact=contact, trees=frozenset([tree]), frame="world" if turned else "body",
             )  # fmt: skip
-    for actuator, count in enumerate(mj.actuator_actnum.tolist()):
-        first = int(mj.actuator_actadr[actuator])
-        if first < 0 or not count:
-            continue
-        tree, always, contact = _of_actuator(trees, actuator, stateful=True)
-        ends = _ends(mj.actuator_actlimited[actuator], mj.actuator_actrange[actuator])
-        add(
-            "actuator", f"{names['actuator'][actuator]}.activation", "act",
-            [*range(first, first + count)], ends, unit="1", doc="Inner state of the actuator.",
-            always=always, contact=contact, trees=frozenset([tree]),
-        )  # fmt: skip
+    for actuator, name in enumerate(names["actuator"]):
+        always, contact = trees.actuator(actuator)
+        first, count = int(mj.actuator_actadr[actuator]), int(mj.actuator_actnum[actuator])
+        if count:  # its inner state belongs to the tree that it moves
+            own = frozenset([min(always or contact or {0})])
+            always |= own
+            ends = _ends(mj.actuator_actlimited[actuator], mj.actuator_actrange[actuator])
+            add(
+                "actuator", f"{name}.activation", "act", [*range(first, first + count)], ends,
+                unit="1", doc="Inner state of the actuator.", always=always,
+                contact=contact - always, trees=own,
+            )  # fmt: skip
+        effect = {"always": always, "contact": contact - always}
+        first, count = int(mj.actuator_ctrladr[actuator]), int(mj.actuator_ctrlnum[actuator])
+        unit, doc = control_unit(mj, actuator), _CONTROLS[servo(mj, actuator)]
+        for i in range(first, first + count):
+            low, high = _ends(mj.actuator_ctrllimited[i], mj.actuator_ctrlrange[i])
+            label = f"{name}.control" if count == 1 else f"{name}.control_{i - first}"
+            start = min(max(float(data.ctrl[i]), low), high)
+            inputs.append(Row(label, unit, (), start, low, high, doc, **effect))
     found.sort(key=lambda pair: pair[1].reported)
     named = Counter(row.name for _, row in found)
-    return [
+    rows = [
         replace(row, name=f"{kind}:{row.name}") if named[row.name] > 1 else row
         for kind, row in found
     ]
+    return {row.name: row for row in rows}, inputs
 
 
 def _grouped(
@@ -500,42 +514,3 @@ def _grouped(
             )
         found.append(row)
     return tuple(found)
-
-
-def _of_actuator(
-    trees: Couplings, actuator: int, *, stateful: bool
-) -> tuple[int, frozenset[int], frozenset[int]]:
-    """Return the tree that an actuator is counted to, and the trees that it acts on.
-
-    The inner state of an actuator belongs to the tree it moves.
-    """
-    always, contact = trees.actuator(actuator)
-    tree = min(always or contact or {0})
-    if stateful:
-        always |= {tree}
-    return tree, always, contact - always
-
-
-def _inputs(
-    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings, data: mujoco.MjData
-) -> Iterator[Row]:
-    """Describe the components of a command; the data have those of the beginning."""
-    for actuator in range(mj.nactuator):
-        name = names["actuator"][actuator]
-        first, count = int(mj.actuator_ctrladr[actuator]), int(mj.actuator_ctrlnum[actuator])
-        unit, doc = control_unit(mj, actuator), _CONTROLS[servo(mj, actuator)]
-        stateful = bool(mj.actuator_actnum[actuator])
-        _, always, contact = _of_actuator(trees, actuator, stateful=stateful)
-        for i in range(first, first + count):
-            low, high = _ends(mj.actuator_ctrllimited[i], mj.actuator_ctrlrange[i])
-            yield Row(
-                name=f"{name}.control" if count == 1 else f"{name}.control_{i - first}",
-                unit=unit,
-                shape=(),
-                default=min(max(float(data.ctrl[i]), low), high),
-                low=low,
-                high=high,
-                doc=doc,
-                always=always,
-                contact=contact,
-            )

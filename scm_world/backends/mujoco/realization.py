@@ -71,7 +71,7 @@ class Realization:
         data: With the present state.
         kept: The parameters in force; at first, none has been written.
         revision: An object that identifies the parameters in force; new with every change.
-        command: Where it is written, shape (n_commands,).
+        command: As it is held, shape (n_commands,).
         lean: Whether ``mjSTATE_INTEGRATION`` is all that a scene has to keep.
         replay: ``mjSTATE_INTEGRATION`` before the last steps and how many these were, if they were
             taken elsewhere, so that their contacts are not in the data.
@@ -97,7 +97,7 @@ class Realization:
         self._motion, self._zeros = np.empty(len(self._places)), np.zeros(len(self._places))
         self._names, self._turned, self._own = turned_bodies(structure, compiled)
         self._spins = self._turned[:, 4:]
-        self._reported = np.stack(structure.places(REPORTED))
+        self._reported = structure.places(REPORTED)
         self._row = self._motion[None], self._forces[None], self._places, self._reported
         self.lean = not (self._reported.size or self._names)
         self._last: LastStep | None = None
@@ -120,10 +120,9 @@ class Realization:
 
     def place(self, vector: Floats) -> None:
         """Write a state; all else stays as it is. What is as the last step left it stays exact."""
-        remembered = self._remembered() if self._names else None
         motion = vector[self._places]
-        if remembered is not None:
-            names, known, exact = remembered
+        if self._names:
+            names, known, exact = self._remembered()
             if names != self._names:
                 where = [names.index(name) if name in names else -1 for name in self._names]
                 nobody = np.full((1, 7), np.nan)
@@ -160,8 +159,17 @@ class Realization:
         """Forget what was before a step that is made now."""
         self.replay = self._last = self._written = None
 
-    def problem(self) -> str:
-        """Return why the state after a step is invalid; empty if it is valid."""
+    def step(self, command: Floats, substeps: int) -> str:
+        """Hold a command; return why the state after it is invalid, or nothing."""
+        self.command[:] = command
+        self.forget()
+        try:
+            mujoco.mj_step(self.model, self.data, substeps)
+        except (mujoco.FatalError, mujoco.UnexpectedError) as error:
+            numbers = self.numbers()
+            mujoco.mj_resetData(self.model, self.data)  # what the step was using is free again
+            self.recall(numbers, None)
+            return f"MuJoCo: {error}"
         mujoco.mj_getState(self.model, self.data, self._motion, MOTION)
         full = self._full.tolist() != [1, 1]
         if self._motion.dot(self._zeros) == 0.0 and not full:
@@ -172,13 +180,6 @@ class Realization:
         vector = self.structure.empty_state().vector
         self.read(vector)
         return lost(self.structure, vector, self.data.time)
-
-    def recover(self) -> None:
-        """Free what a step was using when it failed; the state stays as the step left it."""
-        numbers = self.numbers()
-        mujoco.mj_resetData(self.model, self.data)
-        mujoco.mj_setState(self.model, self.data, numbers, STATE)
-        self._counts[:] = 1
 
     def touches(self) -> Touches:
         """Copy the contacts of the last physics step; of Runge-Kutta, those of its last stage."""
@@ -305,7 +306,7 @@ class Realization:
             wrong = reversed_ranges({key: kept[key] for key in before})
             reason = REVERSED if wrong else self._followed([*before])
             if reason:
-                wrong = wrong or self._culprits(before)
+                wrong = wrong or [key for key in before if slots[key].constant]
                 names = ", ".join(".".join(key).strip(".") for key in wrong)
                 values = [parameters[key] for key in wrong]
                 raise Infeasible(names, values[0] if len(values) == 1 else values, [reason])
@@ -335,14 +336,3 @@ class Realization:
             singular[0] = 1
             return "masses and moments of inertia would not be those of something that can move"
         return ""
-
-    def _culprits(self, keys: Iterable[ParameterKey]) -> list[ParameterKey]:
-        """List the parameters among some that no body can have; all that count if none is wrong."""
-        constant, wrong = [key for key in keys if self._slots[key].constant], []
-        for key in constant:
-            value = self._slots[key].read()
-            most = value.max()
-            bad = not np.isfinite(value).all() or (key[1] == "mass" and value < 0.0)
-            if bad or (key[1] == "inertia" and 2.0 * most - value.sum() > 1e-6 * most):
-                wrong.append(key)
-        return wrong or constant

@@ -39,15 +39,14 @@ from scm_world.tasks.rewards import (
     reward,
     succeeded,
 )
-from scm_world.tasks.trifinger import hardware, kernels, shaping
+from scm_world.tasks.trifinger import hardware, kernels
 from scm_world.tasks.trifinger.conventions import CONVENTIONS, TriFingerConventions
-from scm_world.tasks.trifinger.entities.block_world import BlockWorld
+from scm_world.tasks.trifinger.entities.block_world import BlockWorld, fingers_reach
 from scm_world.tasks.trifinger.entities.robot import ACTIONS, robot
 from scm_world.tasks.trifinger.entities.stage import light_and_cameras, stage
-from scm_world.tasks.trifinger.feasibility import fingers_reach
 from scm_world.tasks.trifinger.hardware import PRESETS, RESOLUTIONS, TIMESTEP
+from scm_world.tasks.trifinger.kernels import POSE
 from scm_world.tasks.trifinger.scenarios import scenarios
-from scm_world.tasks.trifinger.shaping import POSE
 from scm_world.tasks.trifinger.symmetry import thirds
 from scm_world.tasks.trifinger.views import boxes_apart, view_of
 from scm_world.variables import Function, Linear, Measured, Variable, names
@@ -80,7 +79,6 @@ def observe(name: str, kind: int, *parts: str) -> Iterable[Observed]:
 
 
 REWARD = "reward"
-SECONDS_PER_BLOCK = 10.0
 
 MEASURES = ("cartesian_position", "orientation", "linear_velocity", "angular_velocity")
 """States of a block, in the order in which they are listed."""
@@ -114,6 +112,9 @@ class TriFingerTask(Task):
         start: The same, if an option changed them.
         success: Replaces the usual goal, if given; see ``Common``.
         terminated: Ends an episode before its time, if given; see ``Common``.
+
+    Raises:
+        UnknownOption: An argument is not known, or out of the bounds of its variable.
     """
 
     choices: ClassVar[dict[str, Any]] = {
@@ -134,7 +135,7 @@ class TriFingerTask(Task):
     default_weights: ClassVar[Mapping[str, float]]
     paper_weights: ClassVar[Mapping[str, float]] = {}
     dense_terms: ClassVar[tuple[Measured, ...]] = ()
-    ready_terms: ClassVar[tuple[Measured, ...]] = shaping.ROBOT
+    ready_terms: ClassVar[tuple[Measured, ...]] = kernels.ROBOT
     terms: tuple[Measured, ...] = ()
     options: ClassVar[type] = Common
     unchecked: ClassVar[tuple[str, ...]] = ()
@@ -238,7 +239,7 @@ class TriFingerTask(Task):
     def seconds(self) -> float:
         """Ten seconds for each block [s]."""
         still = len(self.obstacles) if self.conventions.published else 0
-        return SECONDS_PER_BLOCK * (len(self.tools) + still)
+        return 10.0 * (len(self.tools) + still)
 
     @property
     def goal(self) -> Goal:
@@ -260,7 +261,7 @@ class TriFingerTask(Task):
                 SUCCESS: lambda mine, its: fraction(mine, its) > FULFILLED,
                 OVERLAP: aligned,
             },
-            closeness=((shaping.TIPS, *have, *want), boxes_apart),
+            closeness=((kernels.TIPS, *have, *want), boxes_apart),
             tools=self.tools,
             targets=self.targets,
         )

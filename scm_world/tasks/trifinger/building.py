@@ -217,9 +217,6 @@ class Towers(Building):
         tower_dims: Default size of the tower [m].
         tower_center: Default place of the middle of its base, x and y [m].
         common: Options of every task; see ``Common``.
-
-    Raises:
-        UnknownOption: An argument is out of the bounds of its variable.
     """
 
     name = "towers"

@@ -176,9 +176,6 @@ class General(Building):
         tool_block_size: Default edge length of a block [m].
         nums_objects: Default number of blocks.
         common: Options of every task; see ``Common``.
-
-    Raises:
-        UnknownOption: An argument is out of the bounds of its variable.
     """
 
     name = "general"

@@ -33,7 +33,6 @@ from scm_world.tasks.trifinger.hardware import N_JOINTS
 from scm_world.tasks.trifinger.kinematics import forward, inverse
 from scm_world.tasks.trifinger.system import PhysicalState, TriFinger
 
-CUBE = 0.065  # [m] edge of the platform's cube
 TURN = math.radians(-48.0)  # of this package's world about z, so that the fingers lie alike
 NEAR, SMALL = 1e-4, 1e-6  # [m] of inverse kinematics, [rad] of derivatives
 OWN: Mapping[str, Any] = {

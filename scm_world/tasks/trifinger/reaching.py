@@ -15,7 +15,7 @@ from scm_world.tasks.base import Goal, Observed, checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, weighted
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import hardware, kernels, shaping
+from scm_world.tasks.trifinger import hardware, kernels
 from scm_world.tasks.trifinger.base import ROWS, TriFingerTask, observe
 from scm_world.tasks.trifinger.entities.bodies import (
     COUNT,
@@ -26,8 +26,8 @@ from scm_world.tasks.trifinger.entities.bodies import (
     scattered,
     scattering,
 )
+from scm_world.tasks.trifinger.kernels import PLACES, SMOOTHNESS, TIPS, TIPS_WAS
 from scm_world.tasks.trifinger.kinematics import inverse
-from scm_world.tasks.trifinger.shaping import PLACES, SMOOTHNESS, TIPS, TIPS_WAS
 from scm_world.variables import Box, Cylinder, Draw, Function, Integers, Measured, Variable
 from scm_world.variables.kinds import SpaceName
 
@@ -85,7 +85,7 @@ class Reaching(TriFingerTask):
         fraction=1.0,
     )
     paper_weights = {FRACTION: 0.0}  # noqa: RUF012 # a constant
-    ready_terms = shaping.REACHING
+    ready_terms = kernels.REACHING
     seconds = 5.0
     decided_by = (COUNT,)
     goal_causes = tuple(f"{name}.cylindrical_position" for name in GOALS)

@@ -18,7 +18,7 @@ from scm_world.tasks.base import checked, finite_numbers
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, Common, weighted
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import kernels, shaping
+from scm_world.tasks.trifinger import kernels
 from scm_world.tasks.trifinger.base import TriFingerTask
 from scm_world.tasks.trifinger.catalogue import Causes
 from scm_world.tasks.trifinger.entities.bodies import (
@@ -36,7 +36,7 @@ from scm_world.tasks.trifinger.entities.bodies import (
     tool,
     turned_on_the_floor,
 )
-from scm_world.tasks.trifinger.shaping import BLOCK, GOAL, TARGET, TIPS, TOOL, TURNED, WAS
+from scm_world.tasks.trifinger.kernels import BLOCK, GOAL, TARGET, TIPS, TOOL, TURNED, WAS
 from scm_world.variables import Box, Fixed, Function, Switch, Variable
 from scm_world.variables.spaces import Bound
 
@@ -128,7 +128,7 @@ class OneBlock(TriFingerTask):
 
     options = Alike
     targets: ClassVar[dict[str, str]] = {GOAL: TOOL}
-    ready_terms = shaping.ONE_BLOCK
+    ready_terms = kernels.ONE_BLOCK
 
     def __init__(self, tool_block_position: Place, **options: Unpack[Alike]) -> None:
         common: Any = dict(options)
@@ -255,7 +255,7 @@ class Pushing(OneBlock):
 
     name = "pushing"
     default_weights, dense_terms = weighted(
-        (750.0, *shaping.TIPS_TO_BLOCK),
+        (750.0, *kernels.TIPS_TO_BLOCK),
         (250.0, "block_to_goal", kernels.block_progress, (BLOCK, WAS, TARGET)),
         (100.0, *TURNED),
         fraction=1.0,
@@ -329,10 +329,10 @@ class Picking(OneBlock):
         (0.0, "height_error", kernels.minus_height_error, (BLOCK, TARGET)),
         (125.0, "block_to_center", kernels.centering_progress, (BLOCK, WAS)),
         (0.0, "center_distance", kernels.minus_eccentricity, (BLOCK,)),
-        (750.0, *shaping.TIPS_TO_BLOCK),
+        (750.0, *kernels.TIPS_TO_BLOCK),
         (0.0, "tips_distance", kernels.minus_tips_distance, (TIPS, BLOCK)),
         (0.0, "grasp", kernels.minus_grasp_distance, (TIPS, BLOCK, f"{TOOL}.size")),
-        (0.005, *shaping.SMOOTHNESS),
+        (0.005, *kernels.SMOOTHNESS),
         fraction=1.0,
     )
     goal_causes = (HEIGHT,)
@@ -446,11 +446,11 @@ class PickAndPlace(OneBlock):
 
     name = "pick_and_place"
     default_weights, dense_terms = weighted(
-        (750.0, *shaping.TIPS_TO_BLOCK),
+        (750.0, *kernels.TIPS_TO_BLOCK),
         (50.0, "block_to_goal", kernels.horizontal_progress, (BLOCK, WAS, TARGET)),
         (250.0, "block_to_height", kernels.crossing_progress, (BLOCK, WAS, TARGET, f"{GOAL}.size")),
         (0.0, *TURNED),
-        (0.005, *shaping.SMOOTHNESS),
+        (0.005, *kernels.SMOOTHNESS),
         fraction=0.0,
     )
     paper_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant

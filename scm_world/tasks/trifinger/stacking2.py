@@ -30,7 +30,7 @@ from scm_world.tasks.trifinger.entities.bodies import (
     tool,
     turned_on_the_floor,
 )
-from scm_world.tasks.trifinger.shaping import SMOOTHNESS, TIPS, TIPS_WAS
+from scm_world.tasks.trifinger.kernels import SMOOTHNESS, TIPS, TIPS_WAS
 from scm_world.tasks.trifinger.single import SIZE, floor_place, start_place, unit_quaternion
 from scm_world.variables import Affine, Function, Parent
 

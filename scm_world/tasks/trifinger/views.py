@@ -18,7 +18,7 @@ from numba import njit
 
 from scm_world._types import Floats, Values
 from scm_world.geometry.rotations import rotation_kernel, rotation_matrix
-from scm_world.tasks.trifinger.shaping import POSE, TIPS
+from scm_world.tasks.trifinger.kernels import POSE, TIPS
 
 QUARTER = 0.5 * math.pi
 SIZE = 20

@@ -208,9 +208,6 @@ class StackedBlocks(Building):
 
     Attributes:
         levels: Bounds and spaces of the number of levels.
-
-    Raises:
-        UnknownOption: An argument is out of the bounds of its variable.
     """
 
     name = "stacked_blocks"

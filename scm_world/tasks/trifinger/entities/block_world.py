@@ -1,27 +1,42 @@
-"""The robot, blocks, obstacles and goals together."""
+"""The robot, blocks, obstacles and goals together, and which of them are in one place."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
-from scm_world._types import Values
+from scm_world._types import Floats, Values
+from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models import GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.camera import Camera, camera_from
-from scm_world.models.scene import Overlap
+from scm_world.models.scene import TOLERANCE, Overlap
 from scm_world.tasks.base import Timing
 from scm_world.tasks.composition import Composition, Entity
 from scm_world.tasks.model import causes_of
 from scm_world.tasks.trifinger.cameras import CAMERAS
 from scm_world.tasks.trifinger.entities.robot import RobotCommands, acted_on
-from scm_world.tasks.trifinger.feasibility import buried_goals, clear, overlaps
-from scm_world.tasks.trifinger.hardware import FINGERS, LINK_NAMES, N_JOINTS, PRESETS
+from scm_world.tasks.trifinger.grasping.hand import deepest_kernel
+from scm_world.tasks.trifinger.hardware import (
+    FINGERS,
+    LINK_NAMES,
+    N_JOINTS,
+    PRESETS,
+    WALL_HEIGHT,
+    WALL_RADIUS,
+    link_name,
+)
+from scm_world.tasks.trifinger.kinematics import forward, forward_kernel
 from scm_world.variables import Variable
 from scm_world.variables.kinds import Coupled
 from scm_world.variables.reserved import PRESET
+
+if TYPE_CHECKING:
+    from scm_world.tasks.trifinger.system import TriFinger
 
 PARAMETERS = {
     "gravity": ("world", "gravity"),
@@ -44,8 +59,67 @@ PARAMETERS = {
 QUANTITIES = ("mass", "size", "friction", "color", "cartesian_position", "orientation")
 """Quantities of bodies that are parameters, as far as the model has them; ``position`` in it."""
 
-if TYPE_CHECKING:
-    from scm_world.tasks.trifinger.system import TriFinger
+BALLS_MARGIN = 1e-3  # [m] by which balls of two legs may be deeper in one another than capsules
+
+
+def overlaps(scene: Scene, *, tolerance: float, enough: float = math.inf) -> tuple[Overlap, ...]:
+    """List all pairs of bodies that lie deeper in one another than a tolerance.
+
+    Compared are blocks with everything; the middle and lower links of different fingers with one
+    another; both with the floor and obstacles; the tips with the ring. What has its center beyond
+    the ring has left the arena, and lies in the stage: a block at any height, a tip below the
+    upper end.
+
+    Args:
+        scene: With complete parameters.
+        tolerance: How deep is too deep [m].
+        enough: Where some lie deeper than this in one another, those alone may be listed [m].
+
+    Returns:
+        One entry for each pair of names, blocks first.
+
+    Example:
+        >>> from scm_world.tasks.trifinger.system import trifinger
+        >>> scene = trifinger(("tool_block",)).default_scene()
+        >>> overlaps(scene, tolerance=1e-4)
+        ()
+        >>> scene.state.positions[0, 2] = 0.03
+        >>> print(*overlaps(scene, tolerance=1e-4))
+        'tool_block' lies 2.5 mm deep in 'floor'
+    """
+    from scm_world.backends.mujoco import overlaps as engine
+
+    found, state = engine.overlaps(scene, tolerance, enough=enough), scene.state
+    if any(overlap.depth > enough for overlap in found):
+        return found
+    tips = forward(state.joint_positions, float(scene.parameters["robot", "height"])).reshape(3, 3)
+    centers = np.vstack([state.positions, tips])
+    beyond = np.hypot(centers[:, 0], centers[:, 1]) - WALL_RADIUS
+    beyond[len(state.positions) :][tips[:, 2] > WALL_HEIGHT] = 0.0
+    if beyond.max() <= tolerance:
+        return found
+    names = *scene.structure.blocks, *(link_name(f, 3) for f in FINGERS)
+    deepest = {overlap.bodies: overlap.depth for overlap in found}
+    for name, depth in zip(names, beyond.tolist(), strict=True):
+        if depth > tolerance:
+            deepest[name, "stage"] = max(depth, deepest.get((name, "stage"), 0.0))
+    return tuple(Overlap(bodies, depth) for bodies, depth in deepest.items())
+
+
+@njit(cache=True)
+def _clear(joints: Floats, heights: Floats, limit: float) -> NDArray[np.bool_]:
+    """Return for each row of joints whether fingers may be clear of one another and of the ring.
+
+    Rows with True have to be looked at with ``overlaps``.
+    """
+    found, none = np.empty(len(joints), dtype=np.bool_), np.empty((0, 3, 5))
+    for row in range(len(joints)):
+        tips, apart = forward_kernel(joints[row], heights[row]), True
+        for x, y, z in tips.reshape(3, 3):
+            apart &= z > WALL_HEIGHT or math.hypot(x, y) - WALL_RADIUS <= limit
+        most = limit + BALLS_MARGIN
+        found[row] = apart and deepest_kernel(joints[row], heights[row], none) <= most
+    return found
 
 
 @final
@@ -125,7 +199,7 @@ class BlockWorld(Composition):
         if len(joints) > 1:
             heights = np.broadcast_to(candidates.parameter(("robot", "height")), len(joints))
             limit = max(limit, self._conventions.robot_tolerance)
-            candidates.keep(clear(joints, np.ascontiguousarray(heights), limit))
+            candidates.keep(_clear(joints, np.ascontiguousarray(heights), limit))
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable; edges into states follow from the kinematic trees."""
@@ -172,8 +246,17 @@ class BlockWorld(Composition):
         return {name: key for name, key in found.items() if key in known}
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
-        """List goals that lie in an obstacle."""
-        return buried_goals(scene, names)
+        """List goals that lie deeper than ``TOLERANCE`` in an obstacle: nothing can fill them."""
+        found, obstacles = list[Overlap](), scene.structure.obstacles
+        goals = [goal for goal in scene.goals if obstacles and goal.name in names]
+        for goal in (goal for goal in goals if goal.shape == "sphere"):
+            inside = (Overlap((goal.name, o), _depth_in_box(goal, scene, o)) for o in obstacles)
+            found += [overlap for overlap in inside if overlap.depth > TOLERANCE]
+        solid = [goal for goal in goals if goal.shape != "sphere"]
+        if solid:
+            listed = overlaps(_filled(solid, scene.parameters, obstacles), tolerance=TOLERANCE)
+            found += [overlap for overlap in listed if overlap.bodies[1] in obstacles]
+        return tuple(found)
 
     def movers(self) -> tuple[str, ...]:
         """Name the fingers, then the blocks. The bases of fingers are fixed."""
@@ -213,3 +296,39 @@ class BlockWorld(Composition):
             )
             for camera in CAMERAS
         )
+
+
+def _filled(
+    goals: Sequence[GoalRegion], parameters: Mapping[Any, Any], obstacles: tuple[str, ...] = ()
+) -> Scene:
+    """Return a scene with blocks in the places of goals."""
+    from scm_world.tasks.trifinger.system import trifinger  # it loads an engine
+
+    hulls = tuple((goal.name, goal.hull) for goal in goals if goal.hull is not None)
+    blocks = tuple(goal.name for goal in goals)
+    scene = trifinger(blocks, obstacles=obstacles, hulls=hulls).default_scene()
+    sizes = {(goal.name, "size"): goal.size for goal in goals if goal.hull is None}
+    for pose, goal in zip(scene.state.blocks, goals, strict=True):
+        pose[:3], pose[3:7] = goal.position, goal.orientation
+    return scene.with_(parameters={**scene.parameters, **parameters, **sizes})
+
+
+def _depth_in_box(goal: GoalRegion, scene: Scene, obstacle: str) -> float:
+    """Measure how far a sphere would have to be moved out of an obstacle [m]."""
+    size, place, turn = (
+        scene.parameters[obstacle, what] for what in ("size", "position", "orientation")
+    )
+    beyond = np.abs((goal.position - place) @ rotation_matrix(turn)) - 0.5 * size
+    distance = np.linalg.norm(np.maximum(beyond, 0.0)) + min(beyond.max(), 0.0)
+    return 0.5 * float(goal.size[0]) - float(distance)
+
+
+def fingers_reach(
+    size: Floats, position: Floats, orientation: Floats, joints: Floats, height: float
+) -> bool:
+    """Return whether a finger lies in a box with these edges and this pose, at given joints."""
+    box = GoalRegion("box", "box", size, position, orientation, color=np.zeros(3))
+    scene = _filled([box], {("robot", "height"): height})
+    scene.state.joint_positions[:] = joints
+    found = overlaps(scene, tolerance=TOLERANCE)
+    return any("box" in o.bodies and o.bodies[1] in LINK_NAMES for o in found)

@@ -334,16 +334,11 @@ class Choice:
         The block itself counts if its sides are moved outwards by ``grow`` [m].
         """
         sight, rows = self._sight, np.ascontiguousarray(tips).reshape(-1, 9)
-        boxes = [(other, CLEAR) for other in self._others(body.name)]
-        boxes += [(body, grow)] if grow is not None else []
-        joints, reached, depth = poses(
-            rows,
-            np.tile(sight.joints, (len(rows), 1)) if near is None else near,
-            sight.height,
-            np.array([box.half + more for box, more in boxes]).reshape(-1, 3),
-            np.array([box.place for box, _ in boxes]).reshape(-1, 3),
-            np.array([turn_about_z(box.yaw) for box, _ in boxes]).reshape(-1, 3, 3),
-        )
+        bodies = [(other, CLEAR) for other in self._others(body.name)]
+        bodies += [(body, grow)] if grow is not None else []
+        boxes = [np.c_[b.half + more, b.place, turn_about_z(b.yaw)] for b, more in bodies]
+        near = np.tile(sight.joints, (len(rows), 1)) if near is None else near
+        joints, reached, depth = poses(rows, near, sight.height, np.reshape(boxes, (-1, 3, 5)))
         return joints, reached & (depth <= 0.0), depth
 
 

@@ -138,14 +138,10 @@ class Program:
         sight = self.sight
         sight.look(world)
         move, tips = self._planned(), sight.tips
-        if self.back > 0:
-            self.back -= 1
-            place = sight.tips_at(np.array(hardware.REST))
-            place[:, 2] = 0.12
-            return self._to(place, TRAVEL)
-        if move is None:
-            place = tips.copy()
-            place[:, 2] = np.maximum(tips[:, 2], 0.09)
+        if self.back > 0 or move is None:
+            place = sight.tips_at(np.array(hardware.REST)) if self.back > 0 else tips.copy()
+            place[:, 2] = 0.12 if self.back > 0 else np.maximum(tips[:, 2], 0.09)
+            self.back = max(self.back - 1, 0)
             return self._to(place, TRAVEL)
         body, grip = sight.body(move.end.name), move.grip
         own = body.own(tips)

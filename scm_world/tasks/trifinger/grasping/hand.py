@@ -31,9 +31,7 @@ _MASSES = (
 
 
 @njit(cache=True)
-def deepest_kernel(
-    joints: Floats, height: float, halves: Floats, centers: Floats, turns: Floats
-) -> float:
+def deepest_kernel(joints: Floats, height: float, boxes: Floats) -> float:
     """Compute how deep any leg lies in a box or in a leg of another finger [m]; negative: apart.
 
     A leg, lower or middle, counts as a row of balls; what lies between two of them is up to 1.4 mm
@@ -42,9 +40,7 @@ def deepest_kernel(
     Args:
         joints: Shape (9,) [rad].
         height: Of the robot [m].
-        halves: Half edges of the boxes, shape (n, 3) [m].
-        centers: Shape (n, 3) [m].
-        turns: Axes of the boxes as columns, shape (n, 3, 3).
+        boxes: Half edges [m], center [m] and the three axes of each as columns, shape (n, 3, 5).
     """
     legs, deepest = np.empty((2 * N_FINGERS, BALLS, 3)), -math.inf
     for leg in range(2 * N_FINGERS):
@@ -55,13 +51,13 @@ def deepest_kernel(
         for i, ball in enumerate(legs[leg]):
             for k in range(3):
                 ball[k] = first[k] + (knee[k] - first[k]) * i / (BALLS - 1)
-            for box in range(len(halves)):
+            for box in boxes:
                 outside, inside = 0.0, -math.inf
                 for axis in range(3):
                     along = 0.0
                     for k in range(3):
-                        along += (ball[k] - centers[box, k]) * turns[box, k, axis]
-                    beyond = abs(along) - halves[box, axis]
+                        along += (ball[k] - box[k, 1]) * box[k, 2 + axis]
+                    beyond = abs(along) - box[axis, 0]
                     outside, inside = outside + max(beyond, 0.0) ** 2, max(inside, beyond)
                 deepest = max(deepest, radius - math.sqrt(outside) - min(inside, 0.0))
         for other in range(2 * finger):
@@ -99,7 +95,7 @@ def torques(joints: Floats, height: float, forces: Floats) -> Floats:
 
 @njit(cache=True)
 def poses(
-    tips: Floats, near: Floats, height: float, halves: Floats, centers: Floats, turns: Floats
+    tips: Floats, near: Floats, height: float, boxes: Floats
 ) -> tuple[Floats, NDArray[np.bool_], Floats]:
     """Find joints for fingertips [m], near others, all of shape (n, 9) [rad].
 
@@ -111,5 +107,5 @@ def poses(
     for row in range(len(tips)):
         found, fingers = inverse_kernel(tips[row], height, near[row])
         joints[row], reached[row] = found, fingers.all()
-        depths[row] = deepest_kernel(found, height, halves, centers, turns)
+        depths[row] = deepest_kernel(found, height, boxes)
     return joints, reached, depths
