@@ -616,6 +616,21 @@ def test_a_batch_is_its_members(backend: BulletBackend) -> None:
         member.close()
 
 
+def test_a_shape_that_only_pictures_show_has_no_effect(backend: BulletBackend) -> None:
+    """Resizing it in mid-episode leaves contacts as they are."""
+    label = '<geom name="label" size="0.02" contype="0" conaffinity="0" mass="0"/></body>'
+    model = everything(SLIDER.format(floor=0.5, box=0.5).replace("</body>", label))
+    scene = model.default_scene()
+    scene.state["box.linear_velocity"][:] = [1.0, 0.5, 0.0]
+    backend.build(scene)
+    play(backend, 10)
+    start = backend.snapshot()
+    expected = play(backend, 20)
+    backend.restore(start)
+    backend.apply(Difference(parameters={("label", "size"): np.array([0.05])}))
+    np.testing.assert_array_equal(play(backend, 20), expected)
+
+
 # --- what there is not ----------------------------------------------------------------------------
 
 ODD = """
