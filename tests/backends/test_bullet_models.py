@@ -740,3 +740,52 @@ def test_a_state_that_is_not_finite_is_an_error(backend: BulletBackend) -> None:
     backend.build(scene)
     with pytest.raises(EngineFailure, match="not finite"):
         play(backend, 3)
+
+
+MOTORS = """
+<mujoco model="motors">
+  <option timestep="0.002"/>
+  <custom><numeric name="bullet_explicit_servos" data="1"/></custom>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <joint name="shoulder" axis="0 1 0" stiffness="0.4" springref="20" pos="0 0 0.01"/>
+      <geom name="upper" type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.4"/>
+      <body name="fore" pos="0.2 0 0">
+        <joint name="elbow" axis="0 1 0" actuatorfrcrange="-0.3 0.3" actuatorfrclimited="true"/>
+        <geom name="fore" type="capsule" fromto="0 0 0 0 0 -0.2" size="0.015" mass="0.2"/>
+      </body>
+    </body>
+    <body name="apart" pos="0 2 1">
+      <joint name="apart" axis="0 1 0"/>
+      <geom name="apart" type="sphere" size="0.05" pos="0.1 0 0" mass="0.1"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="shoulder" joint="shoulder" gear="2" forcerange="-0.5 0.5" forcelimited="true"/>
+    <position name="elbow" joint="elbow" kp="3" kv="0.05"/>
+    <general name="apart" joint="apart" dyntype="DYNAMICS" dynprm="0.1"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_forces_of_joints_alone_are_those_of_the_whole_model() -> None:
+    """A filter elsewhere needs all of MuJoCo's step; the arm moves the same, but for rounding."""
+    runs = []
+    for dynamics in ("none", "filter"):
+        backend, model = make_backend("bullet"), read_model(MOTORS.replace("DYNAMICS", dynamics))
+        backend.build(model.default_scene())
+        rows = []
+        for angle in np.linspace(0.0, 6.0, 40):
+            backend.step(np.array([0.4 * np.sin(angle), np.cos(angle), 0.0]), 5)
+            state = backend.read()
+            names = [
+                f"{joint}.{what}"
+                for joint in ("shoulder", "elbow")
+                for what in ("position", "velocity")
+            ]
+            rows.append(np.concatenate([state[name] for name in names]))
+        runs.append(np.array(rows))
+        backend.close()
+    assert abs(runs[0]).max() > 1.0
+    np.testing.assert_allclose(runs[0], runs[1], rtol=0, atol=1e-9)

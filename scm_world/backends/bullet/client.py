@@ -26,7 +26,7 @@ from scm_world.backends.bullet.build import (
 )
 from scm_world.backends.bullet.engine import Connection
 from scm_world.backends.bullet.honoured import realized, rebuilt
-from scm_world.backends.bullet.joints import JointSet, parts
+from scm_world.backends.bullet.joints import Free, JointSet, parts
 from scm_world.backends.mujoco import reading
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.backends.mujoco.trees import Couplings, disabled
@@ -318,6 +318,7 @@ class Client:
         if self._trees != moved:
             self._trees = moved
             self._driven = parts(self.engine, self.twin.model, self.joints, moved)
+        self._local = self._needs_joints_alone()
 
     def _settings(
         self,
@@ -396,6 +397,22 @@ class Client:
                 twin.edit({key: present})
         return tuple(found)
 
+    def _needs_joints_alone(self) -> bool:
+        """Return whether forces follow from coordinates of joints, and no damper is implicit."""
+        mj = self.twin.model
+        dampers = (mj.dof_damping, mj.dof_dampingpoly, mj.actuator_damping, mj.actuator_dampingpoly)
+        return not (
+            mj.na
+            or mj.ntendon
+            or mj.nplugin
+            or mj.opt.density
+            or mj.opt.viscosity
+            or mj.body_gravcomp.any()
+            or (mj.actuator_trntype != mujoco.mjtTrn.mjTRN_JOINT).any()
+            or any(numbers.any() for numbers in dampers)
+            or any(isinstance(part, Free) for part in self._driven)
+        )
+
     # --- steps -----------------------------------------------------------------------------------
 
     def step(self, command: Sequence[float], substeps: int) -> None:
@@ -405,7 +422,8 @@ class Client:
         before the step, light links would turn back faster than they came. With mass matrix M,
         bias b, forces f and slopes D, MuJoCo's integrator ``implicitfast`` has the acceleration
         ``a = (M + h D)^-1 (f - b)``, and ``Euler`` has the slopes of passive dampers alone; the
-        forces ``M a + b`` let the engine's explicit step have it.
+        forces ``M a + b`` let the engine's explicit step have it. Without implicit dampers these
+        are f, which takes no pass over all bodies where it follows from the joints alone.
         """
         self.twin.forget()
         mj, data, options = self.twin.model, self.twin.data, self.twin.model.opt
@@ -416,18 +434,28 @@ class Client:
         if custom(mj, "bullet_explicit_servos"):
             options.integrator = mujoco.mjtIntegrator.mjINT_EULER
         self.twin.command[:] = command
-        forces, rates, step = np.empty(mj.nv), np.empty(mj.nv), options.timestep
+        explicit = options.integrator == mujoco.mjtIntegrator.mjINT_EULER
+        direct = explicit and self._local
+        (speeds, rates, forces), step = np.empty((3, mj.nv)), options.timestep
+        velocities, bias = data.qvel, data.qfrc_bias
+        passive, actuators = data.qfrc_passive, data.qfrc_actuator
         advance = self.engine.stepSimulation
         for _ in range(substeps):
             if self._driven:
                 for part in self._driven:
                     part.take(data)
-                speeds = data.qvel.copy()
-                mujoco.mj_step(mj, data)
-                np.subtract(data.qvel, speeds, out=rates)
-                rates /= step
-                mujoco.mj_mulM(mj, data, forces, rates)
-                forces += data.qfrc_bias
+                if direct:
+                    mujoco.mj_transmission(mj, data)
+                    mujoco.mj_fwdVelocity(mj, data)
+                    mujoco.mj_fwdActuation(mj, data)
+                    np.add(passive, actuators, out=forces)
+                else:
+                    speeds[:] = velocities
+                    mujoco.mj_step(mj, data)
+                    np.subtract(velocities, speeds, out=rates)
+                    rates /= step
+                    mujoco.mj_mulM(mj, data, forces, rates)
+                    forces += bias
                 for part in self._driven:
                     part.drive(data, forces)
             advance()
