@@ -253,13 +253,13 @@ class ModelTask(DeclaredTask):
 
     def _check_names(self) -> None:
         rows = (*self.system.parameters, *self.system.states, *self.system.inputs)
-        known = [row.name for row in rows] + [variable.name for variable in self.ties]
+        ties = {variable.name: variable.shape for variable in self.ties}
+        known = [*(row.name for row in rows), *ties]
         if not isinstance(self.spaces, Mapping):
             raise UnknownOption("spaces", self.spaces, ("a dictionary by name",))
         for row in rows:
-            tie = next((one for one in self.ties if one.name == row.name), None)
-            if tie is not None and tie.shape != row.shape:
-                raise UnknownOption(f"shape of the tie {row.name}", tie.shape, (str(row.shape),))
+            if (shape := ties.get(row.name, row.shape)) != row.shape:
+                raise UnknownOption(f"shape of the tie {row.name}", shape, (str(row.shape),))
         for name, given in self.spaces.items():
             if name not in known:
                 raise UnknownOption("spaces", name, known)
@@ -269,11 +269,8 @@ class ModelTask(DeclaredTask):
 
     def on(self, backend: Backend) -> Self:
         """Return the same task with the parameters that a backend has."""
-        kept = tuple(
-            row
-            for row in self.system.parameters
-            if backend.capabilities.supports(self.system, row.key)
-        )
+        supports = backend.capabilities.supports
+        kept = tuple(row for row in self.system.parameters if supports(self.system, row.key))
         if len(kept) == len(self.system.parameters):
             return self
         gone = {row.name for row in self.system.parameters} - {row.name for row in kept}

@@ -192,11 +192,10 @@ class StepTask(DeclaredTask):
         return self
 
     def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
-        """Declare all variables, and their meaning to the backend.
+        """Declare all variables; a control step is one call, of which the declared edges are.
 
         Raises:
-            UnknownOption: A control step is to be several calls of the function: the declared
-                edges are those of one.
+            UnknownOption: A control step is to be several calls.
         """
         calls = round(timing.control_period / self.time_unit)
         if calls != 1:
@@ -209,11 +208,9 @@ class StepTask(DeclaredTask):
         every = [Parent(v.name, 1) for v in (*self.parameters, *self.states, *self.actions)]
         for state in self.states:
             default = 0.0 if state.default is None else state.default
+            initial = (parent for parent in state.parents if parent.when == "set")
             fields = {
-                "parents": (
-                    *(_lagged(state) or every),
-                    *(p for p in state.parents if p.when == "set"),
-                ),
+                "parents": (*(_lagged(state) or every), *initial),
                 "settable_state": True,
                 "default": _numbers(state.name, default, state.shape),
             }
