@@ -26,8 +26,8 @@ from scm_world.curricula.combinations import (
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
 from scm_world.curricula.parts import (
     Follow,
-    Goals,
     Interpolate,
+    NewGoal,
     Resample,
     everything,
     follow,
@@ -55,9 +55,9 @@ __all__ = [
     "CurriculumVectorEnv",
     "Do",
     "Follow",
-    "Goals",
     "Interpolate",
     "Memory",
+    "NewGoal",
     "Part",
     "Resample",
     "Situation",

@@ -172,7 +172,7 @@ def _check(variable: Variable, region: SpaceName | Distribution) -> None:
 
 
 @final
-class Goals(Part):
+class NewGoal(Part):
     """Draw a new goal, as the task draws goals; ``goals`` in a sentence.
 
     Attributes:
@@ -375,7 +375,7 @@ class Follow(Part):
             yield self.function
 
 
-resample, goals, interpolate, follow = Resample, Goals, Interpolate, Follow
+resample, goals, interpolate, follow = Resample, NewGoal, Interpolate, Follow
 
 
 def poses(space: Any = "A") -> Resample:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from scm_world._arguments import one_of
 from scm_world.curricula.base import Do, Part
-from scm_world.curricula.parts import Goals, Resample
+from scm_world.curricula.parts import NewGoal, Resample
 from scm_world.errors import UnknownOption
 from scm_world.variables.kinds import SPACES, SpaceName
 
@@ -56,7 +56,7 @@ def published_actor(
         case "base_actor":
             return Do({})
         case "goal_actor":
-            return Goals(space=space)
+            return NewGoal(space=space)
         case "joints_actor":
             return Resample("@joints", space=space)
         case "physical_properties_actor":

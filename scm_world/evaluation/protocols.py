@@ -19,7 +19,7 @@ from typing import Any, final
 from scm_world._arguments import whole_number
 from scm_world.curricula import Curriculum, as_curriculum, at_step, together
 from scm_world.curricula.base import AnyPart, Part, as_part, read_from, words
-from scm_world.curricula.parts import Goals, Resample
+from scm_world.curricula.parts import NewGoal, Resample
 from scm_world.errors import UnknownOption
 from scm_world.tasks import Task, tasks
 from scm_world.variables import Distribution, Subset
@@ -335,7 +335,7 @@ def _protocol(roles: Roles, name: str, what: str, space: SpaceName) -> Protocol:
     named = [FRICTION if w == "friction" else getattr(roles, w) for w in words]
     if None not in named:
         return Protocol(name, named, space, doc=doc)
-    shape = Goals(space=space, besides=roles.kept)
+    shape = NewGoal(space=space, besides=roles.kept)
     others = [pattern for pattern in named if pattern is not None]
     act_: Part = together(shape, Resample(others, space=space)) if others else shape
     return Protocol(name, space=space, act=act_, doc=doc)

@@ -16,7 +16,7 @@ from scm_world.curricula import (
     Curriculum,
     Do,
     Follow,
-    Goals,
+    NewGoal,
     Resample,
     as_curriculum,
     at_reset,
@@ -115,7 +115,7 @@ def test_goal_draws_what_the_task_draws() -> None:
     moved = {name for name in names if value(env, name) != first[name]}
     assert moved
     assert all("goal" in n or n in ("reward", "fractional_success") for n in moved), moved
-    kept = under(Goals("A", besides="goal_block.euler_orientation"))
+    kept = under(NewGoal("A", besides="goal_block.euler_orientation"))
     turns = series(kept, "goal_block.euler_orientation", 3)
     assert turns[0] == turns[1] == turns[2]
 
@@ -317,7 +317,7 @@ IMPOSSIBLE: list[tuple[Any, type[ScmWorldError]]] = [
     (resample(MASS, Box((0.1, 0.2), (0.2, 0.3))), InterventionError),
     (resample("*.cartesian_position", "A"), InterventionError),
     (resample("solver_preset", Normal(0.0, 1.0)), InterventionError),
-    (Goals("A", besides=["gravity"]), UnknownVariable),
+    (NewGoal("A", besides=["gravity"]), UnknownVariable),
     (interpolate({"tool_blok.mass": 0.1}, episodes=5), UnknownVariable),
     (interpolate({MASS: -0.1}, episodes=5), OutOfBounds),
     (interpolate({"gravity": [0.0, 0.0]}, episodes=5), WrongShape),
