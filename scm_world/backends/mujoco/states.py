@@ -34,11 +34,7 @@ def _rotate(turn: Floats, vector: Floats, sign: float) -> None:
     vector[2] = c + scale * (w * k + x * j - y * i)
 
 
-@numba.njit(
-    "i8(f8[:, :], f8[:, :], i8[::1], i8[:, ::1], i8[:, ::1], i4[::1], f8[:, ::1])",
-    cache=True,
-    error_model="numpy",
-)
+@numba.njit(cache=True, error_model="numpy")
 def read_rows(
     motions: Floats,
     forces: Floats,
