@@ -103,7 +103,7 @@ def test_a_larger_block_fills_no_more_than_the_goal() -> None:
 def test_distances_to_three_goals() -> None:
     """Nine offsets of 1, 2, …: Euclidean for the reward, mean absolute for success."""
     goals = np.arange(1.0, 10.0).reshape(3, 3)
-    assert kernels.reach_distance(np.zeros(9), goals.ravel()) == pytest.approx(np.sqrt(285.0))
+    assert kernels.distance(np.zeros(9), goals.ravel()) == pytest.approx(np.sqrt(285.0))
     assert kernels.reach_error(np.zeros(9), *goals) == pytest.approx(5.0)
     half = goals.ravel() / 2.0
     assert kernels.reach_progress(half, np.zeros(9), *goals) == pytest.approx(np.sqrt(285.0) / 2)

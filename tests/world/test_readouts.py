@@ -13,8 +13,7 @@ from numba.extending import is_jitted
 from scm_world import World
 from scm_world.env import ScmWorldEnv
 from scm_world.tasks import TASKS
-from scm_world.tasks.trifinger.kernels import filled
-from scm_world.tasks.trifinger.reaching import minus_norm
+from scm_world.tasks.trifinger.kernels import filled, minus_length
 from scm_world.variables import Concatenation, Linear
 from scm_world.variables.mechanisms import Stacked
 
@@ -59,4 +58,4 @@ def test_a_weighted_sum_is_added_up_in_order() -> None:
 def test_a_norm_is_that_of_numpy() -> None:
     """The loop over a vector agrees with numpy's norm."""
     vector = np.random.default_rng(0).normal(size=9)
-    assert minus_norm(vector) == pytest.approx(-np.linalg.norm(vector), rel=1e-15)
+    assert minus_length(vector) == pytest.approx(-np.linalg.norm(vector), rel=1e-15)

@@ -64,6 +64,14 @@ class Range:
         fields = {**vars(self), "name": name, "doc": doc or self.doc, "inverse": inverse}
         return Derived(parents=tuple(parents), mechanism=mechanism, **fields)
 
+    def either(
+        self, name: str, default: Any, causes: Causes | None, constants: Any = None
+    ) -> Variable:
+        """Declare a root if there are no causes, else what follows from them."""
+        if causes is None:
+            return self.root(name, default)
+        return self.derived(name, causes, constants=constants)
+
     def state(
         self, name: str, default: Any, doc: str = "", on_set: Iterable[str] = (), **how: Any
     ) -> Measured:

@@ -14,6 +14,7 @@ Source:
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any
 
@@ -217,25 +218,11 @@ def stacking_progress(
     return before - distance(first[:2], second[:2])
 
 
-@njit(cache=True)
-def reach_distance(tips: Floats, goals: Floats) -> float:
-    """Compute the Euclidean distance of the nine tip coordinates from their goals [m]."""
-    total = 0.0
-    for axis in range(3):
-        for i in range(axis, 9, 3):
-            total += (tips[i] - goals[i]) ** 2
-    return math.sqrt(total)
-
-
 @Stacked
 @njit(cache=True)
 def reach_error(points: Floats) -> float:
     """Compute the mean absolute error of the nine tip coordinates [m]; three tips, three goals."""
-    total = 0.0
-    for axis in range(3):
-        for i in range(axis, 9, 3):
-            total += abs(points[i] - points[9 + i])
-    return total / 9.0
+    return float(np.abs(points[:9] - points[9:]).mean())
 
 
 @Stacked
@@ -246,14 +233,14 @@ def reach_progress(points: Floats) -> float:
     ``points`` has the three tips, where they were, and the three goals.
     """
     tips, before, goals = points[:9], points[9:18], points[18:]
-    return reach_distance(before, goals) - reach_distance(tips, goals)
+    return distance(before, goals) - distance(tips, goals)
 
 
 @Stacked
 @njit(cache=True)
 def minus_reach_distance(points: Floats) -> float:
     """Compute minus the distance of the tips from their goals [m]."""
-    return -reach_distance(points[:9], points[9:])
+    return -distance(points[:9], points[9:])
 
 
 # --- how full goals are ---------------------------------------------------------------------------
@@ -461,39 +448,25 @@ ROBOT = _terms(
 )
 """Terms of every task. The second one keeps fingers from pressing a block from all sides."""
 
-_COARSE, _FINE = ({"sharpness": sharpness} for sharpness in (COARSE, FINE))
+
+def _near(name: str, kernel: Any, parents: tuple[str, ...], doc: str) -> Iterator[tuple[Any, ...]]:
+    """Describe a kernel that reaches far, and one that is felt within about 2 cm."""
+    for kind, sharpness, felt in (("", COARSE, ""), ("_fine", FINE, "; felt within about 2 cm")):
+        function = Function(kernel, constants={"sharpness": sharpness})
+        yield f"{name}{kind}", function, parents, f"{doc}, in [0, 1]{felt}."
+
+
 _TURN = f"{TOOL}.orientation"
+_CORNERS = "How near the corners of the block are to those of the goal"
 
 ONE_BLOCK = ROBOT + _terms(
-    (
-        "goal_kernel",
-        Function(goal_kernel, constants=_COARSE),
-        _BOXES,
-        "How near the corners of the block are to those of the goal, in [0, 1].",
-    ),
-    (
-        "goal_kernel_fine",
-        Function(goal_kernel, constants=_FINE),
-        _BOXES,
-        "How near the corners are, in [0, 1]; it is felt within about 2 cm.",
-    ),
+    *_near("goal_kernel", goal_kernel, _BOXES, _CORNERS),
     ("corners_to_goal", corners_progress, (*_BOXES[:3], WAS, Parent(_TURN, 1), *_BOXES[3:])),
     ("tip_behind_block", pushing_progress, (TIPS, TIPS_WAS, BLOCK, WAS, TARGET)),
 )
 """Terms of tasks with one block and one goal."""
 
 REACHING = ROBOT + _terms(
-    (
-        "reach_kernel",
-        Function(reach_kernel, constants=_COARSE),
-        (TIPS, *PLACES),
-        "How near the fingertips are to their goals, in [0, 1].",
-    ),
-    (
-        "reach_kernel_fine",
-        Function(reach_kernel, constants=_FINE),
-        (TIPS, *PLACES),
-        "How near the fingertips are, in [0, 1]; it is felt within about 2 cm.",
-    ),
+    *_near("reach_kernel", reach_kernel, (TIPS, *PLACES), "How near the tips are to their goals"),
 )
 """Terms of reaching."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import Any, Unpack, final
 
@@ -10,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Value, Values
-from scm_world.geometry.scalars import fused, scalar
+from scm_world.geometry.scalars import scalar
 from scm_world.tasks.base import Goal, Observed, checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, weighted
@@ -55,15 +54,6 @@ def within(error: Value, reached: Value) -> int:
     return int(scalar(error) < scalar(reached))
 
 
-@njit(cache=True)
-def minus_norm(torques: Floats) -> float:
-    """Compute minus the norm of the joint torques [N m]."""
-    total = 0.0
-    for number in torques:
-        total = fused(number, number, total)
-    return -math.sqrt(total)
-
-
 @final
 class Reaching(TriFingerTask):
     """Three points in the air, one for each fingertip.
@@ -80,7 +70,7 @@ class Reaching(TriFingerTask):
     default_weights, dense_terms = weighted(
         (100_000.0, "tips_to_goals", kernels.reach_progress, (TIPS, TIPS_WAS, *PLACES)),
         (0.0, "distance", kernels.minus_reach_distance, (TIPS, *PLACES)),
-        (0.0, "torque", minus_norm, ("joint_torques",)),
+        (0.0, "torque", kernels.minus_length, ("joint_torques",)),
         (0.0, *SMOOTHNESS),
         fraction=1.0,
     )

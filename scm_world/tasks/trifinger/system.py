@@ -79,6 +79,14 @@ _BLOCK_MASS = 0.02  # [kg]
 _JOINT_NAMES = tuple(link_name(finger, index) for finger in FINGERS for index in (1, 2, 3))
 
 
+def _joints(first: int, doc: str) -> Any:
+    return property(lambda state: state.vector[first : first + N_JOINTS], doc=doc)
+
+
+def _columns(first: int, end: int, doc: str) -> Any:
+    return property(lambda state: state.blocks[:, first:end], doc=doc)
+
+
 @final
 class PhysicalState(State):
     """What moves.
@@ -95,45 +103,14 @@ class PhysicalState(State):
 
     __slots__ = ()
 
-    @property
-    def joint_positions(self) -> Floats:
-        """Shape (9,) [rad]."""
-        return self.vector[:9]
-
-    @property
-    def joint_velocities(self) -> Floats:
-        """Shape (9,) [rad/s]."""
-        return self.vector[9:18]
-
-    @property
-    def joint_torques(self) -> Floats:
-        """Shape (9,) [N m]."""
-        return self.vector[18:27]
-
-    @property
-    def blocks(self) -> Floats:
-        """Shape (n, 13)."""
-        return self.vector[27:].reshape(-1, 13)
-
-    @property
-    def positions(self) -> Floats:
-        """Shape (n, 3) [m]."""
-        return self.blocks[:, 0:3]
-
-    @property
-    def orientations(self) -> Floats:
-        """Shape (n, 4)."""
-        return self.blocks[:, 3:7]
-
-    @property
-    def linear_velocities(self) -> Floats:
-        """Shape (n, 3) [m/s]."""
-        return self.blocks[:, 7:10]
-
-    @property
-    def angular_velocities(self) -> Floats:
-        """Shape (n, 3) [rad/s]."""
-        return self.blocks[:, 10:13]
+    joint_positions = _joints(0, "Shape (9,) [rad].")
+    joint_velocities = _joints(N_JOINTS, "Shape (9,) [rad/s].")
+    joint_torques = _joints(2 * N_JOINTS, "Shape (9,) [N m].")
+    blocks = property(lambda self: self.vector[27:].reshape(-1, 13), doc="Shape (n, 13).")
+    positions = _columns(0, 3, "Shape (n, 3) [m].")
+    orientations = _columns(3, 7, "Shape (n, 4).")
+    linear_velocities = _columns(7, 10, "Shape (n, 3) [m/s].")
+    angular_velocities = _columns(10, 13, "Shape (n, 3) [rad/s].")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -105,32 +105,21 @@ def block_size(
     name: str, causes: Causes | None = None, *, default: tuple[float, ...] = numbers.BLOCK_SIZE
 ) -> Variable:
     """Declare the full edge lengths of a block [m]: a root, or what follows from causes."""
-    kind = numbers.BLOCK_SIZES
-    return kind.root(name, default) if causes is None else kind.derived(name, causes)
+    return numbers.BLOCK_SIZES.either(name, default, causes)
 
 
 def position(
     name: str, causes: Causes | None = None, constants: Any = None, *, default: Any = ZERO
 ) -> Variable:
     """Declare the center of a goal or obstacle [m]: a root, or what follows from causes."""
-    kind, name = numbers.POSITIONS, f"{name}.cartesian_position"
-    return (
-        kind.root(name, default)
-        if causes is None
-        else kind.derived(name, causes, constants=constants)
-    )
+    return numbers.POSITIONS.either(f"{name}.cartesian_position", default, causes, constants)
 
 
 def orientation(
     name: str, causes: Causes | None = None, constants: Any = None, *, default: Any = IDENTITY
 ) -> Variable:
     """Declare the quaternion of a goal or obstacle: a root, or what follows from causes."""
-    kind, name = numbers.ORIENTATIONS, f"{name}.orientation"
-    return (
-        kind.root(name, default)
-        if causes is None
-        else kind.derived(name, causes, constants=constants)
-    )
+    return numbers.ORIENTATIONS.either(f"{name}.orientation", default, causes, constants)
 
 
 def coordinates(
