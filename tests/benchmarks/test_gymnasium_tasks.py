@@ -34,7 +34,7 @@ def test_both_do_the_same(name: str) -> None:
     ours.reset(seed=0)
     theirs.reset(seed=0)
     assert ours.observation_space.shape == theirs.observation_space.shape
-    scene, data = ours.world.backend._now, theirs.data
+    scene, data = ours.world.backend.realization, theirs.data
     data.qpos[:], data.qvel[:] = scene.data.qpos, scene.data.qvel
     mujoco.mj_forward(theirs.model, data)
     random = np.random.default_rng(0)

@@ -281,6 +281,16 @@ class Realization:
                 self.check([key])
         return found
 
+    def _impossible(self, keys: list[ParameterKey]) -> list[ParameterKey]:
+        """List the masses and inertias that no body can have; all of them if none is wrong."""
+        wrong = []
+        for key in keys:
+            value, most = self._slots[key].read(), self._slots[key].read().max()
+            bad = not np.isfinite(value).all() or (key[1] == "mass" and value < 0.0)
+            if bad or (key[1] == "inertia" and 2.0 * most - value.sum() > 1e-6 * most):
+                wrong.append(key)
+        return wrong or keys
+
     def edit(self, parameters: Parameters) -> None:
         """Write parameters, then all numbers that follow from them; unchanged ones cost nothing.
 
@@ -306,7 +316,7 @@ class Realization:
             wrong = reversed_ranges({key: kept[key] for key in before})
             reason = REVERSED if wrong else self._followed([*before])
             if reason:
-                wrong = wrong or [key for key in before if slots[key].constant]
+                wrong = wrong or self._impossible([key for key in before if slots[key].constant])
                 names = ", ".join(".".join(key).strip(".") for key in wrong)
                 values = [parameters[key] for key in wrong]
                 raise Infeasible(names, values[0] if len(values) == 1 else values, [reason])

@@ -22,7 +22,7 @@ import numpy as np
 
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.output.reading import read_bytes
+from scm_world.output.reading import read_bytes, regular
 
 _UNNAMED = "MuJoCo Model"
 _CHOICES = ("integrator", "solver", "cone", "jacobian")
@@ -113,6 +113,7 @@ def read_source(
         spec, where, stem, urdf = _specified(source)
         if urdf:
             _complete(spec, where, fixed_base=fixed_base)
+        _refuse_endless(spec)
         with understood(where):
             mj = spec.compile()
         notes = tuple(_replaced_inertia(spec, mj))
@@ -127,6 +128,22 @@ def read_source(
     name = mj.names.split(b"\0", 1)[0].decode()
     name = stem if name in ("", _UNNAMED) else name
     return Source(binary.tobytes(), mujoco.__version__), name, where, notes
+
+
+def _refuse_endless(spec: mujoco.MjSpec) -> None:
+    """Refuse files that MuJoCo would read without an end."""
+    named = [(spec.meshdir, part.file) for part in (*spec.meshes, *spec.hfields, *spec.skins)]
+    for texture in spec.textures:
+        named += [(spec.texturedir, name) for name in (texture.file, *texture.cubefiles)]
+    for folder, name in named:
+        inner = os.path.basename(name) if spec.strippath else name
+        path = Path(spec.modelfiledir, folder, inner)
+        if name and path.exists() and not path.is_dir():
+            try:
+                regular(path)
+            except OSError as error:
+                advice = "correct the path that the model names"
+                raise UnreadableFile(str(path), str(error), advice) from None
 
 
 def _set_option(options: mujoco.MjOption, name: str, value: Any) -> None:
