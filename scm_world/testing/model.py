@@ -3,23 +3,17 @@
 Each check takes a world and raises ``AssertionError`` where a promise is broken. ``check_model``
 runs them all and returns the figures; ``benchmarks.models`` writes its tables with it, and
 ``scm_world.testing.task`` makes tests of them.
-
-Example::
-
-    from scm_world.testing.model import check_model
-
-    print(check_model("my_robot.xml"))
 """
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 import importlib
 import pickle
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, final
+from contextlib import closing, suppress
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +24,7 @@ from scm_world.queries import World
 from scm_world.variables import Box, Categories, Draw, Integers, Noise, Rotations, Scale
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.work.processes import Worker
-from scm_world.world import Audit, Batch, Simulation
+from scm_world.world import Batch, Simulation
 
 SEED = 20_26
 
@@ -38,14 +32,8 @@ SEED = 20_26
 def quantities(world: Simulation) -> tuple[str, ...]:
     """Return the parameters and states that ``do`` can set, each in its own coordinates."""
     model = world.model
-    return tuple(
-        v.name
-        for v in model.variables
-        if v.settable
-        and v.role != "action"
-        and v.name != CONTROL_INDEX
-        and model.target(v.name) == v.name
-    )
+    names = (v.name for v in model.variables if v.settable and v.role != "action")
+    return tuple(n for n in names if n != CONTROL_INDEX and model.target(n) == n)
 
 
 def nearby(world: Simulation, name: str) -> Iterator[Value]:
@@ -70,41 +58,35 @@ def nearby(world: Simulation, name: str) -> Iterator[Value]:
             for angle in (0.1, 0.02):  # [rad]
                 turned = value + 0.5 * angle * np.array([0.0, 0.0, 1.0, 0.0])
                 yield np.asarray(variable.bounds.nearest(turned))
-        case _:
-            raise ValueError(f"{name} has no bounds to choose from")
 
 
-def moved(world: Simulation, name: str) -> tuple[Value, Audit] | None:
-    """Set a variable to the first nearby value that is feasible.
-
-    Returns:
-        The value and the report; None if there is none.
-    """
+def moved(world: Simulation, name: str) -> bool:
+    """Set a variable to the first nearby value that is feasible, if there is one."""
     for value in nearby(world, name):
-        with contextlib.suppress(InterventionError):
-            return value, world.do({name: value})
-    return None
+        with suppress(InterventionError):
+            world.do({name: value})
+            return True
+    return False
 
 
 def actions(world: Simulation, n: int, seed: int = 0) -> Floats:
     """Draw actions, shape (n, n_actions)."""
     low, high = action_range(world)
     drawn = Noise(seed).uniforms("actions", n=n * low.size)[0].reshape(n, low.size)
-    found: Floats = low + (high - low) * drawn
-    return found
+    return np.asarray(low + (high - low) * drawn)
 
 
 def trajectory(world: Simulation, taken: Floats) -> Floats:
     """Step a world, and return its states, shape (n + 1, k)."""
-    found = [world.current()[1].vector.copy()]
+    found = [world.vector.copy()]
     for action in taken:
         world.step(action)
-        found.append(world.current()[1].vector.copy())
+        found.append(world.vector.copy())
     return np.stack(found)
 
 
-def digest(world: Simulation, snapshot: Any) -> str:
-    """Hash the future of a snapshot, and two episodes with all kinds of interventions."""
+def future(world: Simulation, snapshot: Any) -> list[bytes]:
+    """List what follows a snapshot, and two episodes with all kinds of interventions."""
     world.restore(snapshot)
     seen = [trajectory(world, actions(world, 20, 7)).tobytes()]
     for episode in range(2):
@@ -117,40 +99,31 @@ def digest(world: Simulation, snapshot: Any) -> str:
             {name: Draw("A") for name in spaced[:: max(len(spaced) // 3, 1)]},
             {name: Scale(0.95) for name in real[:: max(len(real) // 3, 1)]},
         ):
-            with contextlib.suppress(InterventionError):  # refused here, refused everywhere
+            with suppress(InterventionError):  # refused here, refused everywhere
                 world.do(request)
             seen.append(trajectory(world, actions(world, 4, seed=episode)).tobytes())
         values = world.values()
         seen += [name.encode() + np.asarray(values[name]).tobytes() for name in sorted(values)]
-    return hashlib.sha256(b"".join(seen)).hexdigest()
+    return seen
 
 
-@final
-class _Caller:
-    """Calls functions in another process."""
-
-    def load(self, module: str) -> None:
-        importlib.import_module(module)
-
-    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        return function(*arguments)
-
-
-_OTHER = Worker(_Caller)
+_OTHER = Worker(partial(importlib.import_module, __name__))  # this module in another process
 
 
 def elsewhere(function: Callable[..., Any], *arguments: Any, module: str = __name__) -> Any:
     """Call a function in another process that has imported a module; it is always the same one."""
-    _OTHER.ask("load", module)
-    return _OTHER.ask("call", function, *arguments)
+    return _OTHER.ask("called", module, pickle.dumps((function, arguments)))
 
 
-# --- checks -----------------------------------------------------------------------------------
+def called(module: str, what: bytes) -> Any:
+    """Import a module; then unpickle a function and its arguments, and call it."""
+    importlib.import_module(module)
+    function, arguments = pickle.loads(what)  # noqa: S301 # our own
+    return function(*arguments)
 
 
 def check_variables(world: Simulation) -> int:
-    """Check that every variable has a unit, a sentence and a default within its bounds."""
-    world.reset(seed=0)
+    """Check that every variable has a unit, a sentence and a value within its bounds."""
     values = world.values()
     for variable in world.model.variables:
         assert variable.unit, f"{variable.name} has no unit"
@@ -172,24 +145,19 @@ def _future(world: Simulation, steps: int) -> tuple[Any, Floats, Floats]:
     return start, taken[3:], expected
 
 
-def check_undo(world: Simulation, horizons: tuple[int, ...] = (1, 50)) -> tuple[int, float]:
-    """Check that an intervention that is undone leaves exactly 0.0, for every quantity.
-
-    Returns:
-        How many quantities were set, and the largest difference at any horizon.
-    """
+def check_undo(world: Simulation, horizons: tuple[int, ...] = (1, 50)) -> int:
+    """Check that an intervention that is undone leaves exactly 0.0; count the quantities set."""
     start, taken, expected = _future(world, max(horizons))
-    found, worst = 0, 0.0
+    found = 0
     for name in quantities(world):
         old = world[name]
-        if moved(world, name) is not None:
+        if moved(world, name):
             world.do({name: old})
             found += 1
-            here = trajectory(world, taken)
-            worst = max(worst, *(float(np.abs(here[h] - expected[h]).max()) for h in horizons))
-            assert worst == 0.0, f"{name}: {worst:g} is left after do and undo"
+            left = np.abs(trajectory(world, taken) - expected)[list(horizons)].max()
+            assert left == 0.0, f"{name}: {left:g} is left after do and undo"
         world.restore(start)
-    return found, worst
+    return found
 
 
 def check_refusal(world: Simulation) -> int:
@@ -202,11 +170,9 @@ def check_refusal(world: Simulation) -> int:
         bad = (np.full(shape, np.nan), np.full((*shape, 2), 1.0), "much")
         requests += [{**present, name: value} for value in bad]
     for request in requests:
-        try:
+        with suppress(InterventionError):
             world.do(request)
-        except InterventionError:
-            continue
-        raise AssertionError(f"do({request!r}) was not refused")
+            raise AssertionError(f"do({request!r}) was not refused")
     assert np.array_equal(trajectory(world, taken), expected), "a refusal left a trace"
     return len(requests)
 
@@ -221,61 +187,44 @@ def check_counterfactual(world: World, steps: int = 20) -> None:
 def check_future(world: Simulation, module: str = __name__) -> None:
     """Check that a seed and a snapshot have one future each, here and in another process.
 
-    Args:
-        world: The world.
-        module: A module that the other process has to import first.
+    The other process imports ``module`` first.
     """
     snapshot, *_ = _future(world, 2)
-    here = digest(world, snapshot)
-    assert digest(world, pickle.loads(pickle.dumps(snapshot))) == here  # noqa: S301 # our own
-    there = elsewhere(digest, world, snapshot, module=module)
+    here = future(world, snapshot)
+    assert future(world, pickle.loads(pickle.dumps(snapshot))) == here  # noqa: S301 # our own
+    there = elsewhere(future, world, snapshot, module=module)
     assert there == here, "another process has another future"
 
 
-def check_batch(
-    make: Callable[[], Simulation], n: int = 16, steps: int = 10, threads: int = 2
-) -> None:
+def check_batch(make: Callable[[], Simulation], n: int = 16, steps: int = 10) -> None:
     """Check that worlds stepped together equal single ones, each with a change of its own.
 
     One whose physics explodes is left out.
-
-    Args:
-        make: Makes a world.
-        n: How many.
-        steps: How many control steps.
-        threads: Threads of the engine.
     """
-
-    def begun(index: int) -> Simulation:
+    worlds, taken, ends = list[Simulation](), list[Floats](), list[Floats]()
+    for index in range(n):
         world = make()
         world.reset(seed=index)
-        names = quantities(world)
-        moved(world, names[index % len(names)])
-        return world
-
-    taken: list[Floats] = []
-    ends: list[Floats] = []
-    worlds: list[Simulation] = []
-    for index in range(n):
-        with contextlib.suppress(EngineFailure), contextlib.closing(begun(index)) as world:
-            mine = actions(world, steps, index)
-            ends.append(trajectory(world, mine)[-1])
-            taken.append(mine)
-            worlds.append(begun(index))
-    with contextlib.closing(Batch(worlds, threads=threads)) as batch:
-        for step in range(steps):
-            batch.advance(np.stack([mine[step] for mine in taken]))
+        names, mine = quantities(world), actions(world, steps, index)
+        try:
+            moved(world, names[index % len(names)])
+            start, end = world.snapshot(), trajectory(world, mine)[-1]
+        except EngineFailure:
+            world.close()
+            continue
+        world.restore(start)
+        worlds.append(world)
+        taken.append(mine)
+        ends.append(end)
+    with closing(Batch(worlds, threads=2)) as batch:
+        for together in np.stack(taken, axis=1):
+            batch.advance(together)
         for index, end in enumerate(ends):
-            together = batch.world(index).current()[1].vector
-            assert np.array_equal(together, end), f"world {index} of the batch differs"
+            assert np.array_equal(batch.world(index).vector, end), f"world {index} differs"
 
 
 def check_endurance(world: Simulation, steps: int = 2000, every: int = 20) -> tuple[int, str]:
-    """Step with random actions and interventions: no NaN, or a typed error that says which.
-
-    Returns:
-        How many control steps were taken, and the error that ended it, if any.
-    """
+    """Step with random actions and interventions: no NaN; count the steps, return any error."""
     world.reset(seed=5)
     names, taken = quantities(world), actions(world, steps, 11)
     for step in range(steps):
@@ -285,35 +234,26 @@ def check_endurance(world: Simulation, steps: int = 2000, every: int = 20) -> tu
             world.step(taken[step])
         except EngineFailure as error:
             return step, str(error)
-        assert np.isfinite(world.current()[1].vector).all()
+        assert np.isfinite(world.vector).all()
     return steps, ""
 
 
 def check_model(
     source: Any, *, backend: str = "mujoco", steps: int = 2000, **options: Any
 ) -> Mapping[str, Any]:
-    """Run all checks on a model.
+    """Run all checks on a model, and return the figures, by name.
 
     Args:
         source: Anything that ``World`` takes: a path, XML text, a task.
         backend: Name of the backend.
         steps: Control steps with random actions and interventions.
-        options: Options of ``World.from_mjcf``.
-
-    Returns:
-        The figures, by name.
-
-    Raises:
-        AssertionError: A promise is broken.
+        options: Of ``World.from_mjcf``.
     """
-
-    def make() -> World:
-        return World.from_mjcf(source, backend=backend, **options)
-
+    make = partial(World.from_mjcf, source, backend=backend, **options)
     started, world = time.perf_counter(), make()
+    world.reset(seed=0)
     found: dict[str, Any] = {"variables": check_variables(world), "edges": len(world.graph.edges)}
-    found["set and undone"], found["left over"] = check_undo(world)
-    found["refused"] = check_refusal(world)
+    found |= {"set and undone": check_undo(world), "refused": check_refusal(world)}
     check_counterfactual(world)
     check_future(world)
     check_batch(make)

@@ -218,7 +218,7 @@ class Batches(Sound):
 FAULTS = {
     Remembers: "test_the_future_depends_on_the_scene_alone",
     Forgets: "test_a_snapshot_continues_bit_for_bit",
-    Shares: "test_the_future_depends_on_the_scene_alone",
+    Shares: "test_a_batch_is_one_after_another",
     OfOneProcess: "test_the_future_depends_on_the_scene_alone",
     Rounds: "test_parameters_are_read_back",
     Couples: "test_parameters_are_read_back",
@@ -238,8 +238,6 @@ def suite(kind: type[Sound]) -> type:
     """Make the suite of a backend."""
 
     class OfThis(BackendConformance):
-        long = 20
-
         def make(self) -> Backend:
             return kind()
 

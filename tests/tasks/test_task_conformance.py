@@ -56,8 +56,6 @@ class OnEveryTask(TaskConformance):
 
     backend: ClassVar[str]
     tasks: ClassVar[tuple[str, ...]] = (*TASKS, *SHAPED)
-    episodes = 2
-    steps = 25
     task: str
     awake: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "obstacle_places": {"number_of_obstacles": 2},
