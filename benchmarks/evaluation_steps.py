@@ -61,11 +61,11 @@ def split(arena: EpisodeRunner, protocol: Protocol, episode: int) -> dict[str, f
 
     arena.play(as_player(recorder), protocol, seed=0, episode=episode, watch=watch)
     env, world, actions = arena.env, arena.env.world, recorder.actions
-    commands = [env._command(action) for action in actions]
+    commands = [env.command(action) for action in actions]
     player = as_player(Mlp())
 
     def raw(command: Any) -> None:
-        world.backend.step(world._mode, command, world._substeps)
+        world.backend.step(command, world.substeps)
 
     found = {
         "steps": float(len(actions)),

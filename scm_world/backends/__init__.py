@@ -78,11 +78,11 @@ def make_backend(name: str) -> Backend:
         >>> make_backend("fake").name
         'fake'
     """
-    if name in _REGISTERED:
+    if name in tuple(_REGISTERED):
         return _REGISTERED[name]()
     found: type[Backend]
-    if name not in _CLASSES:
-        if name not in _declared():
+    if name not in BACKENDS:
+        if name not in backends():
             raise UnknownOption("backend", name, backends())
         found = _declared()[name].load()
         return found()

@@ -102,9 +102,11 @@ class DeclaredTask(Task):
             given = getattr(self, option)
             if given is not None:
                 single = isinstance(given, (*types, str)) or not isinstance(given, Iterable)
-                setattr(self, option, (given,) if single else tuple(given))
-                if not all(isinstance(one, tuple(types)) for one in getattr(self, option)):
-                    raise UnknownOption(option, given, [one.__name__ for one in types])
+                members = (given,) if single else tuple(given)
+                setattr(self, option, members)
+                wrong = [getattr(m, "name", m) for m in members if not isinstance(m, tuple(types))]
+                if wrong:
+                    raise UnknownOption(option, wrong, [one.__name__ for one in types])
         if not isinstance(self.start, Mapping):
             raise UnknownOption("start", self.start, ("a dictionary by name",))
         self.weights = {REWARD: 1.0} if self.reward is not None else {}
@@ -113,7 +115,7 @@ class DeclaredTask(Task):
     def options(cls) -> tuple[str, ...]:
         """Return the names of the options, without the first argument."""
         _, *own = cls.__annotations__
-        _, _, *shared = DeclaredTask.__annotations__
+        _, _, *shared, _kinds = DeclaredTask.__annotations__
         return (*own, *shared, "name")
 
     @property

@@ -90,6 +90,10 @@ def test_a_name_belongs_to_one(registry: dict[str, type[Backend]]) -> None:
         with pytest.raises(UnknownOption, match="a name that is not taken"):
             register(other)
     assert registry == {"twin": Twin}
+    names: Any = ("twins", ["mujoco"], None)
+    for name in names:
+        with pytest.raises(UnknownOption, match="twin"):
+            make_backend(name)
 
 
 @pytest.mark.parametrize(

@@ -340,6 +340,8 @@ def test_a_world_takes_the_options_of_its_model(tmp_path: Path) -> None:
             World(task, control_dt=0.05)
     with pytest.raises(UnknownOption, match="did you mean 'expose'"):
         World(str(path), exposed=["*.mass"])
+    with pytest.raises(UnknownOption, match="no option of ModelTask is named 'kinds'"):
+        World(str(path), kinds=())
     assert (
         World("pushing", backend="fake", tool_block_mass=0.3)
         .model.declared("tool_block.mass")

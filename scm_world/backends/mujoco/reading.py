@@ -207,7 +207,7 @@ def _check(mj: mujoco.MjModel, where: str) -> None:
     problems = []
     if mj.nv == 0:
         hint = "add a joint, or a freejoint; for a URDF, fixed_base=False lets its root link move"
-        problems.append(f"has no joint, so that nothing in it can move; {hint}")
+        problems.append(f"it has no joint, so that nothing in it can move; {hint}")
     users = mujoco.mjtDyn.mjDYN_USER, mujoco.mjtGain.mjGAIN_USER, mujoco.mjtBias.mjBIAS_USER
     for i, name in enumerate(element_names(mj)["actuator"]):
         kinds = mj.actuator_dyntype[i], mj.actuator_gaintype[i], mj.actuator_biastype[i]
@@ -219,7 +219,7 @@ def _check(mj: mujoco.MjModel, where: str) -> None:
             problems.append(f"the actuator {name!r} {what}")
     if getattr(mj, "nplastic", 0):  # since MuJoCo 4
         what = "plastic springs or flexes, whose rest shape is a hidden state"
-        problems.append(f"has {what}; remove springyield and yield")
+        problems.append(f"it has {what}; remove springyield and yield")
     if mj.nv:
         problems += _check_inertia(mj)
     if problems:

@@ -142,7 +142,7 @@ def probes(
     noise = Noise(seed)
     world.reset(seed=seed)
     asked = world.task.scenarios(world) if scenarios else ()
-    known = tuple(Scenario(prepare.__name__, prepare, act, steps) for prepare, act, steps in asked)
+    known = tuple(Scenario(getattr(one[0], "__name__", "own"), *one) for one in asked)
     kinds = known or _kinds(world, settled=settled)
     for number in range(first, n):
         yield _prepared(world, kinds[number % len(kinds)], noise, number, settled)
