@@ -316,11 +316,7 @@ class Realization:
             wrong = reversed_ranges({key: kept[key] for key in before})
             reason = REVERSED if wrong else self._followed([*before])
             if reason:
-<<<<<<< HEAD
                 wrong = wrong or self._impossible([key for key in before if slots[key].constant])
-=======
-                wrong = wrong or self._culprits([*before])
->>>>>>> rev
                 names = ", ".join(".".join(key).strip(".") for key in wrong)
                 values = [parameters[key] for key in wrong]
                 raise Infeasible(names, values[0] if len(values) == 1 else values, [reason])
@@ -350,14 +346,3 @@ class Realization:
             singular[0] = 1
             return "masses and moments of inertia would not be those of something that can move"
         return ""
-
-    def _culprits(self, keys: list[ParameterKey]) -> list[ParameterKey]:
-        """List the parameters that no body can have; if none is, all that may have part in it."""
-        constant, wrong = [key for key in keys if self._slots[key].constant], []
-        for key in constant:
-            value = self._slots[key].read()
-            most = value.max()
-            bad = not np.isfinite(value).all() or (key[1] == "mass" and value < 0.0)
-            if bad or (key[1] == "inertia" and 2.0 * most - value.sum() > 1e-6 * most):
-                wrong.append(key)
-        return wrong or constant
