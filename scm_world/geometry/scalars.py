@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from numba import types
-from numba.extending import intrinsic, overload
+from numba.extending import overload
 
 
 def scalar(value: Any) -> float:
-    """Give a number as a float, also one that comes as an array of shape ().
+    """Return a number as a float, also one that comes as an array of shape ().
 
     Compiled code may call it, where ``float`` refuses arrays.
 
@@ -30,15 +30,3 @@ def _scalar(value: Any) -> Any:
         return float(value)
 
     return of_array if isinstance(value, types.Array) else of_number
-
-
-def _fused(typing: Any, a: Any, b: Any, c: Any) -> Any:
-
-    def write(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.fma(*arguments)
-
-    return types.float64(types.float64, types.float64, types.float64), write
-
-
-fused: Any = intrinsic(_fused)
-"""Computes ``a * b + c`` with one rounding, in compiled code, on every processor alike."""

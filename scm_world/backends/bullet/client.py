@@ -185,7 +185,7 @@ class Client:
 
     MuJoCo takes the parameters, has what follows from them, gives the forces of actuators,
     springs, dampers and media, and converts states. Nothing moves there: each of its numbers that
-    concerns the engine is told to the engine when it differs from what that was told before.
+    concerns the engine is set in the engine when it differs from its last setting.
     After an error other than ``Infeasible`` a client is of no use.
 
     Args:
@@ -205,7 +205,7 @@ class Client:
         self.holds: Step | Instant | None = None
         self._model: Model | None = None
         self._parameters: Parameters = {}  # in force
-        self._told: list[Floats] = []  # rows of settings that are in force
+        self._in_force: list[Floats] = []  # rows of settings that are in force
         self._units: list[EngineBody] = []
         self._enabled: set[tuple[int, int, int, int]] = set()  # pairs of links that may touch
         self._saved: dict[int, weakref.ref[SavedState]] = {}
@@ -267,8 +267,8 @@ class Client:
         self._scalar = [joint for joint in self.joints if mj.jnt_type[joint] not in (FREE, BALL)]
         armed = [(r, body) for r, body in enumerate(self.bodies) if takes_armature(mj, body)]
         self._moments = {row: solid(mj, body)[0].copy() for row, body in armed}
-        self._told, self._trees, self._driven = [], set[int](), list[JointSet]()
-        self._tell()
+        self._in_force, self._trees, self._driven = [], set[int](), list[JointSet]()
+        self._set_all()
 
     def _read_tables(self, mj: mujoco.MjModel) -> None:
         """Read from a compiled model what no parameter changes."""
@@ -301,19 +301,19 @@ class Client:
             self.twin.edit(fresh)
         self._parameters = parameters
         if fresh:
-            self._tell()
+            self._set_all()
 
-    def _tell(self) -> None:
+    def _set_all(self) -> None:
         """Set in the engine whatever differs from its last setting."""
-        told = list[Floats]()
-        for number, (tell, places, keys, names, rows) in enumerate(self._settings()):
-            told.append(rows)
-            known = self._told[number] if self._told else np.full_like(rows, np.nan)
+        settings = list[Floats]()
+        for number, (function, places, keys, names, rows) in enumerate(self._settings()):
+            settings.append(rows)
+            known = self._in_force[number] if self._in_force else np.full_like(rows, np.nan)
             if rows.tobytes() != known.tobytes():
                 for index in np.flatnonzero((rows != known).any(axis=1)).tolist():
                     values = dict(zip(names, rows[index].tolist(), strict=False))
-                    tell(*places[keys[index]], **values)
-        self._told = told
+                    function(*places[keys[index]], **values)
+        self._in_force = settings
         moved = self._moved()
         if self._trees != moved:
             self._trees = moved
