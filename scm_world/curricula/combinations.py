@@ -11,7 +11,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world.curricula.base import Acts, AnyPart, Memory, Part, Progress, Situation, as_part
 from scm_world.errors import UnknownOption
-from scm_world.world.plan import merged
+from scm_world.world.interventions import merged
 
 # --- when -----------------------------------------------------------------------------------------
 

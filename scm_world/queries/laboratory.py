@@ -32,7 +32,7 @@ from scm_world.queries.timed import Contact, Reaches
 from scm_world.queries.twins import Twins, twins_of
 from scm_world.variables import Fixed
 from scm_world.world import Simulation
-from scm_world.world.plan import merged
+from scm_world.world.interventions import merged
 
 FORMAT = "scm_world/laboratory/1"
 

@@ -21,7 +21,7 @@ from scm_world.models import ParameterKey, Scene, State, Structure
 from scm_world.tasks import Conventions, Task, Timing
 from scm_world.variables import Action, Derived, Exogenous, Intervention, Measured
 from scm_world.variables.checks import check_bounds, coerce
-from scm_world.world.mechanisms import Mechanisms, wrong_value
+from scm_world.world.mechanisms import Mechanisms, Row, wrong_value
 
 Plan = tuple[Hashable, frozenset[str]]
 """A structure: which bodies the task asks for, and the names of those that were taken away."""
@@ -177,9 +177,12 @@ class CompiledTask(ActionVector):
         commanded: Where each action stands, with the bundles of actions.
         parameter_keys: Which physical parameter each variable sets.
         carried: States that follow others when these are set.
+        carried_by_name: The same, by name.
+        set_by_hand: Everything that is set at one instant: states, and the clock.
         set_parents: These others, of each.
         computed: Variables that are computed from what moves, causes before effects.
         static_names: Everything that interventions alone decide, causes before effects.
+        static: The same, without their order.
         random: Variables that are drawn when an episode begins.
     """
 
@@ -195,9 +198,6 @@ class CompiledTask(ActionVector):
         self.commanded = {**self.actions, **_in_a_row(self.bundles, self.actions)}
         states = self.composition.system.layout.slices
         self.slices = {**states, **_in_a_row(self.bundles, states)}
-        self._places = [
-            (name, where, self.model.declared(name).shape) for name, where in self.slices.items()
-        ]
         self.whole = tuple(
             name for name in self.slices if self.model.declared(name).dtype != "real"
         )
@@ -205,6 +205,8 @@ class CompiledTask(ActionVector):
         measured = [v for v in ordered if isinstance(v, Measured)]
         self.set_parents = {v.name: found for v in measured if (found := v.set_parents())}
         self.carried = tuple(v for v in measured if v.name in self.set_parents)
+        self.carried_by_name = {v.name: v for v in self.carried}
+        self.set_by_hand = frozenset(v.name for v in self.model.variables if v.role == "state")
         problems = [
             f"{v.name!r} is drawn in every step, which a world does not do: use a noise of the task"
             for v in self.model.variables
@@ -221,6 +223,7 @@ class CompiledTask(ActionVector):
             raise ModelError(problems)
         self.computed = _computed(self.model)
         self.static_names = _static(self.model, self.computed)
+        self.static = frozenset(self.static_names)
         self.random = tuple(
             v.name
             for v in self.model.variables
@@ -239,9 +242,8 @@ class CompiledTask(ActionVector):
     def mechanisms(self) -> Mechanisms:
         """The mechanisms of what is computed in every step, bound to a row of values."""
         sizes = (self._start.vector.size, self.n_actions)
-        static = frozenset(self.static_names)
         where = (self.slices, self.commanded)
-        return Mechanisms(self.model, self.computed, static, *where, sizes)
+        return Mechanisms(self.model, self.computed, self.static_names, *where, sizes)
 
     @cached_property
     def places(self) -> Mapping[str, slice]:
@@ -290,13 +292,9 @@ class CompiledTask(ActionVector):
         """Give a state to read into, or one with some numbers."""
         return self._start.copy() if vector is None else self._start.with_vector(vector)
 
-    def states(self, state: State) -> dict[str, Value]:
-        """Give the states by name, as views of a vector; whole numbers as copies."""
-        vector = state.vector
-        found = {name: vector[where].reshape(shape) for name, where, shape in self._places}
-        for name in self.whole:
-            found[name] = found[name].astype(np.int64)
-        return found
+    def state_of(self, row: Row) -> State:
+        """Return where everything is in a row, as a view of it."""
+        return self._start.with_vector(row.numbers[: self.mechanisms.state_size])
 
     def read(self, name: str, vectors: Floats) -> Value:
         """Give a state in many vectors, shape (n, size): an array of shape (n, *shape)."""
@@ -316,6 +314,13 @@ class CompiledTask(ActionVector):
             variable: Any = self.model.declared(name)
             function = self._coordinates[name] = variable.mechanism.bind()
         return np.asarray(function(*values))
+
+    def coordinates(self, name: str, row: Row) -> Value:
+        """Return a parameter or a state of a row, also in other coordinates, or a bundle."""
+        targets = self.model.targets(name)
+        if targets == (name,):
+            return row[name]
+        return self.in_coordinates(name, *(row[target] for target in targets))
 
     def describe(self, values: Values, state: State) -> Scene:
         """Describe the scene that some values stand for."""
@@ -370,9 +375,7 @@ class StepBase:
     Attributes:
         compiled: The task in the structure that there is.
         model: With the interventions of earlier steps.
-        static: Values of everything that physics does not move.
-        state: Where everything is.
-        index: The control step.
+        row: The values.
         pending: The interventions at this step so far.
         at_start: Whether an episode is just beginning.
         fresh: States of bodies that come into being.
@@ -381,9 +384,7 @@ class StepBase:
 
     compiled: CompiledTask
     model: SCM
-    static: Mapping[str, Value]
-    state: State
-    index: int
+    row: Row
     pending: PendingInterventions = field(default_factory=dict)
     at_start: bool = False
     fresh: frozenset[str] = frozenset()
@@ -391,17 +392,16 @@ class StepBase:
 
     def value(self, name: str) -> Value | None:
         """Return a parameter or a state, also in other coordinates; None for anything else."""
-        if name in self.compiled.slices:
-            return self.compiled.view(name, self.state)
-        targets = self.compiled.model.targets(name)
-        if targets == (name,):
-            return self.static.get(name)
-        parts = [self.value(target) for target in targets]
-        known = [part for part in parts if part is not None]
-        return self.compiled.in_coordinates(name, *known) if len(known) == len(parts) else None
+        compiled = self.compiled
+        if name not in compiled.slices and not all(
+            target in compiled.static or target in compiled.slices
+            for target in compiled.model.targets(name)
+        ):
+            return None
+        return self.row[name] if name in compiled.slices else compiled.coordinates(name, self.row)
 
 
-def beginning(compiled: CompiledTask, key: NoiseKey | None) -> tuple[dict[str, Value], State]:
+def beginning(compiled: CompiledTask, key: NoiseKey | None) -> Row:
     """Compute where an episode begins without interventions.
 
     Args:
@@ -409,15 +409,17 @@ def beginning(compiled: CompiledTask, key: NoiseKey | None) -> tuple[dict[str, V
         key: Where to draw what is random by declaration; its default if None.
 
     Returns:
-        The values of everything that physics does not move, and the state of the rest.
+        A row with everything that physics does not move, and the states.
     """
+    row = Row(compiled.mechanisms, compiled.mechanisms.start.copy())
     static = compiled.model.solve(only=compiled.static_names, key=key)
-    state = compiled.empty_state()
+    for name in compiled.static_names:
+        row[name] = static[name]
     for variable in compiled.model.variables:
-        where = compiled.slices.get(variable.name)
-        if where is not None and isinstance(variable, Measured) and not variable.parts:
-            state.vector[where] = np.ravel(_first(compiled, variable, static))
-    return static, state
+        is_state = variable.name in compiled.slices
+        if isinstance(variable, Measured) and is_state and not variable.parts:
+            row[variable.name] = _first(compiled, variable, static)
+    return row
 
 
 def _first(compiled: CompiledTask, variable: Measured, static: Values) -> Value:
@@ -438,17 +440,16 @@ def refuse_impossible(compiled: CompiledTask) -> None:
     Raises:
         ModelError: A default is out of bounds, or two bodies are in one place.
     """
-    static, state = beginning(compiled, None)
-    values = {**static, **compiled.states(state)}
+    values = beginning(compiled, None)
     problems = []
     for variable in compiled.model.variables:
-        if variable.name in values:
+        if variable.name in compiled.static or variable.name in compiled.slices:
             try:
                 coerce(variable, values[variable.name])
                 check_bounds(variable, values[variable.name], values)
             except InterventionError as problem:
                 problems.append(str(problem).replace(f"do({variable.name}):", variable.name + " ="))
-    found = compiled.composition.overlaps(compiled.describe(static, state))
+    found = compiled.composition.overlaps(compiled.describe(values, compiled.state_of(values)))
     problems += map(str, found)
     if problems:
         advice = f"choose other arguments of the task {compiled.task.name!r}"

@@ -31,7 +31,7 @@ from scm_world.errors import (
     WrongType,
 )
 from scm_world.variables import Draw, Normal, Null, Scale, Shift
-from scm_world.world.plan import plan_intervention
+from scm_world.world.interventions import feasible
 
 NAN = float("nan")
 HUGE = 1e308
@@ -224,9 +224,12 @@ def test_an_engine_is_told_the_difference_of_the_scenes(backend: str, task: str)
         world = begin(backend, task)
         request = {name: other(world, name)}
         key = world.noise_key(world.index)
-        plan = plan_intervention(world.structures, world._step_base(), request, None, key)
-        told = world._present().difference(plan)
-        then = plan.compiled.describe(plan.static, plan.state)
+        base = world._step_base()
+        solution, told = feasible(
+            world.structures, base, base.row, world.structure, request, None, key
+        )
+        compiled, row = solution.compiled, solution.row
+        then = compiled.describe(row, compiled.state_of(row))
         now = world.scene()
         if now.structure != then.structure:
             expected = dict(then.parameters)
