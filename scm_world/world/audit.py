@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -86,7 +86,6 @@ def report(
     solution: Solution,
     change: Difference,
     before: StepBase,
-    changed: Iterable[str],
     now: Row,
     inertia: Parameters,
     reported: Parameters,
@@ -99,13 +98,12 @@ def report(
         solution: That was applied.
         change: What the backend had to change.
         before: The world before.
-        changed: Parameters whose values are others now.
         now: The values that the world has now.
         inertia: Principal moments of bodies whose mass or size changed, before.
         reported: Parameters that were read back already.
         backend: That took over the change.
     """
-    compiled, old = solution.compiled, before.row
+    compiled, old, changed = solution.compiled, before.row, solution.changed
     keys, bundles, model = compiled.parameter_keys, compiled.bundles, compiled.model
     wanted = {keys[t] for name in solution.asked for t in model.targets(name) if t in keys}
     missing = [*(wanted - reported.keys()), *inertia]

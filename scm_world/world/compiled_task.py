@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import real_numbers, whole_number
-from scm_world._types import ArrayLike, Floats, Value, Values
+from scm_world._types import ArrayLike, Floats, Integers, Value, Values
 from scm_world.errors import ActionError, InterventionError, ModelError, UnknownOption
 from scm_world.geometry.clipping import clip_kernel
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
 from scm_world.tasks import Conventions, Task, Timing
-from scm_world.variables import Action, Derived, Exogenous, Intervention, Measured
+from scm_world.variables import Action, Box, Derived, Exogenous, Intervention, Measured
 from scm_world.variables.checks import check_bounds, coerce
 from scm_world.world.mechanisms import Mechanisms, Row, wrong_value
 
@@ -230,6 +230,7 @@ class CompiledTask(ActionVector):
             if (isinstance(v, Exogenous) and v.distribution) or (isinstance(v, Derived) and v.noise)
         )
         self._coordinates: dict[str, Callable[..., Any]] = {}
+        self._boxes: dict[Any, tuple[Integers, Floats, Floats] | None] = {}
         self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._constants: dict[Structure, Mapping[ParameterKey, Floats]] = {}
 
@@ -282,6 +283,26 @@ class CompiledTask(ActionVector):
             follow = {*key, *self.model.structure.instant_descendants(key)}
             self._follow[key] = tuple(name for name in self.static_names if name in follow)
         return self._follow[key]
+
+    def box(self, name: str, source: Any) -> tuple[Integers, Floats, Floats] | None:
+        """Return columns, lower ends and edges of a box that a variable is drawn from.
+
+        None where the source is no box, follows other variables or reaches beyond the bounds.
+        """
+        key = name, source
+        if key not in self._boxes:
+            variable: Any = self.model.declared(name)
+            space: Any = variable.space(source) if isinstance(source, str) else source
+            self._boxes[key] = None
+            ends = []
+            for one in (space, variable.bounds or space):
+                if isinstance(one, Box) and not one.parents() and variable.dtype == "real":
+                    ends += [np.ravel(end) for end in one.bounds(variable.shape, {})]
+            if len(ends) == 4 and (ends[0] >= ends[2]).all() and (ends[1] <= ends[3]).all():
+                where = self.mechanisms.where[name]
+                columns = np.arange(where.start, where.stop)
+                self._boxes[key] = columns, ends[0], ends[1] - ends[0]
+        return self._boxes[key]
 
     @cached_property
     def _start(self) -> State:
@@ -365,7 +386,7 @@ def _in_a_row(
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class StepBase:
     """A world as physics left it at a control step, before anyone intervened.
 
@@ -377,18 +398,18 @@ class StepBase:
         model: With the interventions of earlier steps.
         row: The values.
         pending: The interventions at this step so far.
+        drawn: How often each variable was drawn at this instant, by nature or by an intervention.
         at_start: Whether an episode is just beginning.
         fresh: States of bodies that come into being.
-        drawn: How often each variable was drawn at this instant, by nature or by an intervention.
     """
 
     compiled: CompiledTask
     model: SCM
     row: Row
     pending: PendingInterventions = field(default_factory=dict)
+    drawn: Mapping[str, int] = field(default_factory=dict)
     at_start: bool = False
     fresh: frozenset[str] = frozenset()
-    drawn: Mapping[str, int] = field(default_factory=dict)
 
     def value(self, name: str) -> Value | None:
         """Return a parameter or a state, also in other coordinates; None for anything else."""

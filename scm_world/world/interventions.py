@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import cached_property
 from itertools import chain
 from typing import Any, final
 
 import numpy as np
 
-from scm_world._types import Value
+from scm_world._types import Floats, Integers, Value
 from scm_world.errors import (
     ConflictingTargets,
     Infeasible,
@@ -128,10 +129,9 @@ class Draft:
         self.states = [t for t in self.acts if t in self.compiled.set_by_hand]
         self.model, self.order = base.model, tuple[str, ...]()
         self.impossible: set[str] = set()
-        self.targets = tuple[str, ...]()
+        self.targets, self.draws = tuple[str, ...](), list[str]()
         if len(self.states) < len(self.acts):
             self._mutilate()
-        self.draws = [t for t in self.targets if isinstance(self.acts[t][1], Draw)]
 
     def _accepted(self, request: Mapping[str, Any]) -> PendingInterventions:
         """Check names, types and shapes; what is asked of a bundle is asked of its parts."""
@@ -188,13 +188,15 @@ class Draft:
         """Mutilate the model, and order the descendants of the targets."""
         compiled, by_hand = self.compiled, self.compiled.set_by_hand
         acts = {t: named for t, named in self.acts.items() if t not in by_hand}
-        moving = self._moving(acts)
-        kept = dict(named for target, named in acts.items() if target not in moving)
+        follows = [t for t, (_, act) in acts.items() if isinstance(act, Mechanism)]
+        moving = self._moving({target: acts[target] for target in follows})
+        kept = dict([named for target, named in acts.items() if target not in moving])
         self.model, cycles = self.base.model.without_cycles(kept)
         self.problems += [*{p.variable: p for p in moving.values()}.values(), *cycles]
         self.impossible = {*moving, *chain(*(problem.cycle for problem in cycles))}
         static = compiled.static
-        self.targets = tuple(t for t in acts if t in static and t not in self.impossible)
+        self.targets = tuple([t for t in acts if t in static and t not in self.impossible])
+        self.draws = [t for t in self.targets if isinstance(acts[t][1], Draw)]
         held, actions = self.model.interventions.items(), compiled.actions
         if any(isinstance(act, Mechanism) and name not in actions for name, act in held):
             structure = self.model.structure
@@ -202,7 +204,7 @@ class Draft:
             self.order = tuple(n for n in structure.order if n in follow and n in static)
         else:
             self.order = compiled.static_order(self.targets)
-        drawn = (acts[target] for target in self.targets)
+        drawn = (acts[target] for target in self.draws)
         sources = (self.source(name, act) for name, act in drawn if isinstance(act, Draw))
         if any(source.parents() for source in sources):
             self.order = tuple(n for n in self.model.structure.order if n in {*self.order})
@@ -239,6 +241,26 @@ class Draft:
         """Return what a variable is drawn from."""
         requested = self.compiled.model.declared(whole_of(act, name))
         return requested.space(act.source) if isinstance(act.source, str) else act.source
+
+    @cached_property
+    def boxes(self) -> list[tuple[list[str], list[str], Integers, Floats, Floats]]:
+        """Draws from boxes that follow nothing, by their size: they are made together.
+
+        Of each size the names, streams, columns, lower ends and edges, shape (draws, size).
+        """
+        found = dict[int, list[tuple[str, str, Integers, Floats, Floats]]]()
+        for name in self.draws:
+            asked, act = self.acts[name]
+            if isinstance(act, Draw) and asked == name and whole_of(act, name) == name:
+                box = self.compiled.box(name, act.source)
+                if box is not None:
+                    own = name if act.stream is None else f"{act.stream}/{name}"
+                    found.setdefault(len(box[0]), []).append((name, own, *box))
+        groups = [zip(*group, strict=True) for group in found.values()]
+        return [
+            ([*names], [*streams], np.stack(columns), np.stack(low), np.stack(edges))
+            for names, streams, columns, low, edges in groups
+        ]
 
     def drawn(self, name: str, key: NoiseKey, attempts: Iterable[int]) -> Value | None:
         """Draw a variable in several attempts; None where its space follows other variables."""
@@ -299,6 +321,7 @@ class Solution:
     Attributes:
         row: The values of the world.
         problems: What is wrong with it.
+        changed: Parameters whose values are not the present ones, once ``feasible`` has compared.
     """
 
     def __init__(self, draft: Draft, key: NoiseKey, numbers: Any = None) -> None:
@@ -309,6 +332,8 @@ class Solution:
         self.row = Row(self.compiled.mechanisms, numbers, {*draft.targets})
         self.problems = [*draft.problems]
         self._impossible = {*draft.impossible}
+        self.changed: list[str] = []
+        self._drawn: set[str] = set()
         self._whole: dict[str, Value] = {}  # what bundles are to be
         self._earlier = self.row  # parameters as they will be, states as they were
 
@@ -318,13 +343,25 @@ class Solution:
         A mechanism never meets values that its parents cannot have.
         """
         draft = self.draft
+        self._draw_boxes()
         for name in draft.order:
-            self.compute(name)
+            if name not in self._drawn:
+                self.compute(name)
         if self._impossible.isdisjoint(draft.head):
             self._set_states()
         if draft.space is not None:
             self._check_space(draft.space)
         return self._as_asked() if self.problems else []
+
+    def _draw_boxes(self) -> None:
+        attempt, kept = self.key.attempt, self.key.kept
+        for names, streams, columns, low, edges in self.draft.boxes if self.draft.draws else ():
+            own = zip(names, streams, strict=True)
+            again = (s if n in kept or not attempt else f"{s}#{attempt}" for n, s in own)
+            drawn = uniforms(self.key, again, columns.shape[1])
+            self.row.numbers[columns] = low + edges * drawn
+            self._drawn |= {*names}
+            self.row.unknown -= {*names}
 
     def compute(self, name: str) -> None:
         """Compute a parameter, whose parents have been."""
@@ -370,8 +407,12 @@ class Solution:
         for target in self.draft.states:
             if target not in followed:
                 self.set_state(target)
+        moved, fresh = {*self.draft.order, *self.draft.states}, self.draft.base.fresh
         for variable in self.compiled.carried:
-            self.set_state(variable.name)
+            name = variable.name
+            if name in moved or name in fresh or not moved.isdisjoint(followed[name]):
+                self.set_state(name)
+                moved.add(name)
 
     def set_state(self, name: str) -> None:
         """Carry a state along with its parents, and do what is asked of it."""
@@ -540,28 +581,31 @@ class Solution:
 
     # --- what is kept of it -------------------------------------------------------------------
 
+    @cached_property
+    def _fixed(self) -> dict[str, Hard]:
+        """The values that came out of draws, as interventions by target."""
+        return {target: Hard(self.row[target].tolist()) for target in self.draft.draws}
+
     @property
     def model(self) -> SCM:
         """The model with the interventions that would hold, draws as the values that came out."""
-        draws, model = self.draft.draws, self.draft.model
-        fixed = {target: Hard(self.row[target].tolist()) for target in draws}
-        return model.with_interventions(fixed) if fixed else model
+        model = self.draft.model
+        return model.with_interventions(self._fixed) if self.draft.draws else model
 
     def kept(self) -> PendingInterventions:
         """Return the interventions at this control step, draws as the values that came out."""
-        acts, removals = self.draft.acts, self.draft.request.items()
-        found = {
-            t: self._settled(t, *named) if t in acts else named
-            for t, named in self.draft.pending.items()
-        }
+        acts, by_hand, actions = self.draft.acts, self.compiled.set_by_hand, self.compiled.actions
+        found: PendingInterventions = {}
+        for target, named in self.draft.pending.items():
+            lasting = target not in by_hand and isinstance(named[1], (*SOFT, Mechanism, Natural))
+            stays = isinstance(named[1], Hard) or lasting or target in actions
+            if stays or target not in acts:
+                found[target] = named
+            else:
+                value = self._fixed.get(target) or Hard(self.row[target].tolist())
+                found[target] = target, value
+        removals = self.draft.request.items()
         return found | {name: (name, act) for name, act in removals if isinstance(act, Null)}
-
-    def _settled(self, target: str, name: str, act: Intervention) -> tuple[str, Intervention]:
-        is_state, actions = target in self.compiled.set_by_hand, self.compiled.actions
-        keeps = isinstance(act, (*SOFT, Mechanism, Natural)) and not is_state
-        if isinstance(act, Hard) or target in actions or keeps:
-            return name, act
-        return target, Hard(self.row[target].tolist())
 
 
 @final
@@ -639,7 +683,9 @@ def _shapes(key: ParameterKey | None) -> bool:
     return key is not None and key[1] in SURFACES
 
 
-def difference(compiled: CompiledTask, now: Row, structure: Structure, then: Row) -> Difference:
+def difference(
+    compiled: CompiledTask, now: Row, structure: Structure, then: Row, changed: Iterable[str]
+) -> Difference:
     """Return what a backend has to change: the difference of two scenes, without describing them.
 
     Args:
@@ -647,13 +693,10 @@ def difference(compiled: CompiledTask, now: Row, structure: Structure, then: Row
         now: The present values.
         structure: What the backend has compiled.
         then: The values that are wanted.
+        changed: What ``Row.differing`` lists.
     """
-    if then.mechanisms is not now.mechanisms:
-        scene = compiled.describe(then, compiled.state_of(then))
-        return Difference(scene.structure, scene.parameters, scene.state)
-    changed = then.mechanisms.differing(now.numbers, then.numbers)
-    wanted = compiled.structure(then) if changed else structure
-    state = compiled.state_of(then)
+    state, same_columns = compiled.state_of(then), then.mechanisms is now.mechanisms
+    wanted = compiled.structure(then) if changed or not same_columns else structure
     if wanted is not structure:
         return Difference(wanted, compiled.describe(then, state).parameters, state)
     keys = compiled.parameter_keys
@@ -736,7 +779,8 @@ def feasible(
         solution = Solution(draft, replace(key, attempt=attempt) if attempt else key)
         with np.errstate(all="ignore"):  # what is not finite is refused by name
             raise_all(solution.solve())
-        change = difference(draft.compiled, now, structure, solution.row)
+        solution.changed = now.differing(solution.row)
+        change = difference(draft.compiled, now, structure, solution.row, solution.changed)
         problems = overlaps(draft.compiled, draft.base, now, solution.row, change, draft.asked)
         if draws and not problems:
             problems = _in_obstacles(solution, draws)
@@ -849,7 +893,7 @@ def _nearest(
             blocked = bool(solution.solve())  # outside the bounds on the way
         if not blocked:
             row, compiled = solution.row, draft.compiled
-            change = difference(compiled, now, structure, row)
+            change = difference(compiled, now, structure, row, now.differing(row))
             blocked = bool(overlaps(compiled, draft.base, now, row, change, draft.asked))
         low, high = (low, middle) if blocked else (middle, high)
     return between(low)

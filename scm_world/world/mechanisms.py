@@ -48,6 +48,10 @@ class Mechanisms:
         computed: What is computed, causes before effects.
         whole: Variables that are whole numbers.
         reading: Columns and shape of each variable, and whether it is a whole number.
+        static: Variables that interventions alone decide.
+        decided: The same, without their order.
+        places: Their columns, shape (m,).
+        owners: Which of them each of these columns belongs to, shape (m,).
     """
 
     def __init__(
@@ -78,10 +82,11 @@ class Mechanisms:
             name: (place, model.declared(name).shape, name in self.whole)
             for name, place in self.where.items()
         }
-        self._static = tuple(static)
-        self._decided = places(self.where[name] for name in self._static)
-        widths = [self.where[name].stop - self.where[name].start for name in self._static]
-        self._owners = np.repeat(np.arange(len(widths)), widths)
+        self.static = tuple(static)
+        self.decided = frozenset(self.static)
+        self.places = places(self.where[name] for name in self.static)
+        widths = [self.where[name].stop - self.where[name].start for name in self.static]
+        self.owners = np.repeat(np.arange(len(widths)), widths)
         self._steps = {name: self._bound(name) for name in self.computed}
         remembered = [self.where[name] for name in self.earlier]
         self._memory = _program([_copy(remembered, self.earlier.values())])
@@ -126,13 +131,6 @@ class Mechanisms:
         """Give a variable of a row, as a view."""
         place = self.earlier[name] if earlier else self.where[name]
         return row[place].reshape(self._model.declared(name).shape)
-
-    def differing(self, before: Floats, after: Floats) -> list[str]:
-        """List variables that interventions alone decide and that differ between two rows."""
-        apart = before[self._decided] != after[self._decided]
-        if not apart.any():
-            return []
-        return [self._static[i] for i in dict.fromkeys(self._owners[apart].tolist())]
 
     # --- binding ------------------------------------------------------------------------------
 
@@ -192,12 +190,12 @@ class Row(Mapping[str, Value]):
         unknown: Variables whose values are to be computed first.
     """
 
-    __slots__ = ("_unknown", "mechanisms", "numbers")
+    __slots__ = ("mechanisms", "numbers", "unknown")
 
     def __init__(
         self, mechanisms: Mechanisms, numbers: Floats, unknown: Iterable[str] = ()
     ) -> None:
-        self.mechanisms, self.numbers, self._unknown = mechanisms, numbers, {*unknown}
+        self.mechanisms, self.numbers, self.unknown = mechanisms, numbers, {*unknown}
 
     def __getitem__(self, name: str) -> Value:
         place, shape, is_whole = self.mechanisms.reading[name]
@@ -206,10 +204,19 @@ class Row(Mapping[str, Value]):
 
     def __setitem__(self, name: str, value: ArrayLike) -> None:
         self.numbers[self.mechanisms.where[name]] = np.ravel(value)
-        self._unknown.discard(name)
+        self.unknown.discard(name)
 
     def __contains__(self, name: object) -> bool:
-        return name in self.mechanisms.where and name not in self._unknown
+        return name in self.mechanisms.where and name not in self.unknown
+
+    def differing(self, other: Row) -> list[str]:
+        """List what interventions alone decide, in both rows, and differs in another one."""
+        mine, its = self.mechanisms, other.mechanisms
+        if mine is not its:
+            both = (name for name in its.static if name in mine.decided)
+            return [name for name in both if not np.array_equal(self[name], other[name])]
+        apart = self.numbers[mine.places] != other.numbers[mine.places]
+        return [mine.static[i] for i in dict.fromkeys(mine.owners[apart].tolist())]
 
     def following(self, last: Row) -> Row:
         """Take over the clock, the actions and the memory of a row of another structure."""

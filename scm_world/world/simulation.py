@@ -27,7 +27,7 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.models import Difference, Parameters, Scene, State
+from scm_world.models import Difference, Parameters, Scene, State, Structure
 from scm_world.models.camera import Camera
 from scm_world.tasks import Task
 from scm_world.variables import Draw, Mechanism, Subset
@@ -133,7 +133,7 @@ class Simulation(WorldAttributes):
         self._checked = self._closed = False
         self.version = 0  # counts changes of anything but what physics moves
         self._origin: EngineSnapshot | None = None
-        self._origin_row = np.empty(0)
+        self._origin_row: Row | None = None
         self._have_no_episode()
         if isinstance(self.variables_space, Subset):
             # Where variables decide which bodies there are, some may be named that are not there.
@@ -149,9 +149,10 @@ class Simulation(WorldAttributes):
         self._base: StepBase | None = None
         compiled = self.structures.natural(None)
         self._values = PresentValues(compiled)
-        self._values.put(beginning(compiled, None).numbers)
+        row = beginning(compiled, None)
+        self._values.put(row, [*compiled.static_names])
         self._adopt_model(compiled.model)
-        self._adopt_structure()
+        self._adopt_structure(compiled.structure(row))
 
     @property
     def compiled(self) -> CompiledTask:
@@ -255,14 +256,15 @@ class Simulation(WorldAttributes):
     def _begin(self) -> None:
         self._lost, self._offset = "", 0
         origin = self.structures.natural(None)
-        if self._started and self._origin is not None:
+        row = self._origin_row
+        if self._started and self._origin is not None and row is not None:
             self.backend.restore(self._origin)
         else:
             row = beginning(origin, None)
             self.backend.build(origin.describe(row, origin.state_of(row)))
-            self._origin, self._origin_row = self.backend.snapshot(), row.numbers
+            self._origin, self._origin_row = self.backend.snapshot(), row
             self._started = True
-        self._adopt(origin, origin.model, self._origin_row)
+        self._adopt(origin, origin.model, row)
         self._draw_nature()
         self._forget()
         if not self._checked:
@@ -282,7 +284,7 @@ class Simulation(WorldAttributes):
         if not compiled.random:
             return
         row, present, base = beginning(compiled, key), self._values.row, self._step_base()
-        change = difference(compiled, present, self.structure, row)
+        change = difference(compiled, present, self.structure, row, present.differing(row))
         solid = compiled.composition.solid
         problems = overlaps(compiled, base, present, row, change) if solid else []
         if problems:
@@ -290,7 +292,7 @@ class Simulation(WorldAttributes):
             raise refusal(self.structures, base, present, self.structure, draft, problems, key)
         if change:
             self.backend.apply(change)
-        self._adopt(compiled, compiled.model, row.numbers)
+        self._adopt(compiled, compiled.model, row)
 
     def noise_key(self, index: int) -> NoiseKey:
         """Return the noise key of a control step of this episode.
@@ -414,9 +416,10 @@ class Simulation(WorldAttributes):
         self._require_state()
         twice: list[InterventionError] = []
         flat = flatten(request, twice)
-        base = self._base or self._step_base()
-        twice += self._wrong_actions(flat)
-        flat, drawn = self._anew(flat, base)
+        base, drawn = self._base or self._step_base(), dict[str, int]()
+        if any(isinstance(act, Draw | Mechanism) for act in flat.values()):
+            twice += self._wrong_actions(flat)
+            flat, drawn = self._anew(flat, base)
         region = self.variables_space if space is None else as_region("space", space)
         key = self.noise_key(self._index)
         now = self._values.row
@@ -424,7 +427,9 @@ class Simulation(WorldAttributes):
             self.structures, base, now, self.structure, flat, region, key, twice
         )
         audit = self._commit(solution, change, flat, check, at_start=base.at_start)
-        self._base = replace(base, pending=solution.kept(), drawn=drawn)
+        self._base = StepBase(
+            base.compiled, base.model, base.row, solution.kept(), drawn or base.drawn, base.at_start
+        )
         return audit
 
     def _anew(
@@ -494,27 +499,26 @@ class Simulation(WorldAttributes):
         Raises:
             EngineFailure: The backend does not report what it was given.
         """
-        before, structure, index = self._step_base(), self.structure, self._index
+        before, index = self._step_base(), self._index
 
         def undo() -> None:
-            compiled, row = before.compiled, before.row
-            if change.structure is not None:
-                scene = compiled.describe(row, compiled.state_of(row))
-                self.backend.apply(Difference(scene.structure, scene.parameters, scene.state))
-            elif change:
-                self.backend.apply(difference(compiled, solution.row, structure, row))
+            there = solution.compiled.structure(solution.row)
+            lost = difference(before.compiled, solution.row, there, before.row, solution.changed)
+            if lost:
+                self.backend.apply(lost)
 
-        with self._all_or_nothing(undo):
+        with self._all_or_nothing(before, undo):
             inertia = self._inertia(change)
             reported: Parameters = {}
             if change:
                 self.backend.apply(change)
                 reported = self._applied(change)
-            changed = self._adopt(solution.compiled, solution.model, solution.row.numbers)
-            now = self._values.row
-            audit = report(
-                request, solution, change, before, changed, now, inertia, reported, self.backend
+            structure = self.structure if change.structure is None else change.structure
+            self._adopt(
+                solution.compiled, solution.model, solution.row, solution.changed, structure
             )
+            now = self._values.row
+            audit = report(request, solution, change, before, now, inertia, reported, self.backend)
             self._offset += self._index - index
             if at_start:
                 self._forget()
@@ -523,20 +527,20 @@ class Simulation(WorldAttributes):
         return audit
 
     @contextmanager
-    def _all_or_nothing(self, undo: Callable[[], None]) -> Iterator[None]:
-        """Put everything back, should something fail half way.
+    def _all_or_nothing(self, before: StepBase, undo: Callable[[], None]) -> Iterator[None]:
+        """Put everything back as it was before, should something fail half way.
 
         Args:
+            before: A copy of the present.
             undo: Puts the backend back.
         """
-        kept, numbers = self._values, self._values.matrix[0].copy()
-        model, offset = self._held, self._offset
+        kept, offset = self._values, self._offset
         try:
             yield
         except BaseException:
             undo()
             self._values = kept
-            self._adopt(kept.compiled, model, numbers, moved=False)
+            self._adopt(before.compiled, before.model, before.row, moved=False)
             self._offset = offset
             raise
 
@@ -570,49 +574,48 @@ class Simulation(WorldAttributes):
         return reported
 
     def _adopt(
-        self, compiled: CompiledTask, model: SCM, numbers: Floats, *, moved: bool = True
-    ) -> list[str]:
+        self,
+        compiled: CompiledTask,
+        model: SCM,
+        row: Row,
+        changed: list[str] | None = None,
+        structure: Structure | None = None,
+        *,
+        moved: bool = True,
+    ) -> None:
         """Take over what an intervention decided; the backend has taken over its part.
 
         Args:
             compiled: The task in the structure that there is now.
             model: With the interventions that hold.
-            numbers: The values, shape (width,).
-            moved: Whether the backend reports where everything is; else the numbers do.
-
-        Returns:
-            What only interventions decide and has changed.
+            row: The values.
+            changed: What only interventions decide and differs from the present.
+            structure: What the backend has compiled.
+            moved: Whether the backend reports where everything is; else the row does.
         """
         last = self._values
+        changed = last.row.differing(row) if changed is None else changed
         if compiled is not last.compiled:
-            self._values = PresentValues(compiled)
+            self._values, changed = PresentValues(compiled), [*compiled.static_names]
         values = self._values
-        changed = values.put(numbers)
+        values.put(row, changed)
         self._adopt_model(model)
         if changed or values is not last:
-            self._adopt_structure()
+            self._adopt_structure(compiled.structure(row) if structure is None else structure)
         self.version += 1
         if moved:
             self.backend.read(values.state)
         self._index = int(values.row[CONTROL_INDEX])
         if values is not last:
-            there = last.compiled.static
-            changed = [
-                name
-                for name in compiled.static_names
-                if name in there and not np.array_equal(last.row[name], values.row[name])
-            ]
             self._forget()
             for name in last.before.keys() & values.before.keys():
                 values.before[name][...] = last.before[name]
-        return changed
 
-    def _adopt_structure(self) -> None:
-        compiled, row = self.compiled, self._values.row
-        commands = compiled.composition.commands
-        self.translates = commands is not None and commands.applies(row)
-        self.structure = compiled.structure(row)
-        self._substeps = max(1, round(self.control_period / self.structure.timestep))
+    def _adopt_structure(self, structure: Structure) -> None:
+        commands = self.composition.commands
+        self.translates = commands is not None and commands.applies(self._values.row)
+        self.structure = structure
+        self._substeps = max(1, round(self.control_period / structure.timestep))
 
     def _adopt_model(self, model: SCM) -> None:
         self._held, held = model, model.interventions
@@ -693,9 +696,9 @@ class Simulation(WorldAttributes):
             present = opened(snapshot.present, self.structures)
             base = base if base is None else opened(base, self.structures)
             noise = CompiledNoise(snapshot.seed)
-            with self._all_or_nothing(undo):
+            with self._all_or_nothing(self._step_base(), undo):
                 self.backend.restore(engine)
-                self._adopt(present.compiled, present.model, present.row.numbers, moved=False)
+                self._adopt(present.compiled, present.model, present.row, moved=False)
                 self._values.matrix[0] = present.row.numbers
         except ScmWorldError:
             raise
@@ -746,12 +749,7 @@ class Simulation(WorldAttributes):
             raise NotReset(closed=self._closed)
 
     def _require_state(self) -> None:
-        """Refuse to continue from a state that the backend has lost.
-
-        Raises:
-            EngineFailure: It has; a reset or a snapshot is needed.
-            NotReset: There is no episode yet.
-        """
+        """Refuse to continue without an episode, or from a state that the backend has lost."""
         self._require_episode()
         if self._lost:
             advice = "reset the world, or restore a snapshot"

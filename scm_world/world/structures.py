@@ -99,7 +99,8 @@ class StructureCache:
 
     def decided_by(self, acts: Iterable[tuple[str, Any]]) -> bool:
         """Return whether interventions, by name, may decide which bodies there are."""
-        return any(isinstance(act, Null) or name in self.deciding for name, act in acts)
+        deciding = self.deciding
+        return any(isinstance(act, Null) or name in deciding for name, act in acts)
 
     def after(
         self, acts: dict[str, Intervention], held: SCM, static: Values, key: NoiseKey

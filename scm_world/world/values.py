@@ -61,13 +61,11 @@ class PresentValues:
         self.now |= {name: whole for name, (whole, _) in counted.items()}
         self.before = {n: mechanisms.view(row, n, earlier=True) for n in mechanisms.earlier}
 
-    def put(self, numbers: Floats) -> list[str]:
-        """Take over a row of numbers; return what only interventions decide and has changed."""
-        changed = self.compiled.mechanisms.differing(self.matrix[0], numbers)
-        self.matrix[0] = numbers
+    def put(self, row: Row, changed: list[str]) -> None:
+        """Take over a row; ``changed``: what ``Row.differing`` lists."""
+        self.matrix[0] = row.numbers
         self._decide(changed)
         self.be_at(int(self._clock[0]))
-        return changed
 
     def _decide(self, names: tuple[str, ...] | list[str]) -> None:
         for name in names:
