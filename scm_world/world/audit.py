@@ -84,7 +84,7 @@ def _show(value: Value) -> str:
 def report(
     request: Mapping[str, Any],
     solution: Solution,
-    change: Difference,
+    change: Difference | None,
     before: StepBase,
     now: Row,
     inertia: Parameters,
@@ -116,7 +116,7 @@ def report(
     followed = {
         name: (np.array(old[name]), np.array(now[name])) for name in changed if name not in known
     }
-    if change.state is not None:
+    if change is not None and change.state is not None:
         for name in before.compiled.slices:
             if name in bundles or name in known or name not in compiled.slices:
                 continue
@@ -129,7 +129,8 @@ def report(
         there, were = ({*one.composition.bodies} for one in (compiled, before.compiled))
         came, went = sorted(there - were), sorted(were - there)
     remarks: tuple[str, ...] = ()
-    if change.structure is None and any(what.endswith("friction") for _, what in change.parameters):
+    set_here = change.parameters if change is not None and change.structure is None else {}
+    if any(what.endswith("friction") for _, what in set_here):
         frictions = {keys[name]: old[name] for name in changed if name in keys}
         remarks = backend.capabilities.remarks(backend, frictions)
     return Audit(targets, followed, engine, tuple(came), tuple(went), remarks)

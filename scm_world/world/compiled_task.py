@@ -261,6 +261,17 @@ class CompiledTask(ActionVector):
         return found
 
     @cached_property
+    def can_be_set(self) -> NDArray[np.bool_]:
+        """Which numbers of the state can be set, shape (size,)."""
+        found: NDArray[np.bool_] = self._start.layout.can_be_set
+        return found
+
+    @cached_property
+    def movers(self) -> frozenset[str]:
+        """The bodies that can come and go, and move."""
+        return frozenset(self.composition.movers())
+
+    @cached_property
     def entity_names(self) -> frozenset[str]:
         """Names of what stands in the world."""
         return frozenset(entity.name for entity in self.composition.entities)

@@ -117,7 +117,8 @@ class Draft:
     ) -> None:
         self.problems = [*found]
         self.request = request
-        if structures.decided_by((*base.pending.values(), *request.items())):
+        asked = (*base.pending.values(), *request.items())
+        if any(isinstance(act, Null) or name in structures.deciding for name, act in asked):
             wrong = wrong_structure(structures, base, request)
             request = {name: act for name, act in request.items() if name not in wrong}
             base = restructured(structures, base, request, key)
@@ -125,7 +126,8 @@ class Draft:
         self.base, self.compiled, self.space = base, base.compiled, space
         self.head = structures.deciding
         self.pending = {**base.pending, **self._accepted(request)}
-        self.acts = {t: named for t, named in self.pending.items() if t in self.compiled.model}
+        there = self.compiled.mechanisms.where
+        self.acts = {t: named for t, named in self.pending.items() if t in there}
         self.states = [t for t in self.acts if t in self.compiled.set_by_hand]
         self.model, self.order = base.model, tuple[str, ...]()
         self.impossible: set[str] = set()
@@ -189,7 +191,7 @@ class Draft:
         compiled, by_hand = self.compiled, self.compiled.set_by_hand
         acts = {t: named for t, named in self.acts.items() if t not in by_hand}
         follows = [t for t, (_, act) in acts.items() if isinstance(act, Mechanism)]
-        moving = self._moving({target: acts[target] for target in follows})
+        moving = self._moving({target: acts[target] for target in follows}) if follows else {}
         kept = dict([named for target, named in acts.items() if target not in moving])
         self.model, cycles = self.base.model.without_cycles(kept)
         self.problems += [*{p.variable: p for p in moving.values()}.values(), *cycles]
@@ -290,15 +292,12 @@ class Draft:
         compiled = self.compiled
         return {n for n in names if n in compiled.places or _shapes(compiled.parameter_keys.get(n))}
 
-    def draws_of(self, *, material: bool = False) -> list[str]:
-        """Name the draws of the request; ``material``: those that move a body or change its size.
+    def material(self, draws: Iterable[str]) -> list[str]:
+        """List the draws that move a body or change its size.
 
         Goals count as bodies where there are obstacles, in which they must not be. Which bodies
         there are is drawn once.
         """
-        draws = [n for n, act in self.request.items() if isinstance(act, Draw)]
-        if not material:
-            return draws
         hides = self.compiled.composition.hides_goals
 
         def matters(name: str) -> bool:
@@ -343,7 +342,8 @@ class Solution:
         A mechanism never meets values that its parents cannot have.
         """
         draft = self.draft
-        self._draw_boxes()
+        if draft.draws:
+            self._draw_boxes()
         for name in draft.order:
             if name not in self._drawn:
                 self.compute(name)
@@ -355,7 +355,7 @@ class Solution:
 
     def _draw_boxes(self) -> None:
         attempt, kept = self.key.attempt, self.key.kept
-        for names, streams, columns, low, edges in self.draft.boxes if self.draft.draws else ():
+        for names, streams, columns, low, edges in self.draft.boxes:
             own = zip(names, streams, strict=True)
             again = (s if n in kept or not attempt else f"{s}#{attempt}" for n, s in own)
             drawn = uniforms(self.key, again, columns.shape[1])
@@ -685,8 +685,10 @@ def _shapes(key: ParameterKey | None) -> bool:
 
 def difference(
     compiled: CompiledTask, now: Row, structure: Structure, then: Row, changed: Iterable[str]
-) -> Difference:
-    """Return what a backend has to change: the difference of two scenes, without describing them.
+) -> Difference | None:
+    """Return what a backend has to change; None if nothing.
+
+    It is the difference of two scenes, without describing them.
 
     Args:
         compiled: The task in the structure that is wanted.
@@ -695,14 +697,16 @@ def difference(
         then: The values that are wanted.
         changed: What ``Row.differing`` lists.
     """
-    state, same_columns = compiled.state_of(then), then.mechanisms is now.mechanisms
+    same_columns = then.mechanisms is now.mechanisms
     wanted = compiled.structure(then) if changed or not same_columns else structure
     if wanted is not structure:
-        return Difference(wanted, compiled.describe(then, state).parameters, state)
-    keys = compiled.parameter_keys
+        scene = compiled.describe(then, compiled.state_of(then))
+        return Difference(wanted, scene.parameters, scene.state)
+    keys, size = compiled.parameter_keys, compiled.mechanisms.state_size
     parameters = {keys[name]: then[name] for name in changed if name in keys}
-    unmoved = state.coincides(compiled.state_of(now))
-    return Difference(None, parameters, None if unmoved else state)
+    moves = (now.numbers[:size] != then.numbers[:size]) & compiled.can_be_set
+    state = compiled.state_of(then) if moves.any() else None
+    return Difference(None, parameters, state) if parameters or state is not None else None
 
 
 def overlaps(
@@ -710,10 +714,12 @@ def overlaps(
     base: StepBase,
     now: Row,
     then: Row,
-    change: Difference,
+    change: Difference | None,
     asked: Iterable[str] = (),
 ) -> list[Overlap]:
     """List overlaps deeper than what physics left; taking something back is always possible."""
+    if change is None:
+        return []
     moves = change.structure is not None or any(map(_shapes, change.parameters))
     if not moves and change.state is not None:
         size = compiled.mechanisms.state_size
@@ -743,7 +749,7 @@ def feasible(
     space: AnyRegion | None,
     key: NoiseKey,
     found: Iterable[InterventionError] = (),
-) -> tuple[Solution, Difference]:
+) -> tuple[Solution, Difference | None]:
     """Compute what a world would be after an intervention that puts no two bodies in one place.
 
     Bodies that intersect already (a block that is being squeezed) may continue to. What is
@@ -767,9 +773,9 @@ def feasible(
             draw was.
     """
     draft = Draft(structures, base, request, space, key, found)
-    draws, problems = draft.draws_of(), list[Overlap]()
+    draws, problems = [n for n, act in request.items() if isinstance(act, Draw)], list[Overlap]()
     attempts: Iterator[int] = iter((0,))
-    tried, again = "", draft.draws_of(material=True) if draws and not draft.problems else []
+    tried, again = "", draft.material(draws) if draws and not draft.problems else []
     if draws:
         key = replace(key, kept=frozenset(draws).difference(again))
     if again:
@@ -778,7 +784,9 @@ def feasible(
     for attempt in attempts:
         solution = Solution(draft, replace(key, attempt=attempt) if attempt else key)
         with np.errstate(all="ignore"):  # what is not finite is refused by name
-            raise_all(solution.solve())
+            found = solution.solve()
+        if found:
+            raise_all(found)
         solution.changed = now.differing(solution.row)
         change = difference(draft.compiled, now, structure, solution.row, solution.changed)
         problems = overlaps(draft.compiled, draft.base, now, solution.row, change, draft.asked)

@@ -20,7 +20,6 @@ from scm_world.errors import (
     InterventionError,
     NotFinite,
     NotReset,
-    ScmWorldError,
     SnapshotMismatch,
     UnknownOption,
     WrongShape,
@@ -290,7 +289,7 @@ class Simulation(WorldAttributes):
         if problems:
             draft = Draft(self.structures, base, {compiled.random[0]: Draw("A")}, None, key)
             raise refusal(self.structures, base, present, self.structure, draft, problems, key)
-        if change:
+        if change is not None:
             self.backend.apply(change)
         self._adopt(compiled, compiled.model, row)
 
@@ -413,7 +412,8 @@ class Simulation(WorldAttributes):
             InterventionError: The request was refused; the world is bit-identical to before.
             NotReset: There is no episode yet.
         """
-        self._require_state()
+        if not self._started or self._lost:
+            self._require_state()
         twice: list[InterventionError] = []
         flat = flatten(request, twice)
         base, drawn = self._base or self._step_base(), dict[str, int]()
@@ -488,7 +488,7 @@ class Simulation(WorldAttributes):
     def _commit(
         self,
         solution: Solution,
-        change: Difference,
+        change: Difference | None,
         request: Mapping[str, Any],
         check: Callable[[], object] | None,
         *,
@@ -504,23 +504,26 @@ class Simulation(WorldAttributes):
         def undo() -> None:
             there = solution.compiled.structure(solution.row)
             lost = difference(before.compiled, solution.row, there, before.row, solution.changed)
-            if lost:
+            if lost is not None:
                 self.backend.apply(lost)
 
         with self._all_or_nothing(before, undo):
-            inertia = self._inertia(change)
+            inertia: Parameters = {}
             reported: Parameters = {}
-            if change:
+            if change is not None:
+                inertia = self._inertia(change)
                 self.backend.apply(change)
                 reported = self._applied(change)
-            structure = self.structure if change.structure is None else change.structure
-            self._adopt(
-                solution.compiled, solution.model, solution.row, solution.changed, structure
-            )
+            row, changed = solution.row, solution.changed
+            if change is None and not changed and row[CONTROL_INDEX] == index:
+                self._adopt_model(solution.model)
+                self.version += 1
+            else:
+                self._adopt(solution.compiled, solution.model, row, changed, change)
             now = self._values.row
             audit = report(request, solution, change, before, now, inertia, reported, self.backend)
             self._offset += self._index - index
-            if at_start:
+            if at_start and (change is not None or changed):
                 self._forget()
             if check is not None:
                 check()
@@ -548,10 +551,9 @@ class Simulation(WorldAttributes):
         bodies = {body for body, what in change.parameters if what in ("mass", "size")}
         if change.structure is not None or not bodies:
             return {}
-        movers = self.composition.movers()
-        if not movers:
+        if not self.compiled.movers:
             return {}
-        bodies -= {*self.composition.bodies}.difference(movers)
+        bodies -= {*self.composition.bodies} - self.compiled.movers
         return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
     def _applied(self, change: Difference) -> Parameters:
@@ -579,7 +581,7 @@ class Simulation(WorldAttributes):
         model: SCM,
         row: Row,
         changed: list[str] | None = None,
-        structure: Structure | None = None,
+        change: Difference | None = None,
         *,
         moved: bool = True,
     ) -> None:
@@ -589,19 +591,22 @@ class Simulation(WorldAttributes):
             compiled: The task in the structure that there is now.
             model: With the interventions that hold.
             row: The values.
-            changed: What only interventions decide and differs from the present.
-            structure: What the backend has compiled.
+            changed: What only interventions decide and differs from the present, if known.
+            change: What the backend had to change.
             moved: Whether the backend reports where everything is; else the row does.
         """
         last = self._values
-        changed = last.row.differing(row) if changed is None else changed
+        if changed is None:
+            changed, structure = last.row.differing(row), compiled.structure(row)
+        else:
+            structure = change.structure if change and change.structure else self.structure
         if compiled is not last.compiled:
             self._values, changed = PresentValues(compiled), [*compiled.static_names]
         values = self._values
         values.put(row, changed)
         self._adopt_model(model)
         if changed or values is not last:
-            self._adopt_structure(compiled.structure(row) if structure is None else structure)
+            self._adopt_structure(structure)
         self.version += 1
         if moved:
             self.backend.read(values.state)
@@ -700,7 +705,7 @@ class Simulation(WorldAttributes):
                 self.backend.restore(engine)
                 self._adopt(present.compiled, present.model, present.row, moved=False)
                 self._values.matrix[0] = present.row.numbers
-        except ScmWorldError:
+        except (SnapshotMismatch, EngineFailure):
             raise
         except Exception as error:
             raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error

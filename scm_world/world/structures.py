@@ -97,11 +97,6 @@ class StructureCache:
         """Return the structure of an episode without interventions."""
         return self.compiled(self.plan(self.head.solve(key=key)))
 
-    def decided_by(self, acts: Iterable[tuple[str, Any]]) -> bool:
-        """Return whether interventions, by name, may decide which bodies there are."""
-        deciding = self.deciding
-        return any(isinstance(act, Null) or name in deciding for name, act in acts)
-
     def after(
         self, acts: dict[str, Intervention], held: SCM, static: Values, key: NoiseKey
     ) -> Plan | None:

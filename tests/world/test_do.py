@@ -30,6 +30,7 @@ from scm_world.errors import (
     WrongShape,
     WrongType,
 )
+from scm_world.models import Difference
 from scm_world.variables import Draw, Normal, Null, Scale, Shift
 from scm_world.world.interventions import feasible
 
@@ -236,6 +237,7 @@ def test_an_engine_is_told_the_difference_of_the_scenes(backend: str, task: str)
         else:
             pairs = then.parameters.items()
             expected = {k: v for k, v in pairs if not np.array_equal(v, now.parameters[k])}
+        told = told or Difference()
         assert told.parameters.keys() == expected.keys()
         assert all(np.array_equal(told.parameters[k], v) for k, v in expected.items())
         stays = now.structure == then.structure and now.state.coincides(then.state)
