@@ -18,6 +18,7 @@ from scm_world.errors import ActionError, InterventionError, ModelError, Unknown
 from scm_world.geometry.clipping import clip_kernel
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
+from scm_world.models.scene import SURFACES
 from scm_world.tasks import Conventions, Task, Timing
 from scm_world.variables import Action, Box, Derived, Exogenous, Intervention, Measured
 from scm_world.variables.checks import check_bounds, coerce
@@ -231,6 +232,8 @@ class CompiledTask(ActionVector):
         )
         self._coordinates: dict[str, Callable[..., Any]] = {}
         self._boxes: dict[Any, tuple[Integers, Floats, Floats] | None] = {}
+        self._reached: dict[frozenset[str], frozenset[str]] = {}
+        self._material: dict[str, bool] = {}
         self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._constants: dict[Structure, Mapping[ParameterKey, Floats]] = {}
 
@@ -314,6 +317,35 @@ class CompiledTask(ActionVector):
                 columns = np.arange(where.start, where.stop)
                 self._boxes[key] = columns, ends[0], ends[1] - ends[0]
         return self._boxes[key]
+
+    def reached(self, names: Iterable[str]) -> frozenset[str]:
+        """Name the parameters and states that change at an instant with some targets."""
+        key = frozenset(target for name in names for target in self.model.targets(name))
+        if key not in self._reached:
+            found = {*key, *self.static_order(sorted(key))}
+            for state in self.carried:
+                if not found.isdisjoint(self.set_parents[state.name]):
+                    found.add(state.name)
+            self._reached[key] = frozenset(found)
+        return self._reached[key]
+
+    def surfaces(self, names: Iterable[str]) -> set[str]:
+        """Name those of ``reached`` that decide where bodies are, or how large."""
+        keys = self.parameter_keys
+        shapes = {name for name, key in keys.items() if key[1] in SURFACES}
+        return {name for name in self.reached(names) if name in self.places or name in shapes}
+
+    def is_material(self, name: str) -> bool:
+        """Return whether a variable moves a body or changes its size, when it is set.
+
+        Goals count as bodies where there are obstacles, in which they must not be.
+        """
+        if name not in self._material:
+            follow, hides = self.reached((name,)), self.composition.hides_goals
+            goal = hides and any(n.endswith(tuple(SURFACES)) for n in follow)
+            moves = not follow.isdisjoint(self.set_by_hand)
+            self._material[name] = goal or moves or bool(self.surfaces((name,)))
+        return self._material[name]
 
     @cached_property
     def _start(self) -> State:

@@ -192,15 +192,18 @@ class Draft:
         acts = {t: named for t, named in self.acts.items() if t not in by_hand}
         follows = [t for t, (_, act) in acts.items() if isinstance(act, Mechanism)]
         moving = self._moving({target: acts[target] for target in follows}) if follows else {}
-        kept = dict([named for target, named in acts.items() if target not in moving])
+        held = self.base.model.interventions.values()
+        ties = bool(follows) or any(isinstance(act, Mechanism) for act in held)
+        # Where nothing follows others than before, draws from boxes can wait for their values.
+        later = self.boxes.keys() if not ties else ()
+        kept = dict([acts[t] for t in acts if t not in moving and t not in later])
         self.model, cycles = self.base.model.without_cycles(kept)
         self.problems += [*{p.variable: p for p in moving.values()}.values(), *cycles]
         self.impossible = {*moving, *chain(*(problem.cycle for problem in cycles))}
         static = compiled.static
         self.targets = tuple([t for t in acts if t in static and t not in self.impossible])
         self.draws = [t for t in self.targets if isinstance(acts[t][1], Draw)]
-        held, actions = self.model.interventions.items(), compiled.actions
-        if any(isinstance(act, Mechanism) and name not in actions for name, act in held):
+        if ties:
             structure = self.model.structure
             follow = {*self.targets, *structure.instant_descendants(self.targets)}
             self.order = tuple(n for n in structure.order if n in follow and n in static)
@@ -245,20 +248,24 @@ class Draft:
         return requested.space(act.source) if isinstance(act.source, str) else act.source
 
     @cached_property
-    def boxes(self) -> list[tuple[list[str], list[str], Integers, Floats, Floats]]:
-        """Draws from boxes that follow nothing, by their size: they are made together.
-
-        Of each size the names, streams, columns, lower ends and edges, shape (draws, size).
-        """
-        found = dict[int, list[tuple[str, str, Integers, Floats, Floats]]]()
-        for name in self.draws:
-            asked, act = self.acts[name]
-            if isinstance(act, Draw) and asked == name and whole_of(act, name) == name:
-                box = self.compiled.box(name, act.source)
+    def boxes(self) -> dict[str, tuple[str, Integers, Floats, Floats]]:
+        """Draws from boxes that follow nothing: stream, columns, lower ends and edges."""
+        found: dict[str, tuple[str, Integers, Floats, Floats]] = {}
+        for name, (asked, act) in self.acts.items():
+            if isinstance(act, Draw) and asked == name and name in self.compiled.static:
+                box = None if act.of else self.compiled.box(name, act.source)
                 if box is not None:
                     own = name if act.stream is None else f"{act.stream}/{name}"
-                    found.setdefault(len(box[0]), []).append((name, own, *box))
-        groups = [zip(*group, strict=True) for group in found.values()]
+                    found[name] = own, *box
+        return found
+
+    @cached_property
+    def together(self) -> list[tuple[list[str], list[str], Integers, Floats, Floats]]:
+        """The same by size; columns, lower ends and edges have the shape (draws, size)."""
+        sizes = dict[int, list[tuple[str, str, Integers, Floats, Floats]]]()
+        for name, box in self.boxes.items():
+            sizes.setdefault(len(box[1]), []).append((name, *box))
+        groups = [zip(*group, strict=True) for group in sizes.values()]
         return [
             ([*names], [*streams], np.stack(columns), np.stack(low), np.stack(edges))
             for names, streams, columns, low, edges in groups
@@ -276,36 +283,6 @@ class Draft:
         again = (f"{own}#{n}" if n and name not in key.kept else own for n in attempts)
         drawn: Value = source.transform(uniforms(key, again, source.n_uniforms(shape)), shape, {})
         return drawn
-
-    def reached(self, names: Iterable[str]) -> set[str]:
-        """Name the parameters and states that change at this instant with some targets."""
-        compiled = self.compiled
-        targets = {t for name in names for t in compiled.model.targets(name)}
-        found = targets.union(compiled.static_order(sorted(targets)))
-        for state in compiled.carried:
-            if not found.isdisjoint(compiled.set_parents[state.name]):
-                found.add(state.name)
-        return found
-
-    def surfaces(self, names: Iterable[str]) -> set[str]:
-        """Name those of some parameters and states that decide where bodies are."""
-        compiled = self.compiled
-        return {n for n in names if n in compiled.places or _shapes(compiled.parameter_keys.get(n))}
-
-    def material(self, draws: Iterable[str]) -> list[str]:
-        """List the draws that move a body or change its size.
-
-        Goals count as bodies where there are obstacles, in which they must not be. Which bodies
-        there are is drawn once.
-        """
-        hides = self.compiled.composition.hides_goals
-
-        def matters(name: str) -> bool:
-            follow = self.reached([name])
-            goal = hides and any(n.endswith(tuple(SURFACES)) for n in follow)
-            return goal or bool(self.surfaces(follow)) or not follow.isdisjoint(self.states)
-
-        return [n for n in draws if n not in self.head and matters(n)]
 
 
 @final
@@ -355,7 +332,7 @@ class Solution:
 
     def _draw_boxes(self) -> None:
         attempt, kept = self.key.attempt, self.key.kept
-        for names, streams, columns, low, edges in self.draft.boxes:
+        for names, streams, columns, low, edges in self.draft.together:
             own = zip(names, streams, strict=True)
             again = (s if n in kept or not attempt else f"{s}#{attempt}" for n, s in own)
             drawn = uniforms(self.key, again, columns.shape[1])
@@ -619,7 +596,9 @@ class Candidates:
         varying: What follows from a draw.
     """
 
-    def __init__(self, draft: Draft, key: NoiseKey, attempts: range, varying: set[str]) -> None:
+    def __init__(
+        self, draft: Draft, key: NoiseKey, attempts: range, varying: frozenset[str]
+    ) -> None:
         self.attempts = [*attempts]
         self._draft, self._key, self._varying = draft, key, varying
         self._numbers = np.repeat(draft.base.row.numbers[None], len(attempts), axis=0)
@@ -775,7 +754,12 @@ def feasible(
     draft = Draft(structures, base, request, space, key, found)
     draws, problems = [n for n, act in request.items() if isinstance(act, Draw)], list[Overlap]()
     attempts: Iterator[int] = iter((0,))
-    tried, again = "", draft.material(draws) if draws and not draft.problems else []
+    tried, again = (
+        "",
+        [n for n in draws if n not in draft.head and draft.compiled.is_material(n)]
+        if draws and not draft.problems
+        else [],
+    )
     if draws:
         key = replace(key, kept=frozenset(draws).difference(again))
     if again:
@@ -806,7 +790,7 @@ def _promising(draft: Draft, key: NoiseKey, draws: list[str]) -> Iterator[int]:
     A draw that is left out puts two bodies in one place.
     """
     before = max((overlap.depth for overlap in _overlaps_before(draft.base)), default=0.0)
-    varying = draft.reached(draws)
+    varying = draft.compiled.reached(draws)
     for first in range(0, ATTEMPTS, CHUNK):
         chunk = range(first, min(first + CHUNK, ATTEMPTS))
         candidates = Candidates(draft, key, chunk, varying)
@@ -823,7 +807,7 @@ def _promising(draft: Draft, key: NoiseKey, draws: list[str]) -> Iterator[int]:
 
 def _anyhow(draft: Draft, draws: Iterable[str], problems: Iterable[Overlap]) -> bool:
     """Tell whether every draw has an overlap: of bodies that can be moved and follow no draw."""
-    moved = {name.partition(".")[0] for name in draft.reached(draws)}
+    moved = {name.partition(".")[0] for name in draft.compiled.reached(draws)}
     unmoved = {*draft.compiled.composition.bodies} - moved
     return not draws or any(unmoved.issuperset(overlap.bodies) for overlap in problems)
 
@@ -833,7 +817,7 @@ def _in_obstacles(solution: Solution, draws: Iterable[str]) -> list[Overlap]:
     compiled, row = solution.compiled, solution.row
     if not compiled.composition.hides_goals:
         return []
-    moved = {name.partition(".")[0] for name in solution.draft.reached(draws)}
+    moved = {name.partition(".")[0] for name in compiled.reached(draws)}
     return [*compiled.composition.buried(compiled.describe(row, compiled.state_of(row)), moved)]
 
 
@@ -851,7 +835,7 @@ def refusal(
     bodies = {body for overlap in problems for body in overlap.bodies}
 
     def blame(name: str) -> tuple[bool, bool]:
-        moved = draft.surfaces(draft.reached([name]) if name in draft.compiled.model else ())
+        moved = draft.compiled.surfaces((name,)) if name in draft.compiled.model else ()
         return bool({part.partition(".")[0] for part in moved} & bodies), bool(moved)
 
     name = max(draft.request, key=blame)
