@@ -2,12 +2,11 @@
 
 from scm_world.geometry.coordinates import from_cylindrical, to_cylindrical
 from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction
-from scm_world.geometry.hulls import Hull, extents, hull_of, hull_overlap, load_hull
+from scm_world.geometry.hulls import Hull, hull_of, hull_overlap, load_hull
 from scm_world.geometry.rotations import (
     angle_between,
     canonical,
     from_rotation_vector,
-    quaternion_inverse,
     quaternion_product,
     rotation_matrix,
     to_rotation_vector,
@@ -18,14 +17,12 @@ __all__ = [
     "aabb_overlap_fraction",
     "angle_between",
     "canonical",
-    "extents",
     "from_cylindrical",
     "from_rotation_vector",
     "hull_of",
     "hull_overlap",
     "load_hull",
     "overlap_fraction",
-    "quaternion_inverse",
     "quaternion_product",
     "rotation_matrix",
     "to_cylindrical",
