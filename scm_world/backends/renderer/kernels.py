@@ -387,16 +387,10 @@ def draw(
     alpha: float,
     canvas: Canvas,
 ) -> None:
-    """Draw solids and planes over what is there, where they are nearer.
+    """Draw solids and planes, ``which`` of the shapes, over what is there where they are nearer.
 
-    Args:
-        shapes: What there is.
-        which: Rows of what to draw, in this order; no meshes.
-        shadow: On the planes among them.
-        view: The rays of the pixels.
-        light: Unit vector towards the light, and the ambient brightness, shape (4,).
-        alpha: Opacity. Below 1 colors are blended, and depth and owners stay as they are.
-        canvas: What to draw on.
+    ``light`` is the unit vector towards the light, and the ambient brightness, shape (4,). With an
+    opacity ``alpha`` below 1 colors are blended, and depth and owners stay as they are.
     """
     depth, owners, rgb = canvas
     colored, solid, dark = rgb.shape[1] > 0, alpha == 1.0, SHADOW * (1.0 - light[3])
@@ -462,18 +456,9 @@ def draw_mesh(
 
     The triangle with the homogeneous pixels a, b, c covers the pixel q where the products of q
     with b × c, c × a and a × b have the sign of a · (b × c); it is seen from outside if that is
-    negative.
-
-    Args:
-        mesh: What to draw, in the frame of its shape.
-        shapes: With the shape.
-        n: Its row.
-        view: The rays of the pixels.
-        light: Unit vector towards the light, and the ambient brightness, shape (4,).
-        alpha: Opacity. Below 1, ``canvas.depth`` has to hold the depth of what is nearest, this
-            mesh included; only where the mesh is nearest are colors blended, and the depth there
-            is minus infinity afterwards. Owners stay as they are.
-        canvas: What to draw on.
+    negative. With an opacity below 1, ``canvas.depth`` has to hold the depth of what is nearest,
+    this mesh included; only where the mesh is nearest are colors blended, and the depth there is
+    minus infinity afterwards. Owners stay as they are.
 
     Source:
         Olano and Greer, *Triangle scan conversion using 2D homogeneous coordinates*, 1997.
@@ -530,12 +515,9 @@ def camera_view(camera: Camera, samples: int) -> View:
 
 
 def parallel_view(slope: Floats, half: float, n: int) -> View:
-    """Compute a ray towards the light for each point of a grid on the floor.
+    """Compute a ray towards the light, at height one, for each of n by n points of a floor.
 
-    Args:
-        slope: Towards the light, at height one, shape (3,).
-        half: Half the edge of the grid [m].
-        n: Points along an edge.
+    ``half`` is half the edge of their square [m].
     """
     step = 2.0 * half / (n - 1)
     zero = np.zeros(3)

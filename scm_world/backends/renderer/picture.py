@@ -37,11 +37,7 @@ def views_of(structure: Any) -> Views | None:
 
 
 def _visible(scene: Scene) -> VisibleModel:
-    """Put a scene into MuJoCo, which is imported only where it is needed.
-
-    Raises:
-        ModelError: The structure says nothing about shapes.
-    """
+    """Put a scene into MuJoCo, which is imported only where it is needed."""
     if not isinstance(scene.structure, Model):
         kind = type(scene.structure).__name__
         raise ModelError([f"{kind} says nothing about shapes, so there are no pictures of it"])
@@ -52,10 +48,6 @@ def _visible(scene: Scene) -> VisibleModel:
 
 def shapes_of(scene: Scene, *, goals: bool = True) -> Shapes:
     """Collect everything that is seen, goals last, whatever backend steps the scene.
-
-    Args:
-        scene: What to show.
-        goals: Whether to show the goals.
 
     Raises:
         ModelError: The structure says nothing about shapes.
@@ -68,13 +60,6 @@ def background_of(scene: Scene, *, obstacles: bool = True) -> Shapes:
     """Collect what pictures of the goals of a scene show: nothing that moves.
 
     In scenes whose structure has ``Views``, these say what is shown besides the goals.
-
-    Args:
-        scene: Whose goals to show.
-        obstacles: Whether obstacles are wanted, where there are any.
-
-    Raises:
-        ModelError: The structure says nothing about shapes.
     """
     views = views_of(scene.structure)
     shown, hidden = (scene, None) if views is None else views.background(scene, obstacles)

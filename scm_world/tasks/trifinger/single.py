@@ -260,7 +260,7 @@ class Pushing(OneBlock):
         fraction=1.0,
     )
     paper_weights = {"reward.orientation": 0.0}  # noqa: RUF012 # a constant
-    goal_causes = (f"{GOAL}.polar", f"{GOAL}.euler_orientation")
+    goal_causes: tuple[str, ...] = (f"{GOAL}.polar", f"{GOAL}.euler_orientation")
 
     def __init__(
         self,
