@@ -50,7 +50,6 @@ def test_texts_of_something_else_are_refused(kind: str, text: str) -> None:
         TEXTS[kind](text)
 
 
-MESH = """<mujoco><asset><mesh name="it" file="{}"/></asset><worldbody/></mujoco>"""
 INCLUDE = """<mujoco><include file="{}"/><worldbody/></mujoco>"""
 
 
@@ -73,7 +72,6 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "dataset": ("", lambda path: dataset_of(path.parent)),
     "settings": (".csv", lambda path: read_protocol(path, World("pushing", backend="fake").model)),
     "model": (".xml", read_model),
-    "mesh": (".stl", lambda path: _named_by(MESH, path)),
     "included": (".xml", lambda path: _named_by(INCLUDE, path)),
     "shape": (".stl", load_hull),
 }
