@@ -243,17 +243,9 @@ class Difference:
 
 
 def complete(now: Scene, structure: Structure, difference: Difference) -> Difference:
-    """Fill in what a change of structure leaves unsaid.
+    """Fill in the parameters and the state that a change to another structure leaves unsaid.
 
     Bodies that stay keep their parameters and their state, new ones get the defaults.
-
-    Args:
-        now: The scene before.
-        structure: The structure after.
-        difference: A change to that structure, with only some parameters, or without a state.
-
-    Returns:
-        The same change with all parameters and a state.
     """
     default = structure.default_scene()
     stays = {key: value for key, value in now.parameters.items() if key in default.parameters}

@@ -80,12 +80,7 @@ class BulletBackend(Backend):
         return self._holding(self._at.world, self._at.now.parameters)
 
     def _holding(self, world: Step | Instant, parameters: Parameters) -> Client:
-        """Return a client in a world, with the parameters that its live bodies took on since.
-
-        Raises:
-            Infeasible: Nothing can move with the parameters. Nothing has changed.
-            EngineFailure: The engine refused.
-        """
+        """Return a client in a world, with the parameters that its live bodies took on since."""
         at: Record | None = vars(self).get("_at")
         client = next((one for one in self._clients if one.holds is world), None)
         try:
@@ -126,14 +121,7 @@ class BulletBackend(Backend):
         self._at = Record(world, world, world, world)
 
     def apply(self, difference: Difference) -> None:
-        """Change structure, parameters and state without advancing time.
-
-        Raises:
-            ModelError: The engine cannot honour the new structure.
-            UnknownOption: The scene has no such parameter.
-            NotIntervenable: The engine has no such parameter.
-            EngineFailure: A value is not finite, or the engine refused. The world is as it was.
-        """
+        """Change structure, parameters and state without advancing time."""
         now, structure = self._at.now, difference.structure
         state, known = now.structure.empty_state().with_vector(now.state), now.parameters
         given: Parameters = {**known, **difference.parameters}
@@ -156,11 +144,7 @@ class BulletBackend(Backend):
         self._at = replace(at, now=now, world=world)
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Read parameters back; see ``Realization.parameters``.
-
-        Raises:
-            UnknownOption: The scene has no such parameter.
-        """
+        """Read parameters back; see ``Realization.parameters``."""
         return self.client().twin.parameters(keys)
 
     def read(self, into: Any = None) -> Any:
@@ -208,11 +192,7 @@ class BulletBackend(Backend):
         return EngineSnapshot.of(self, self._at)
 
     def restore(self, snapshot: EngineSnapshot) -> None:
-        """Go back to a snapshot.
-
-        Raises:
-            SnapshotMismatch: It was taken by another engine, or another version of it.
-        """
+        """Go back to a snapshot."""
         self._at = snapshot.opened(self)
         self.client()
 

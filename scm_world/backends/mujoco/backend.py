@@ -64,12 +64,7 @@ class MujocoBackend(Backend):
         self.realization, self.slot, self._touches = now, None, None
 
     def apply(self, difference: Difference) -> None:
-        """Change structure, parameters and state without advancing time.
-
-        Raises:
-            UnknownOption: There is no such parameter. Nothing has changed.
-            Infeasible: MuJoCo could not continue with these parameters. Nothing has changed.
-        """
+        """Change structure, parameters and state without advancing time."""
         self._return()
         now, structure = self.realization, difference.structure
         if now.replay is not None and (difference.parameters or structure is not None):
@@ -130,11 +125,7 @@ class MujocoBackend(Backend):
         return EngineSnapshot.of(self, (*scene, now.numbers(), now.memory(), touches, replay))
 
     def restore(self, snapshot: EngineSnapshot) -> None:
-        """Go back to a snapshot.
-
-        Raises:
-            SnapshotMismatch: It was taken by another engine, or another version of this one.
-        """
+        """Go back to a snapshot."""
         structure, parameters, revision, numbers, memory, touches, replay = snapshot.opened(self)
         now: Realization | None = vars(self).get("realization")
         if now is None or now.revision is not revision:

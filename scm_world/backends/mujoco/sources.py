@@ -47,11 +47,7 @@ class Source:
         return hashlib.sha256(self.binary).hexdigest()
 
     def compile(self) -> mujoco.MjModel:
-        """Return the model, in arrays of its own.
-
-        Raises:
-            ModelError: Another version of MuJoCo compiled it.
-        """
+        """Return the model, in arrays of its own."""
         if self.version != mujoco.__version__:
             versions = f"{self.version}, and MuJoCo {mujoco.__version__}"
             what = f"the model was compiled by MuJoCo {versions} does not read it"
@@ -102,8 +98,7 @@ def read_source(
 ) -> tuple[Source, str, str, tuple[str, ...]]:
     """Read and compile a model; see ``reading.read_model``.
 
-    Returns:
-        The source, a name for the model, how to call it in errors, and what its compiler replaces.
+    The result is the source, a name, how to call it in errors, and what its compiler replaces.
     """
     notes, plugins = tuple[str, ...](), ""
     if isinstance(source, mujoco.MjModel):
@@ -196,11 +191,7 @@ def _included(text: str, folder: Path) -> dict[str, bytes]:
 
 @contextmanager
 def understood(where: str) -> Iterator[None]:
-    """Turn MuJoCo's complaints about a model into one error, and keep its warnings.
-
-    Raises:
-        ModelError: With what MuJoCo said.
-    """
+    """Turn MuJoCo's complaints about a model into one error, and drop its warnings."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
