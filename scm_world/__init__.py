@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from scm_world.discovery import discover
     from scm_world.env import MovingAverageAction, ScmWorldEnv
     from scm_world.errors import ScmWorldError
-    from scm_world.geometry import load_hull
+    from scm_world.geometry.hulls import load_hull
     from scm_world.queries import (
         SCM,
         At,
@@ -59,7 +59,7 @@ _HOMES = {
     "Task": "tasks",
     "TriFingerTask": "tasks",
     "discover": "discovery",
-    "load_hull": "geometry",
+    "load_hull": "geometry.hulls",
     "make_task": "tasks",
     **dict.fromkeys(
         (

@@ -13,9 +13,9 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from scm_world._types import Floats
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
-from scm_world.geometry import rotation_matrix
 from scm_world.geometry.filling import overlap_fraction
 from scm_world.geometry.hulls import Hull, hull_of, hull_overlap, load_hull
+from scm_world.geometry.rotations import rotation_matrix
 
 HERE, UPRIGHT = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
 TETRAHEDRON = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]])

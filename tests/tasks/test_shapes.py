@@ -9,12 +9,8 @@ import pytest
 from robot_scenes import box_hull
 
 from scm_world.errors import NotIntervenable
-from scm_world.geometry import (
-    from_rotation_vector,
-    quaternion_product,
-    rotation_matrix,
-)
 from scm_world.geometry.hulls import Hull, hull_of
+from scm_world.geometry.rotations import from_rotation_vector, quaternion_product, rotation_matrix
 from scm_world.tasks import PickAndPlace, Picking, Pushing
 from scm_world.tasks.trifinger import hardware
 from scm_world.variables import Draw

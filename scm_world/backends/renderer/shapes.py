@@ -23,7 +23,7 @@ from scm_world.backends.renderer.kernels import (
     draw_mesh,
     parallel_view,
 )
-from scm_world.geometry import rotation_matrix
+from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models.camera import Camera
 from scm_world.models.scene import GoalRegion, Light
 from scm_world.models.shapes import BOX, ELLIPSOID, GOAL_OPACITY, MESH, PLANE, Shapes, mesh_of
