@@ -303,31 +303,10 @@ def png(rgb: NDArray[np.uint8]) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
-@final
-@dataclass(frozen=True)
-class Convention:
-    """How pixels are laid out, and what a goal picture shows besides goals, arena and robot.
-
-    Attributes:
-        flipped: Whether the first row is the lowest one.
-        channels_last: Whether a picture has shape (h, w, 3) instead of (3, h, w).
-        goal_obstacles: Whether goal pictures show the obstacles.
-    """
-
-    flipped: bool = False
-    channels_last: bool = False
-    goal_obstacles: bool = True
-
-    def shape(self, camera: Camera) -> tuple[int, int, int]:
-        """Give the shape of a picture of a camera."""
-        h, w = camera.height, camera.width
-        return (h, w, 3) if self.channels_last else (3, h, w)
-
-
-PLAIN = Convention()
-
-ORIGINAL = Convention(flipped=True, channels_last=True, goal_obstacles=False)
-"""That of CausalWorld 1.2. Together with ``ORIGINAL_CAMERAS`` pictures are upright and mirrored."""
+def shape_of_pixels(camera: Camera, *, published: bool) -> tuple[int, int, int]:
+    """Return the shape of what ``camera_pixels`` writes for a camera."""
+    h, w = camera.height, camera.width
+    return (h, w, 3) if published else (3, h, w)
 
 
 def camera_pixels(
@@ -336,7 +315,7 @@ def camera_pixels(
     out: Colors,
     *,
     goals: bool = False,
-    convention: Convention = PLAIN,
+    published: bool = False,
 ) -> None:
     """Draw what cameras see now, without goals and shadows, or what they should see.
 
@@ -347,9 +326,11 @@ def camera_pixels(
     Args:
         scene: What to show; the state does not matter to the goals.
         cameras: Where from; all with pictures of one size.
-        out: Where to write, uint8 of shape (n, 3, h, w), or (n, h, w, 3) with channels last.
+        out: Where to write, uint8 of shape (n, 3, h, w), or (n, h, w, 3) if published.
         goals: Whether to show the goals.
-        convention: How pixels are laid out, and whether the goals' pictures show obstacles.
+        published: Whether pixels are laid out as in CausalWorld 1.2, channels last and the lowest
+            row first; its pictures of goals leave obstacles out. With the published cameras they
+            are upright and mirrored.
 
     Raises:
         ValueError: ``out`` has another shape or another dtype.
@@ -367,15 +348,16 @@ def camera_pixels(
     """
     if out.dtype != np.uint8:
         raise ValueError(f"out: expected dtype uint8, got {out.dtype}")
-    for shape in {convention.shape(camera) for camera in cameras} or {(0, 0, 0)}:
+    for shape in {shape_of_pixels(camera, published=published) for camera in cameras} or {
+        (0, 0, 0)
+    }:
         if out.shape != (len(cameras), *shape):
             raise ValueError(f"out: expected shape {(len(cameras), *shape)}, got {out.shape}")
     if goals:
-        shapes = background_of(scene, obstacles=convention.goal_obstacles)
+        shapes = background_of(scene, obstacles=not published)
     else:
         shapes = shapes_of(scene, goals=False)
     parts = parted(shapes, shadows=False)
     for picture, camera in zip(out, cameras, strict=True):
         rgb = draw_parts(parts, camera, scene.light).rgb
-        rows = rgb[:, ::-1] if convention.flipped else rgb
-        picture[:] = rows.transpose(1, 2, 0) if convention.channels_last else rows
+        picture[:] = rgb[:, ::-1].transpose(1, 2, 0) if published else rgb
