@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, Capabilities, ContactPoint, EngineSnapshot
-from scm_world.backends.bullet.client import Client, Instant, SavedState, Step
+from scm_world.backends.bullet.client import Client, Instant, Past, SavedState
 from scm_world.backends.bullet.engine import load
 from scm_world.backends.bullet.honoured import accepted, settle, supports
 from scm_world.errors import EngineFailure, Infeasible
@@ -26,7 +26,7 @@ class Record:
     """What a backend holds, and its snapshot.
 
     Attributes:
-        past: The last step, or the canonical world if there was none since.
+        past: All up to the last step.
         last: The world after it.
         now: The world with what was changed since.
         world: That from which live bodies come to the present by taking on parameters alone: the
@@ -34,10 +34,10 @@ class Record:
         saved: The engine's own state after the last step, if one was kept.
     """
 
-    past: Step | Instant
+    past: Past
     last: Instant
     now: Instant
-    world: Step | Instant
+    world: Past
     saved: SavedState | None = None
 
 
@@ -79,7 +79,7 @@ class BulletBackend(Backend):
         """Return the client that holds the present."""
         return self._holding(self._at.world, self._at.now.parameters)
 
-    def _holding(self, world: Step | Instant, parameters: Parameters) -> Client:
+    def _holding(self, world: Past, parameters: Parameters) -> Client:
         """Return a client in a world, with the parameters that its live bodies took on since."""
         at: Record | None = vars(self).get("_at")
         client = next((one for one in self._clients if one.holds is world), None)
@@ -116,9 +116,10 @@ class BulletBackend(Backend):
         same = "_at" in vars(self) and structure == self.structure
         known = self._at.now.parameters if same else {}
         parameters = accepted(structure, scene.parameters, known)
-        world = Instant(structure, parameters, settle(structure, scene.state))
+        now = Instant(structure, parameters, settle(structure, scene.state))
+        world = Past(now)
         self._holding(world, parameters)
-        self._at = Record(world, world, world, world)
+        self._at = Record(world, now, now, world)
 
     def apply(self, difference: Difference) -> None:
         """Change structure, parameters and state without advancing time."""
@@ -134,11 +135,10 @@ class BulletBackend(Backend):
         if difference.state is not None:
             vector = settle(structure, difference.state, state)
         now = Instant(structure, parameters, vector)
-        at = self._at
-        world: Step | Instant = now
+        at, world = self._at, Past(now)
         if now.differs_lightly(at.last):
             world = at.past
-        elif isinstance(at.world, Instant) and now.differs_lightly(at.world):
+        elif not at.world.steps and now.differs_lightly(at.world.start):
             world = at.world
         self._holding(world, parameters)
         self._at = replace(at, now=now, world=world)
@@ -164,15 +164,15 @@ class BulletBackend(Backend):
         if substeps < 1:
             return
         at, client, now = self._at, self.client(), self._at.now
-        past = at.past if at.world is at.past else now
+        past = at.past if at.world is at.past else Past(now)
         try:
             client.step(numbers, substeps)
             state = client.read()
         except Exception as error:
             self._drop(client)  # torques that were not stepped would count twice
             raise EngineFailure(f"Bullet could not step: {error}", self.name) from error
-        total = substeps + (past.total if isinstance(past, Step) else 0)
-        client.holds = past = Step(past, now.parameters, numbers, substeps, total)
+        steps = *past.steps, (now.parameters, numbers, substeps)
+        client.holds = past = Past(past.start, steps)
         last = Instant(now.structure, now.parameters, state)
         self._at = Record(past, last, last, past)
 
@@ -185,7 +185,7 @@ class BulletBackend(Backend):
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""
         at = self._at
-        if isinstance(at.past, Step) and at.past.total >= LONG and at.saved is None:
+        if at.saved is None and sum(substeps for *_, substeps in at.past.steps) >= LONG:
             for client in self._clients:
                 if client.holds is at.past:
                     self._at = replace(at, saved=client.save())
