@@ -150,5 +150,5 @@ def test_installed_packages_declare_backends(monkeypatch: pytest.MonkeyPatch) ->
     assert isinstance(make_backend("declared"), Twin)
     wrong = EntryPoint("wrong", "math:pi", "scm_world.backends")
     monkeypatch.setattr("scm_world.backends._declared", lambda: {"wrong": wrong})
-    with pytest.raises(ModelError, match="'wrong'.* does not make a Backend"):
+    with pytest.raises(ModelError, match=r"'wrong'.* does not make a Backend"):
         make_backend("wrong")
