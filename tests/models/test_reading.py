@@ -639,16 +639,6 @@ def test_plugins_are_refused_by_name() -> None:
         read_model(text)
 
 
-def test_callbacks_are_refused() -> None:
-    """What a callback acts on is unknown."""
-    mujoco.set_mjcb_control(lambda mj, data: None)
-    try:
-        with pytest.raises(ModelError, match=r"call mujoco.set_mjcb_control\(None\)"):
-            read_model(PENDULUM)
-    finally:
-        mujoco.set_mjcb_control(None)
-
-
 def test_flexes_act_without_variables() -> None:
     """Their vertices are states, their material is mentioned in a note."""
     model = read_model(

@@ -59,7 +59,7 @@ class BulletBackend(Backend):
 
     name: ClassVar[str] = "bullet"
     capabilities: ClassVar[Capabilities] = Capabilities(
-        supports=supports, remarks=lambda backend, before: backend.client().remarks(before)
+        supports=supports, remarks=lambda backend, before: backend.client().twin.remarks(before)
     )
 
     _at: Record

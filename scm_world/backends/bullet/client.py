@@ -354,22 +354,6 @@ class Client:
         )
         return self._pulled.union(mj.body_treeid[np.concatenate(bodies)].tolist())
 
-    def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """List which frictions were changed without an effect; see ``shares``."""
-        twin, found = self.twin, list[str]()
-        now = shares(twin.model, self._dynamic, self._usual)
-        for key, old in before.items():
-            if key[1] == "friction":
-                present = twin.kept[key]
-                twin.edit({key: old})
-                if np.array_equal(shares(twin.model, self._dynamic, self._usual), now):
-                    found.append(
-                        f"{'.'.join(key)} has no effect: the larger coefficient of two shapes "
-                        "counts, and those of the others are larger"
-                    )
-                twin.edit({key: present})
-        return tuple(found)
-
     def _needs_joints_alone(self) -> bool:
         """Return whether forces follow from coordinates of joints, and no damper is implicit."""
         mj = self.twin.model

@@ -17,7 +17,6 @@ from scm_world.backends.base import (
 )
 from scm_world.backends.mujoco.batch import MujocoBatch, Slot
 from scm_world.backends.mujoco.contacts import Touches
-from scm_world.backends.mujoco.reading import callbacks
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.errors import EngineFailure
 from scm_world.models.scene import (
@@ -98,12 +97,10 @@ class MujocoBackend(Backend):
         """Hold a command for some physics steps.
 
         Raises:
-            EngineFailure: Also where memory did not suffice, or a callback of the user is in use.
+            EngineFailure: Also where memory did not suffice.
         """
         if self.slot is not None:
             self._return()
-        if found := callbacks():
-            raise EngineFailure("; ".join(found), self.name)
         self._touches = None
         if problem := self.realization.step(command, substeps):
             raise EngineFailure(problem, self.name)
