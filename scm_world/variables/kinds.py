@@ -302,8 +302,10 @@ class Derived(Variable):
         mechanism: The function.
         noise: Distribution of its own noise, or None. The mechanism takes it as ``noise=``.
         noise_shape: Shape of the noise; that of the variable if None.
-        inverse_noise: The function from a value of this variable, and those of the parents, to its
-            noise. ``SCM.counterfactual`` needs it where it cannot invert the mechanism itself.
+        inverse_noise: How the noise follows from a value of this variable and those of the parents,
+            for ``SCM.counterfactual``: ``"additive"`` where the function adds it, ``"monotone"``
+            where each component rises or falls with its own noise, or a function of the value and
+            the parents. It is known of ``Linear``, of a ``Table``, and of a discrete noise.
         start: The value that lagged children see before the first step.
         inverse: For other coordinates of one quantity (cylindrical for Cartesian): the function
             from a value of this variable to the one of its only parent. An intervention on this
@@ -317,7 +319,7 @@ class Derived(Variable):
     noise_shape: tuple[int, ...] | None = None
     start: AsNumber = 0.0
     inverse: AsMechanism | None = None
-    inverse_noise: AsMechanism | None = None
+    inverse_noise: Literal["additive", "monotone"] | AsMechanism | None = None
 
     @property
     def all_parents(self) -> tuple[Parent, ...]:
@@ -354,6 +356,9 @@ class Derived(Variable):
         check_order(self.name, self.inverse_noise, names(self.parents), before=1)
         if self.noise is None and (self.noise_shape is not None or self.inverse_noise is not None):
             raise ValueError(f"{self.name}: noise_shape and inverse_noise need a noise")
+        alike = self.noise_shape in (None, self.shape)
+        if isinstance(self.inverse_noise, str) and not alike:
+            raise ValueError(f"{self.name}: {self.inverse_noise} noise has the shape of the value")
         return self
 
 
