@@ -11,7 +11,7 @@ from typing import Any, final
 from scm_world._arguments import one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
-from scm_world.errors import BudgetExhausted, Forbidden, UnknownOption
+from scm_world.errors import Forbidden, UnknownOption
 from scm_world.queries.outcomes import Outcome, column
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Samples, Setting, sample
@@ -145,8 +145,7 @@ class Laboratory:
         """Observe new episodes.
 
         Raises:
-            Forbidden: This question is not allowed.
-            BudgetExhausted: There are fewer episodes left.
+            Forbidden: This question is not allowed, or fewer episodes are left.
         """
         return self._experiment("see", {}, n)
 
@@ -158,8 +157,8 @@ class Laboratory:
             n: How many episodes.
 
         Raises:
-            Forbidden: This question is not allowed, or something may not be set.
-            BudgetExhausted: There are fewer episodes left.
+            Forbidden: This question is not allowed, something may not be set, or fewer episodes are
+                left.
             InterventionError: The intervention was refused. That costs nothing if it could be seen
                 beforehand, else all the episodes.
         """
@@ -180,7 +179,6 @@ class Laboratory:
 
         Raises:
             Forbidden: As in ``do``, or the unit was never seen.
-            BudgetExhausted: No episode is left.
         """
         with self._lock:
             self._permit("counterfactual", request, 1)
@@ -213,8 +211,7 @@ class Laboratory:
 
         Raises:
             UnknownOption: A cell is no number.
-            Forbidden: As in ``do``; before anything is carried out.
-            BudgetExhausted: Likewise, for the whole table.
+            Forbidden: As in ``do``, for the whole table, before anything is carried out.
         """
         rows = [
             ("do" if request else "see", request, n)
@@ -285,7 +282,7 @@ class Laboratory:
     def _afford(self, n: int) -> None:
         left = self.remaining
         if left is not None and n > left:
-            raise BudgetExhausted(n, left)
+            raise Forbidden(f"run {n} more episodes", [f"{left} episodes"])
 
 
 def _matching(option: str, patterns: Iterable[str], names: Sequence[str]) -> tuple[str, ...]:

@@ -15,7 +15,6 @@ import pytest
 
 from scm_world.errors import (
     ActionError,
-    BudgetExhausted,
     Forbidden,
     InterventionError,
     ModelError,
@@ -223,7 +222,7 @@ def test_threads_share_one_budget(world: World) -> None:
     def ask() -> None:
         try:
             lab.do({FLOOR: 0.3}, 2)
-        except BudgetExhausted as error:
+        except Forbidden as error:
             refused.append(error)
 
     threads = [threading.Thread(target=ask) for _ in range(4)]

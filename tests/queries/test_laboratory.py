@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from scm_world.errors import (
-    BudgetExhausted,
     Forbidden,
     InterventionError,
     UnknownOption,
@@ -49,14 +48,14 @@ def test_the_budget_is_never_exceeded() -> None:
     """What costs more than is left is refused before it begins."""
     mine = lab(budget=5)
     mine.see(3)
-    with pytest.raises(BudgetExhausted, match="2 are left"):
+    with pytest.raises(Forbidden, match="run 3 more episodes; allowed: 2 episodes"):
         mine.do({"floor_friction": 0.3}, n=3)
-    with pytest.raises(BudgetExhausted):
+    with pytest.raises(Forbidden):
         mine.run([{"floor_friction": 0.3}] * 3)
     assert mine.spent == 3
     mine.counterfactual(1, {"floor_friction": 0.3})
     mine.do({"floor_friction": 0.3})
-    with pytest.raises(BudgetExhausted):
+    with pytest.raises(Forbidden):
         mine.counterfactual(1, {})
 
 
