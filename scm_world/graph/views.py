@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import product
 from typing import Any
 
 import networkx as nx
@@ -11,6 +10,7 @@ import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable
+from scm_world.graph.ancestral import window
 from scm_world.graph.exchange import to_digraph
 from scm_world.graph.scm import SCM
 
@@ -68,44 +68,20 @@ def window_of(graph: nx.MultiDiGraph) -> nx.DiGraph:
         Verma and Pearl, *Equivalence and synthesis of causal models*, UAI 1990, for projections;
         a clique of bidirected edges separates as one common cause does.
     """
-    past = _past_of(graph)
+    past, place = _past_of(graph), {name: number for number, name in enumerate(graph)}
+    edges = np.zeros((past + 1, len(place), len(place)), dtype=bool)  # lag, cause, effect
+    for cause, effect, lag in graph.edges(keys=True):
+        edges[lag, place[cause], place[effect]] = True
+    for name in _held(graph) if past else ():
+        edges[1, place[name], place[name]] = True
+    _, shared = window(edges, np.zeros_like(edges), past)
+    nodes = [(name, slice_) for slice_ in range(-past, 1) for name in graph]
+    pairs = nx.Graph((nodes[i], nodes[j]) for i, j in np.argwhere(np.triu(shared)).tolist())
     made = slices_of(graph, past + 1)
-    for number, effects in enumerate(_with_common_past(graph, past), start=1):
+    for number, effects in enumerate(sorted(map(sorted, nx.find_cliques(pairs))), start=1):
         made.add_node(("past", number), observed="no")
         made.add_edges_from((("past", number), effect) for effect in effects)
     return made
-
-
-def _with_common_past(graph: nx.MultiDiGraph, past: int) -> list[list[tuple[str, int]]]:
-    """List the largest sets of nodes of which each two have a cause before slice ``-past``."""
-    place = {name: number for number, name in enumerate(graph)}
-    edges = np.zeros((past + 1, len(place), len(place)), dtype=np.float32)  # lag, cause, effect
-    for cause, effect, lag in graph.edges(keys=True):
-        edges[lag, place[cause], place[effect]] = 1.0
-    for name in _held(graph) if past else ():
-        edges[1, place[name], place[name]] = 1.0
-    # common[d][x, y]: x and the y of d steps before have an ancestor in common, or are in line
-    common = np.zeros_like(edges)
-    common[0] = np.eye(len(place))
-
-    def shared(apart: int) -> Any:
-        return common[apart] if apart >= 0 else common[-apart].T
-
-    known = -1.0
-    while known != (known := float(common.sum(dtype=np.float64))):
-        for apart, lag in product(range(past + 1), repeat=2):  # the later of the two steps back
-            common[apart][edges[lag].T @ shared(apart - lag) > 0.0] = 1.0
-        common[0] = np.maximum(common[0], common[0].T)
-    nodes = [(name, slice_) for slice_ in range(-past, 1) for name in graph]
-    before = np.zeros((past, len(nodes), len(place)), dtype=np.float32)  # steps, effect, cause
-    for row, (name, slice_) in enumerate(nodes):
-        for steps in range(1, -slice_ + 1):
-            before[steps - 1, row] = edges[past + slice_ + steps, :, place[name]]
-    joined = np.zeros((len(nodes), len(nodes)), dtype=bool)
-    for first, second in product(range(past), repeat=2):
-        joined |= before[first] @ shared(second - first) @ before[second].T > 0.0
-    pairs = nx.Graph((nodes[i], nodes[j]) for i, j in np.argwhere(np.triu(joined, 1)).tolist())
-    return sorted(sorted(clique) for clique in nx.find_cliques(pairs))
 
 
 def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
@@ -125,7 +101,7 @@ def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
         UnknownOption: The source is no graph.
     """
     graph, made = to_digraph(source), nx.DiGraph()
-    held, past, window = _held(graph), _past_of(graph), window_of(graph)
+    held, past, slices = _held(graph), _past_of(graph), window_of(graph)
 
     def named(node: tuple[str, int]) -> str:
         name, slice_ = node
@@ -133,10 +109,10 @@ def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
             return f"past_{slice_}@-{past + 1}"
         return f"{name}@{'=' if name in held else ''}{slice_}" if slice_ else name
 
-    for node in sorted(window, key=lambda node: (node[1] > 0, abs(node[1]))):  # the present first
-        data = graph.nodes.get(node[0], {}) if node[1] <= 0 else window.nodes[node]
+    for node in sorted(slices, key=lambda node: (node[1] > 0, abs(node[1]))):  # the present first
+        data = graph.nodes.get(node[0], {}) if node[1] <= 0 else slices.nodes[node]
         made.add_node(named(node), **{k: v for k, v in data.items() if k == "observed"})
-    made.add_edges_from((named(cause), named(effect)) for cause, effect in window.edges)
+    made.add_edges_from((named(cause), named(effect)) for cause, effect in slices.edges)
     if not nx.is_directed_acyclic_graph(made):
         cycle = [cause for cause, _ in nx.find_cycle(made)]
         path = " → ".join([*cycle, cycle[0]])

@@ -13,15 +13,15 @@ from scm_world.variables.spaces import (
     Box,
     Categories,
     Either,
-    Frozen,
     Integers,
     Rotations,
+    Source,
     refuse_infinite,
 )
 
 
 @final
-class Normal(Frozen):
+class Normal(Source):
     """The normal distribution, component by component.
 
     Attributes:
@@ -38,10 +38,6 @@ class Normal(Frozen):
 
     def __init__(self, mean: float = 0.0, std: float = 1.0, **fields: Any) -> None:
         super().__init__(mean=mean, std=std, **fields)
-
-    def parents(self) -> frozenset[str]:
-        """Name the variables that it depends on: there are none."""
-        return frozenset()
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
         """Count the uniform numbers that one draw takes: two for each component."""
@@ -60,7 +56,7 @@ class Normal(Frozen):
 
 
 @final
-class Cylinder(Frozen):
+class Cylinder(Source):
     """Uniform over the volume of a box in cylindrical coordinates (radius, angle, …).
 
     A box of cylindrical coordinates, drawn component by component, crowds its points near the
@@ -88,10 +84,6 @@ class Cylinder(Frozen):
         """Name the variables that the corners depend on."""
         return self.box.parents()
 
-    def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes."""
-        return self.box.n_uniforms(shape)
-
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
         """Turn uniform numbers into points, the radius first."""
         low, high = self.box.bounds(shape, values)
@@ -106,7 +98,7 @@ class Cylinder(Frozen):
 
 
 @final
-class Continuous(Frozen):
+class Continuous(Source):
     """A continuous distribution of scipy, by its name there, component by component.
 
     ``Laplace``, ``Exponential``, ``Gamma``, ``StudentT`` and ``Gumbel`` make the usual ones.
@@ -149,14 +141,6 @@ class Continuous(Frozen):
         self.frozen.support()
         return self
 
-    def parents(self) -> frozenset[str]:
-        """Name the variables that it depends on: there are none."""
-        return frozenset()
-
-    def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes: one for each component."""
-        return int(np.prod(shape))
-
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
         """Turn uniform numbers into quantiles."""
         inside = uniforms.reshape(*uniforms.shape[:-1], *shape) + 2.0**-54  # never 0
@@ -193,7 +177,7 @@ def Gumbel(loc: float = 0.0, scale: float = 1.0) -> Continuous:  # noqa: N802
 
 
 @final
-class Discrete(Frozen):
+class Discrete(Source):
     """A few numbers, each with a probability, component by component.
 
     ``Bernoulli``, ``Categorical`` and ``Empirical`` make the usual ones.
@@ -230,14 +214,6 @@ class Discrete(Frozen):
         """The probability of each value, shape (n,)."""
         n = len(self.values)
         return np.full(n, 1.0 / n) if self.probabilities is None else np.array(self.probabilities)
-
-    def parents(self) -> frozenset[str]:
-        """Name the variables that it depends on: there are none."""
-        return frozenset()
-
-    def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes: one for each component."""
-        return int(np.prod(shape))
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
         """Turn uniform numbers into values."""

@@ -324,10 +324,6 @@ class Linear(Frozen):
 
         return linear
 
-    def is_portable(self) -> bool:
-        """Tell that numbers can always be written down."""
-        return True
-
 
 @final
 class Concatenation(Frozen):
@@ -354,39 +350,25 @@ class Concatenation(Frozen):
         ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)]).tolist()
         return tuple(slice(first, last) for first, last in pairwise(ends))
 
-    def bind(self) -> Joined:
-        """Give the function of the parents."""
-        return Joined(self.shapes)
+    def bind(self) -> Callable[..., Any]:
+        """Return the function that puts values together, shape ``(..., n)``; leads broadcast."""
+        shapes = self.shapes
+
+        def joined(*parts: Value) -> Value:
+            ends = [np.ndim(part) - len(s) for part, s in zip(parts, shapes, strict=True)]
+            leads = [np.shape(part)[:end] for part, end in zip(parts, ends, strict=True)]
+            flat = [np.reshape(part, (*lead, -1)) for part, lead in zip(parts, leads, strict=True)]
+            whole = np.broadcast_shapes(*leads)
+            full = (np.broadcast_to(each, (*whole, each.shape[-1])) for each in flat)
+            return np.concatenate([*full], axis=-1)
+
+        return joined
 
     def split(self, value: Value) -> tuple[Value, ...]:
         """Give the values of the parents; the numbers are the last axis of the value."""
         lead = np.shape(value)[:-1]
         both = zip(self.shapes, self.slices, strict=True)
         return tuple(np.asarray(value[..., at]).reshape((*lead, *shape)) for shape, at in both)
-
-    def is_portable(self) -> bool:
-        """Tell that shapes can always be written down."""
-        return True
-
-
-@final
-class Joined:
-    """The function of a bundle.
-
-    Args:
-        shapes: Of the parts.
-    """
-
-    def __init__(self, shapes: tuple[tuple[int, ...], ...]) -> None:
-        self._shapes = shapes
-
-    def __call__(self, *parts: Value) -> Value:
-        """Put values together, shape ``(..., n)``; leading axes broadcast."""
-        ends = [np.ndim(part) - len(s) for part, s in zip(parts, self._shapes, strict=True)]
-        leads = [np.shape(part)[:end] for part, end in zip(parts, ends, strict=True)]
-        flat = [np.reshape(part, (*lead, -1)) for part, lead in zip(parts, leads, strict=True)]
-        whole = np.broadcast_shapes(*leads)
-        return np.concatenate([np.broadcast_to(f, (*whole, f.shape[-1])) for f in flat], axis=-1)
 
 
 @final
@@ -460,10 +442,6 @@ class Table(Frozen):
             return values[(ends <= np.asarray(noise)[..., None]).sum(axis=-1)]
 
         return category
-
-    def is_portable(self) -> bool:
-        """Tell that numbers can always be written down."""
-        return True
 
 
 Equation = Annotated[Function | Linear | Concatenation | Table, Field(discriminator="kind")]

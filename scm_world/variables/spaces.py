@@ -177,22 +177,24 @@ def _widened(low: Floats, high: Floats) -> tuple[Floats, Floats]:
     return low - TOLERANCE * np.abs(low), high + TOLERANCE * np.abs(high)
 
 
-class _Space(Frozen):
+class Source(Frozen):
+    """Anything that values are drawn from: a space, or a distribution."""
+
     if TYPE_CHECKING:  # as in ``Frozen``
 
         def __init__(self, **fields: Any) -> None: ...
 
     def parents(self) -> frozenset[str]:
-        """Name the variables that the bounds depend on."""
+        """Return the names of the variables that it depends on."""
         return frozenset()
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes."""
+        """Return how many uniform numbers one draw takes: one for each component."""
         return prod(shape)
 
 
 @final
-class Box(_Space):
+class Box(Source):
     """All points between two corners, both included.
 
     Attributes:
@@ -235,7 +237,7 @@ class Box(_Space):
         return frozenset(_parents(self.low, self.high))
 
     def parents(self) -> frozenset[str]:
-        """Name the variables that the bounds depend on."""
+        """Return the names of the variables that the bounds follow."""
         return self._followed
 
     def bounds(self, shape: tuple[int, ...], values: Values) -> tuple[Floats, Floats]:
@@ -310,7 +312,7 @@ def refuse_infinite(option: str, region: Any) -> None:
 
 
 @final
-class Integers(_Space):
+class Integers(Source):
     """All whole numbers between two ends, both included.
 
     Example:
@@ -357,7 +359,7 @@ class Integers(_Space):
 
 
 @final
-class Categories(_Space):
+class Categories(Source):
     """A few whole numbers, without an order, which may have labels.
 
     Attributes:
@@ -431,7 +433,7 @@ _Part = Annotated[Box | Integers | Categories, Field(discriminator="kind")]
 
 
 @final
-class Either(_Space):
+class Either(Source):
     """The union of two spaces: not their hull. A draw is uniform over both.
 
     Example:
@@ -448,7 +450,7 @@ class Either(_Space):
         super().__init__(first=first, second=second, **fields)
 
     def parents(self) -> frozenset[str]:
-        """Name the variables that the bounds depend on."""
+        """Return the names of the variables that the bounds follow."""
         return self.first.parents() | self.second.parents()
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
@@ -465,7 +467,7 @@ class Either(_Space):
         return self.first.volume(shape, values) + self.second.volume(shape, values)
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes: one decides which of the two."""
+        """Return how many uniform numbers one draw takes: one decides which of the two."""
         return 1 + max(self.first.n_uniforms(shape), self.second.n_uniforms(shape))
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
@@ -485,7 +487,7 @@ class Either(_Space):
 
 
 @final
-class Rotations(_Space):
+class Rotations(Source):
     """All unit quaternions (x, y, z, w); q and -q are one rotation, written with w >= 0.
 
     Attributes:
@@ -518,7 +520,7 @@ class Rotations(_Space):
         return np.asarray(float(np.pi**2))
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes."""
+        """Return how many uniform numbers one draw takes: three."""
         return 3
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
