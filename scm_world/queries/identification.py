@@ -62,7 +62,7 @@ def nature_graph(
     *,
     contact: bool = True,
 ) -> nx.DiGraph:
-    """Give the static graph of an episode in which nature does something at the beginning.
+    """Return the static graph of an episode in which nature does something at the beginning.
 
     Args:
         model: Of the world.

@@ -152,17 +152,17 @@ class Continuous(Source):
 
 
 def Laplace(loc: float = 0.0, scale: float = 1.0) -> Continuous:  # noqa: N802 # a distribution
-    """Give the Laplace distribution; its standard deviation is √2 times the scale."""
+    """Return the Laplace distribution; its standard deviation is √2 times the scale."""
     return Continuous("laplace", loc=loc, scale=scale)
 
 
 def Exponential(scale: float = 1.0, loc: float = 0.0) -> Continuous:  # noqa: N802
-    """Give the exponential distribution, whose mean is the scale (plus ``loc``)."""
+    """Return the exponential distribution, whose mean is the scale (plus ``loc``)."""
     return Continuous("expon", loc=loc, scale=scale)
 
 
 def Gamma(shape: float, scale: float = 1.0, loc: float = 0.0) -> Continuous:  # noqa: N802
-    """Give the gamma distribution, whose mean is shape times scale (plus ``loc``)."""
+    """Return the gamma distribution, whose mean is shape times scale (plus ``loc``)."""
     return Continuous("gamma", a=shape, loc=loc, scale=scale)
 
 
@@ -172,7 +172,7 @@ def StudentT(df: float, loc: float = 0.0, scale: float = 1.0) -> Continuous:  # 
 
 
 def Gumbel(loc: float = 0.0, scale: float = 1.0) -> Continuous:  # noqa: N802
-    """Give the Gumbel distribution of maxima."""
+    """Return the Gumbel distribution of maxima."""
     return Continuous("gumbel_r", loc=loc, scale=scale)
 
 
@@ -239,7 +239,7 @@ def Categorical(probabilities: Any, values: Any = None) -> Discrete:  # noqa: N8
 
 
 def Empirical(sample: Any) -> Discrete:  # noqa: N802
-    """Give the numbers of a sample, each as often as it is there."""
+    """Return the numbers of a sample, each as often as it is there."""
     return Discrete(np.ravel(np.asarray(sample, dtype=float)))
 
 

@@ -136,7 +136,7 @@ def _as_parents(value: Any, validate: Callable[[Any], Any]) -> Any:
 
 @lru_cache(maxsize=2**14)
 def parent_of(name: str, lag: int = 0, when: str | None = None) -> Parent:
-    """Give an edge; many variables have the same ones, which are one object then."""
+    """Return an edge; many variables have the same ones, which are one object then."""
     return Parent(name, lag, when)
 
 
@@ -198,7 +198,7 @@ class Variable(Frozen):
         return np.asarray(value, dtype=kind).reshape(self.shape)
 
     def space(self, name: SpaceName) -> Space | None:
-        """Give one of the declared spaces, or their union; None where it is not declared.
+        """Return one of the declared spaces, or their union; None where it is not declared.
 
         Whole numbers that lie in both are left out of B; of a continuum, the border stays in the
         set and is distinguished by ``in_space``.
@@ -215,7 +215,7 @@ class Variable(Frozen):
                 return Either(self.a, self.space("B")) if both else (self.a or self.b)
 
     def in_space(self, value: Value, name: SpaceName, values: Values) -> bool:
-        """Tell whether a value lies in a space, given the values of the other variables."""
+        """Return whether a value lies in a space, given the values of the other variables."""
         space = self.space(name)
         if space is None or not space.contains(value, values):
             return False

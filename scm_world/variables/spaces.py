@@ -255,7 +255,7 @@ class Box(Source):
         return _widened(low, high)
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Tell whether a value lies inside, borders included."""
+        """Return whether a value lies inside, borders included."""
         if self._widened is not None and np.ndim(value) < 2:
             low, high = self._widened
             return bool((value >= low).all() and (value <= high).all())
@@ -334,7 +334,7 @@ class Integers(Source):
         return self
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Tell whether a value is whole and lies between the ends."""
+        """Return whether a value is whole and lies between the ends."""
         whole = np.all(value == np.rint(value))
         return bool(whole and np.all(value >= self.low) and np.all(value <= self.high))
 
@@ -393,7 +393,7 @@ class Categories(Source):
         return data if self.labels else {k: v for k, v in data.items() if k != "labels"}
 
     def numbers(self, labels: Any) -> Value:
-        """Give the numbers of labels, of any shape.
+        """Return the numbers of labels, of any shape.
 
         Raises:
             KeyError: There is no such label.
@@ -403,7 +403,7 @@ class Categories(Source):
         return found.reshape(np.shape(labels))
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Tell whether every component is a member."""
+        """Return whether every component is a member."""
         return bool(np.all(np.isin(value, self.members)))
 
     def nearest(self, value: Value, values: Values | None = None) -> Value:
@@ -454,7 +454,7 @@ class Either(Source):
         return self.first.parents() | self.second.parents()
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Tell whether one of the two contains the value."""
+        """Return whether one of the two contains the value."""
         return self.first.contains(value, values) or self.second.contains(value, values)
 
     def nearest(self, value: Value, values: Values | None = None) -> Value:
@@ -502,7 +502,7 @@ class Rotations(Source):
     keeps_sign: bool = False
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Tell whether the norm is 1, to six digits."""
+        """Return whether the norm is 1, to six digits."""
         return bool(np.all(np.abs(np.linalg.norm(value, axis=-1) - 1.0) < 1e-6))
 
     def nearest(self, value: Value, values: Values | None = None) -> Value:
@@ -516,7 +516,7 @@ class Rotations(Source):
         return unit + 0.0
 
     def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
-        """Give the volume of the group, π²: half of the unit sphere in four dimensions."""
+        """Return the volume of the group, π²: half of the unit sphere in four dimensions."""
         return np.asarray(float(np.pi**2))
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
