@@ -14,7 +14,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from scm_world._types import Floats, Integers
-from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption, WrongShape
+from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption, WrongValue
 from scm_world.models.scene import (
     Difference,
     ParameterKey,
@@ -321,7 +321,7 @@ class InMemory(Backend, ABC):
             for key, value in difference.parameters.items():
                 shape = self._known(key).shape
                 if np.shape(value) != shape:
-                    raise WrongShape(".".join(key).strip("."), value, shape, np.shape(value))
+                    raise WrongValue(".".join(key).strip("."), value, shape, np.shape(value))
         self._keep(difference.parameters)
         if difference.state is not None:
             self._place(difference.state)
