@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from scm_world.discovery import discover
     from scm_world.env import MovingAverageAction, ScmWorldEnv
     from scm_world.errors import ScmWorldError
-    from scm_world.geometry import load_hull
+    from scm_world.geometry.hulls import load_hull
     from scm_world.queries import (
         SCM,
         At,
@@ -50,54 +50,17 @@ if TYPE_CHECKING:
 
 __version__ = "0.2.0"
 
-_HOMES = {
-    "MovingAverageAction": "env",
-    "ScmWorldEnv": "env",
-    "ScmWorldError": "errors",
-    "ModelTask": "tasks",
-    "StepTask": "tasks",
-    "Task": "tasks",
-    "TriFingerTask": "tasks",
-    "discover": "discovery",
-    "load_hull": "geometry",
-    "make_task": "tasks",
-    **dict.fromkeys(
-        (
-            "Action",
-            "Box",
-            "Derived",
-            "Draw",
-            "Exogenous",
-            "Fixed",
-            "Linear",
-            "Measured",
-            "Mechanism",
-            "Natural",
-            "Null",
-            "Parent",
-            "Scale",
-            "Shift",
-        ),
-        "variables",
-    ),
-    **dict.fromkeys(
-        (
-            "SCM",
-            "At",
-            "Clamp",
-            "Contact",
-            "Laboratory",
-            "On",
-            "Outcome",
-            "Plan",
-            "Reaches",
-            "World",
-            "do",
-            "verify",
-        ),
-        "queries",
-    ),
+_NAMES = {
+    "discovery": "discover",
+    "env": "MovingAverageAction ScmWorldEnv",
+    "errors": "ScmWorldError",
+    "geometry.hulls": "load_hull",
+    "queries": "SCM At Clamp Contact Laboratory On Outcome Plan Reaches World do verify",
+    "tasks": "ModelTask StepTask Task TriFingerTask make_task",
+    "variables": "Action Box Derived Draw Exogenous Fixed Linear Measured Mechanism Natural Null "
+    "Parent Scale Shift",
 }
+_HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = [
     "SCM",

@@ -8,7 +8,7 @@ from scm_world.queries.differences import ButFor, Divergence, EpisodeDifference,
 from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.estimates import Effect
-from scm_world.queries.identification import Identification, identify, nature_graph
+from scm_world.queries.identification import Identification, estimate, identify, nature_graph
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.live import LiveEpisode
 from scm_world.queries.outcomes import Outcome
@@ -50,6 +50,7 @@ __all__ = [
     "compare",
     "consequences",
     "do",
+    "estimate",
     "identify",
     "load_episode",
     "nature_graph",

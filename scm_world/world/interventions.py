@@ -15,11 +15,10 @@ from scm_world.errors import (
     ConflictingTargets,
     Infeasible,
     InterventionError,
-    NotFinite,
     NotIntervenable,
     OutOfBounds,
     UnknownVariable,
-    WrongShape,
+    WrongValue,
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey
@@ -360,7 +359,7 @@ class Solution:
             if drawn is None:
                 value = draft.model.evaluate(name, self.row, self.key)
                 if value.shape != variable.shape:  # of a mechanism that a user gave
-                    raise WrongShape(name, value, variable.shape, np.shape(value))
+                    raise WrongValue(name, value, variable.shape, np.shape(value))
             else:
                 value = drawn[0]
             check_bounds(variable, value, self.row if follows else {})
@@ -543,7 +542,7 @@ class Solution:
         found = list(self.problems)
         for name in self.asked:
             bundle = self.compiled.model.declared(name)
-            wrong = {p.variable: p for p in found if isinstance(p, OutOfBounds | NotFinite)}
+            wrong = {p.variable: p for p in found if isinstance(p, OutOfBounds | WrongValue)}
             if wrong.keys().isdisjoint(bundle.parts):
                 continue
             parts = [
@@ -754,17 +753,14 @@ def feasible(
     draft = Draft(structures, base, request, space, key, found)
     draws, problems = [n for n, act in request.items() if isinstance(act, Draw)], list[Overlap]()
     attempts: Iterator[int] = iter((0,))
-    tried, again = (
-        "",
-        [n for n in draws if n not in draft.head and draft.compiled.is_material(n)]
-        if draws and not draft.problems
-        else [],
-    )
-    if draws:
+    tried, again = "", list[str]()
+    if draws and not draft.problems:
+        matters = draft.compiled.is_material
+        again = [name for name in draws if name not in draft.head and matters(name)]
         key = replace(key, kept=frozenset(draws).difference(again))
     if again:
-        attempts, tried = _promising(draft, key, again), f"none of {ATTEMPTS:,} draws was feasible"
-        tried += "; in the last one "
+        attempts = _promising(draft, key, again)
+        tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one "
     for attempt in attempts:
         solution = Solution(draft, replace(key, attempt=attempt) if attempt else key)
         with np.errstate(all="ignore"):  # what is not finite is refused by name

@@ -18,11 +18,10 @@ from scm_world.errors import (
     CyclicModel,
     EngineFailure,
     InterventionError,
-    NotFinite,
     NotReset,
     SnapshotMismatch,
     UnknownOption,
-    WrongShape,
+    WrongValue,
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
@@ -469,9 +468,9 @@ class Simulation(WorldAttributes):
                 for target in targets:
                     value, declared = model.evaluate(target, values), model.declared(target)
                     if np.shape(value) != declared.shape:
-                        raise WrongShape(name, act, declared.shape, np.shape(value))
+                        raise WrongValue(name, act, declared.shape, np.shape(value))
                     if not np.isfinite(value).all():
-                        raise NotFinite(name, value)
+                        raise WrongValue(name, value)
             except CyclicModel:
                 continue  # refused with the reason
             except InterventionError as problem:
@@ -620,7 +619,7 @@ class Simulation(WorldAttributes):
         commands = self.composition.commands
         self.translates = commands is not None and commands.applies(self._values.row)
         self.structure = structure
-        self._substeps = max(1, round(self.control_period / structure.timestep))
+        self._substeps = max(1, round(self.control_period / float(structure.timestep)))
 
     def _adopt_model(self, model: SCM) -> None:
         self._held, held = model, model.interventions

@@ -44,7 +44,7 @@ from scm_world.errors import (
     ScmWorldError,
     UnknownOption,
     UnknownVariable,
-    WrongShape,
+    WrongValue,
 )
 from scm_world.geometry.rotations import angle_between, from_rotation_vector
 from scm_world.tasks import TASKS
@@ -309,7 +309,7 @@ def test_nonsense_is_refused_with_what_is_allowed(make: Any) -> None:
 IMPOSSIBLE: list[tuple[Any, type[ScmWorldError]]] = [
     ({"tool_blok.mass": 0.05}, UnknownVariable),
     ({MASS: -1.0}, OutOfBounds),
-    ({MASS: [0.1, 0.2]}, WrongShape),
+    ({MASS: [0.1, 0.2]}, WrongValue),
     (resample("*.mas"), UnknownVariable),
     (resample("@weights"), UnknownVariable),
     (resample("*.mass", besides="*.mas"), UnknownVariable),
@@ -320,7 +320,7 @@ IMPOSSIBLE: list[tuple[Any, type[ScmWorldError]]] = [
     (NewGoal("A", besides=["gravity"]), UnknownVariable),
     (interpolate({"tool_blok.mass": 0.1}, episodes=5), UnknownVariable),
     (interpolate({MASS: -0.1}, episodes=5), OutOfBounds),
-    (interpolate({"gravity": [0.0, 0.0]}, episodes=5), WrongShape),
+    (interpolate({"gravity": [0.0, 0.0]}, episodes=5), WrongValue),
     (during(range(9, 10), at_step(3, resample("nothing"))), UnknownVariable),
 ]
 

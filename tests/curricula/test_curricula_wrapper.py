@@ -40,7 +40,7 @@ from scm_world.env.wrappers import MovingAverageAction
 from scm_world.errors import (
     FunctionFailure,
     Infeasible,
-    OutOfSpace,
+    OutOfBounds,
     UnknownOption,
     UnreadableFile,
 )
@@ -185,13 +185,13 @@ def test_a_refused_intervention_leaves_the_environment_usable() -> None:
 def test_a_curriculum_can_be_held_against_a_space() -> None:
     """What lies outside is refused, at the reset and within the episode."""
     env = under(Curriculum({MASS: 0.09}, space={"parts": [("*.mass", "A")]}))
-    with pytest.raises(OutOfSpace):
+    with pytest.raises(OutOfBounds):
         env.reset(seed=0)
     later = under(
         Curriculum(at_step(1, {"floor_friction": 0.4}), space={"parts": [("*.mass", "A")]})
     )
     later.reset(seed=0)
-    with pytest.raises(OutOfSpace, match="not to be set"):
+    with pytest.raises(OutOfBounds, match="not to be set"):
         later.step(STILL)
 
 

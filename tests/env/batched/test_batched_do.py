@@ -14,7 +14,6 @@ from scm_world.errors import (
     InterventionError,
     NotReset,
     OutOfBounds,
-    OutOfSpace,
     SnapshotMismatch,
     UnknownOption,
 )
@@ -66,7 +65,7 @@ def test_all_worlds_are_intervened_on_or_none(pair: tuple[Any, Any]) -> None:
         with pytest.raises(OutOfBounds, match=f"environment {index}: .*mass") as caught:
             envs.do(requests)
         assert caught.value.variable == "tool_block.mass"
-    with pytest.raises(OutOfSpace, match="environment 0"):
+    with pytest.raises(OutOfBounds, match="environment 0"):
         envs.do({0: {"tool_block.mass": 0.09}}, space="A")
     assert envs.get_attr("interventions") == ((),) * SIZE
     check_same(envs.present(), untouched.present(), "present")
