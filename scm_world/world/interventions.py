@@ -270,6 +270,10 @@ class Draft:
             for names, streams, columns, low, edges in groups
         ]
 
+    def redraws(self, name: str) -> bool:
+        """Return whether a draw takes part in where bodies are; what is wrong is drawn once."""
+        return not self.problems and self.compiled.is_material(name)
+
     def drawn(self, name: str, key: NoiseKey, attempts: Iterable[int]) -> Value | None:
         """Draw a variable in several attempts; None where its space follows other variables."""
         asked, act = self.acts.get(name, (name, None))
@@ -732,7 +736,8 @@ def feasible(
 
     Bodies that intersect already (a block that is being squeezed) may continue to. What is
     drawn is drawn again until the world can be like that: from the feasible part of its space.
-    What takes no part in where bodies are is drawn once, and so is which bodies there are.
+    What takes no part in where bodies are is drawn once. Where it is drawn which bodies there are,
+    each of these draws is followed by some of the rest.
 
     Args:
         structures: Of the task.
@@ -750,45 +755,51 @@ def feasible(
         Infeasible: With the bodies, the depths, and the nearest value that is feasible; or no
             draw was.
     """
-    draft = Draft(structures, base, request, space, key, found)
-    draws, problems = [n for n, act in request.items() if isinstance(act, Draw)], list[Overlap]()
-    attempts: Iterator[int] = iter((0,))
-    tried, again = "", list[str]()
-    if draws and not draft.problems:
-        matters = draft.compiled.is_material
-        again = [name for name in draws if name not in draft.head and matters(name)]
-        key = replace(key, kept=frozenset(draws).difference(again))
-    if again:
-        attempts = _promising(draft, key, again)
-        tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one "
-    for attempt in attempts:
-        solution = Solution(draft, replace(key, attempt=attempt) if attempt else key)
-        with np.errstate(all="ignore"):  # what is not finite is refused by name
-            found = solution.solve()
-        if found:
-            raise_all(found)
-        solution.changed = now.differing(solution.row)
-        change = difference(draft.compiled, now, structure, solution.row, solution.changed)
-        problems = overlaps(draft.compiled, draft.base, now, solution.row, change, draft.asked)
-        if draws and not problems:
-            problems = _in_obstacles(solution, draws)
-        if not problems:
-            return solution, change
-        if draws and _anyhow(draft, again, problems):
-            tried = "whatever is drawn, "
-            break
+    draws = [name for name, act in request.items() if isinstance(act, Draw)]
+    deciding = structures.deciding.intersection(draws)
+    left, turn, tried = ATTEMPTS, 0, ""
+    while left > 0:
+        draft = Draft(structures, base, _drawn_anew(request, deciding, turn), space, key, found)
+        again = [name for name in draws if name not in deciding and draft.redraws(name)]
+        key = replace(key, kept=frozenset(draws).difference(again)) if draws else key
+        attempts = range(min(left, CHUNK) if deciding else ATTEMPTS) if again else range(1)
+        for attempt in _promising(draft, key, attempts, again) if again else attempts:
+            solution = Solution(draft, replace(key, attempt=attempt) if attempt else key)
+            with np.errstate(all="ignore"):  # what is not finite is refused by name
+                wrong = solution.solve()
+            if wrong:
+                raise_all(wrong)
+            solution.changed = now.differing(solution.row)
+            change = difference(draft.compiled, now, structure, solution.row, solution.changed)
+            problems = overlaps(draft.compiled, draft.base, now, solution.row, change, draft.asked)
+            if draws and not problems:
+                problems = _in_obstacles(solution, draws)
+            if not problems:
+                return solution, change
+            tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one " if draws else ""
+            if draws and _anyhow(draft, again, problems):
+                tried = tried if deciding else "whatever is drawn, "
+                break
+        left, turn = left - attempt - 1 if deciding else 0, turn + 1
     raise refusal(structures, base, now, structure, draft, problems, key, tried)
 
 
-def _promising(draft: Draft, key: NoiseKey, draws: list[str]) -> Iterator[int]:
+def _drawn_anew(request: Mapping[str, Any], names: Iterable[str], turn: int) -> Mapping[str, Any]:
+    """Give some draws of a request other noise; the first turn has that of the request."""
+    streams = {name: f"{request[name].stream or name}#{turn}" for name in names} if turn else {}
+    anew = {n: request[n].model_copy(update={"stream": own}) for n, own in streams.items()}
+    return {**request, **anew} if anew else request
+
+
+def _promising(draft: Draft, key: NoiseKey, attempts: range, draws: list[str]) -> Iterator[int]:
     """Yield the draws that may be feasible, and the last one.
 
     A draw that is left out puts two bodies in one place.
     """
     before = max((overlap.depth for overlap in _overlaps_before(draft.base)), default=0.0)
     varying = draft.compiled.reached(draws)
-    for first in range(0, ATTEMPTS, CHUNK):
-        chunk = range(first, min(first + CHUNK, ATTEMPTS))
+    for first in range(0, len(attempts), CHUNK):
+        chunk = attempts[first : first + CHUNK]
         candidates = Candidates(draft, key, chunk, varying)
         try:
             with np.errstate(all="ignore"):
@@ -797,8 +808,8 @@ def _promising(draft: Draft, key: NoiseKey, draws: list[str]) -> Iterator[int]:
             yield from chunk
         else:
             yield from candidates.attempts
-    if ATTEMPTS - 1 not in candidates.attempts:
-        yield ATTEMPTS - 1
+    if attempts[-1] not in candidates.attempts:
+        yield attempts[-1]
 
 
 def _anyhow(draft: Draft, draws: Iterable[str], problems: Iterable[Overlap]) -> bool:
