@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -25,14 +25,14 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.models import Difference, Parameters, Scene, State, Structure
+from scm_world.models import Difference, ParameterKey, Parameters, Scene, State, Structure
 from scm_world.models.camera import Camera
-from scm_world.tasks import Task
+from scm_world.tasks import Conventions, Task
+from scm_world.tasks.composition import Composition
 from scm_world.variables import Draw, Mechanism, Subset
 from scm_world.variables.checks import check_subset
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.variables.subsets import AnyRegion, as_region
-from scm_world.world.attributes import WorldAttributes
 from scm_world.world.audit import Audit, report
 from scm_world.world.compiled_task import (
     CompiledTask,
@@ -59,7 +59,7 @@ from scm_world.world.values import PresentValues
 READ_BACK = 1e-6  # how far a backend may report a number from what it was given
 
 
-class Simulation(WorldAttributes):
+class Simulation:
     """The causal model of a task, stepped by a physics backend; ``scm_world.World`` adds questions.
 
     Args:
@@ -298,6 +298,139 @@ class Simulation(WorldAttributes):
         Noise follows the steps that were taken: an intervention on ``control_index`` leaves it.
         """
         return NoiseKey(self.noise, self.episode, index - self._offset, origin=0)
+
+    # --- the task and the options -------------------------------------------------------------
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle through a snapshot: another backend, the same future bit for bit."""
+        try:
+            snapshot = self.snapshot()
+        except NotReset:
+            snapshot = None
+        options = {
+            "backend": self.backend.name,
+            "preset": self.options.preset,
+            "action_mode": self.action_mode,
+            "frame_skip": self.frame_skip,
+            "max_episode_length": self.given_length,
+            "conventions": self.conventions.name,
+            "variables_space": self.variables_space,
+        }
+        usual = self.task.choices["resolution"][0]
+        if self.resolution != usual:  # logs and files of before have none
+            options["resolution"] = self.resolution
+        return _copied, (type(self), self.structures.task, options, snapshot)
+
+    @property
+    def engine(self) -> str:
+        """Name and version of the physics engine."""
+        return f"{self.backend.name} {self.backend.version}"
+
+    @property
+    def task(self) -> Task:
+        """The task, with its present plan."""
+        return self.compiled.task
+
+    @property
+    def model(self) -> SCM:
+        """The causal model of the present structure, without interventions."""
+        return self.compiled.model
+
+    @property
+    def composition(self) -> Composition:
+        """The entities."""
+        return self.compiled.composition
+
+    @property
+    def slices(self) -> Mapping[str, slice]:
+        """Where each state stands in the state vector."""
+        return self.compiled.slices
+
+    @property
+    def parameter_keys(self) -> Mapping[str, ParameterKey]:
+        """Which physical parameter each variable sets."""
+        return self.compiled.parameter_keys
+
+    @property
+    def static_names(self) -> tuple[str, ...]:
+        """Everything that interventions alone decide, causes before effects."""
+        return self.compiled.static_names
+
+    @property
+    def computed(self) -> tuple[str, ...]:
+        """Variables that are computed from what moves, causes before effects."""
+        return self.compiled.computed
+
+    @property
+    def conventions(self) -> Conventions:
+        """Ours or the predecessor's."""
+        return self.options.conventions
+
+    @property
+    def action_mode(self) -> str:
+        """How the system is commanded."""
+        return self.options.action_mode
+
+    @property
+    def resolution(self) -> str:
+        """How finely the variables are cut."""
+        return self.options.resolution
+
+    @property
+    def frame_skip(self) -> int:
+        """Length of a control step in units of the task; 4 ms for the robot."""
+        return self.options.frame_skip
+
+    @property
+    def control_period(self) -> float:
+        """Length of a control step [s]."""
+        return self.options.control_period
+
+    @property
+    def given_length(self) -> int | None:
+        """Length of an episode in control steps, if one was given."""
+        return self.options.given_length
+
+    @property
+    def max_episode_length(self) -> int:
+        """Length of an episode in control steps."""
+        return self.structures.steps
+
+    @property
+    def action_low(self) -> Floats:
+        """Lower end of all actions, shape (n_actions,)."""
+        return self.compiled.action_bounds[0]
+
+    @property
+    def action_high(self) -> Floats:
+        """Upper end of all actions, shape (n_actions,)."""
+        return self.compiled.action_bounds[1]
+
+    @property
+    def identity(self) -> tuple[Any, ...]:
+        """What two worlds have in common if one can take up a snapshot of the other."""
+        return (*self._settings, self.structures.digest)
+
+    @property
+    def _settings(self) -> tuple[Any, ...]:
+        numbers = (self.frame_skip, self.max_episode_length)
+        options = (self.options.preset, self.action_mode, self.conventions.name)
+        usual = self.task.choices["resolution"][0]
+        finer = () if self.resolution == usual else (self.resolution,)
+        return (self.task.name, *options, *numbers, *finer)
+
+    def __fingerprint__(self) -> dict[str, Any]:
+        """Return what decides what happens here, except versions: the task, and the options."""
+        options = (self.backend.name, self.variables_space, self._settings)
+        return {**self.structures.__fingerprint__(), "options": options}
+
+    def describe(self, values: Values, state: State) -> Scene:
+        """Describe the scene that some values stand for."""
+        return self.compiled.describe(values, state)
+
+    def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
+        """Name some variables and what follows them at lag 0, without physics, causes first."""
+        return self.compiled.static_order(targets)
 
     # --- a control step -----------------------------------------------------------------------
 
@@ -758,6 +891,13 @@ class Simulation(WorldAttributes):
         if self._lost:
             advice = "reset the world, or restore a snapshot"
             raise EngineFailure(f"{self._lost}; {advice}", self.backend.name)
+
+
+def _copied(kind: Any, task: Task, options: Mapping[str, Any], snapshot: Any) -> Any:
+    world = kind(task, **options)
+    if snapshot is not None:
+        world.restore(snapshot)
+    return world
 
 
 def _copies(values: Values) -> dict[str, Value]:
