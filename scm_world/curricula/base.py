@@ -17,7 +17,7 @@ from scm_world._arguments import one_of
 from scm_world._types import Value
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, UnreadableFile
 from scm_world.graph import flatten
-from scm_world.queries.timed import as_act
+from scm_world.queries.plans import as_act
 from scm_world.variables import Draw, Function, Intervention, Noise
 from scm_world.variables.mechanisms import check_trusted
 from scm_world.variables.spaces import Frozen, problems_of

@@ -29,7 +29,6 @@ from scm_world.queries.rollouts import (
     Unit,
     run,
 )
-from scm_world.queries.timed import On
 from scm_world.queries.twins import AnyTwins, EquationTwins, Twins, threaded
 from scm_world.work.executors import Executor
 from scm_world.work.processes import cores
@@ -173,7 +172,7 @@ def _solved_together(twins: EquationTwins, units: Sequence[Unit]) -> tuple[Float
     keys = [tuple((at, id(plan)) for at, plan in unit.layers) for unit in units]
     kinds = {key: unit.layers for key, unit in zip(keys, units, strict=True)}
     plans = (plan for layers in kinds.values() for _, plan in layers)
-    if any(isinstance(part, On) for plan in plans for _, part in plan.timed()):
+    if any(act.time.when is not None for plan in plans for _, act in plan.timed()):
         return None
     places = {kind: group for group, kind in enumerate(kinds)}
     groups = [places[key] for key in keys]

@@ -86,7 +86,7 @@ class Setting:
         """
         nature, acts = Plan(self.nature), Plan(do)
         for name in acts:
-            if name in nature and name not in acts.at_first():
+            if name in nature and name not in acts.at_start():
                 acts = acts.do({name: (*nature[name], *acts[name])})  # until then nature counts
         return Plan(merged(world.model, nature, acts))
 
@@ -244,11 +244,10 @@ def sample(
     first = whole_number("first", first, least=0)
     numbers, plan = range(first, first + count), setting.plan(world, do)
     unit = setting.unit(world, plan, first, names)
-    for name, part in Plan(do).timed():
-        begin = getattr(part, "step", getattr(part, "start", 0))
-        if begin > 0 and begin >= unit.steps:
+    for name, act in Plan(do).timed():
+        if (act.time.start or 0) >= max(unit.steps, 1):
             allowed = (f"a control step before {unit.steps}, where episodes end",)
-            raise UnknownOption(f"time of an intervention on {name}", part, allowed)
+            raise UnknownOption(f"time of an intervention on {name}", act, allowed)
     units = [replace(unit, number=number) for number in numbers]
     if each:
         several = [((0, plan.do(more)),) for more in each]
