@@ -96,6 +96,13 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             flat = flatten({} if request is None else request)
             self._parts = {name: _several(value) for name, value in flat.items()}
 
+    @classmethod
+    def of(cls, parts: dict[str, tuple[Any, ...]]) -> Plan:
+        """Return the plan of interventions by dotted name, which are not looked at."""
+        made = cls.__new__(cls)
+        made._parts = parts
+        return made
+
     def __getitem__(self, name: str) -> tuple[Any, ...]:
         return self._parts[name]
 
@@ -122,9 +129,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
     def do(self, request: Mapping[str, Any]) -> Plan:
         """Return the plan that does this too; where both set a variable, this one counts."""
-        both = Plan()
-        both._parts = {**self._parts, **Plan(request)._parts}
-        return both
+        return Plan.of({**self._parts, **Plan(request)._parts})
 
     def at_start(self) -> dict[str, Intervention]:
         """Return the interventions at the first instant, by variable and without times."""
@@ -173,9 +178,8 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         """
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise ModelError([f"not a plan: expected the format {FORMAT!r}; write it again"])
-        plan = cls()
         try:
-            plan._parts = _PARTS.validate_json(json.dumps(data["do"]))
+            plan = cls.of(_PARTS.validate_json(json.dumps(data["do"])))
         except DAMAGED as error:
             raise ModelError([f"not a plan: {error}"]) from None
         check_trusted(plan._functions(), trusted)
@@ -271,8 +275,17 @@ class Schedule:
                         variable=name,
                         value=act,
                     )
-        self._is_simple = not any(True for _, plan in self.layers for _ in plan.timed())
         self._starts = frozenset(start for start, _ in self.layers)
+        self._all, self._later = (
+            [
+                ((number, name, index), act)
+                for number, (_, plan) in enumerate(self.layers)
+                for name, acts in plan.items()
+                for index, act in enumerate(acts)
+                if act.time is not None or with_untimed
+            ]
+            for with_untimed in (True, False)
+        )
 
     def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[str, Intervention]:
         """Return what is to be done at the beginning of a control step, without times.
@@ -317,37 +330,32 @@ class Schedule:
         self, world: System, step: int, fired: Mapping[Key, int]
     ) -> Iterator[tuple[Key, Any]]:
         """List what is due at a control step, or waits for an event."""
-        if self._is_simple and step not in self._starts:
-            return
-        for number, name in self._owners(step, world):
-            start, plan = self.layers[number]
-            for index, act in enumerate(plan[name]):
-                key, time = (number, name, index), act.time
-                if time is None:
-                    is_possible = step == start
-                elif time.when is not None:
-                    is_possible = step > start and fired.get(key, step) == step
-                elif time.during is not None:
-                    at_end = step in time.during  # a state is put there at every step between
-                    is_possible = time.holds(step) if _is_state(name, world) else at_end
-                elif time.every is not None:
-                    since = step - time.start
-                    is_possible = step >= start and since >= 0 and since % time.every == 0
-                else:
-                    is_possible = step == time.at
-                if is_possible:
-                    yield key, act
+        for key, act in self._all if step in self._starts else self._later:
+            (number, name, _), time = key, act.time
+            start = self.layers[number][0]
+            if time is None:
+                is_possible = step == start
+            elif time.when is not None:
+                is_possible = step > start and fired.get(key, step) == step
+            elif time.during is not None:
+                at_end = step in time.during  # a state is put there at every step between
+                is_possible = time.holds(step) if _is_state(name, world) else at_end
+            elif time.every is not None:
+                since = step - time.start
+                is_possible = step >= start and since >= 0 and since % time.every == 0
+            else:
+                is_possible = step == time.at
+            if is_possible and self._counts(number, name, step, world):
+                yield key, act
 
-    def _owners(self, step: int, world: System) -> Iterable[tuple[int, str]]:
-        """List what counts at a step: of each quantity the last plan that names it."""
-        last: dict[str, tuple[int, dict[str, None]]] = {}
-        for number, (start, plan) in enumerate(self.layers):
-            for name in plan if start <= step else ():
-                for target in world.model.targets(name) if name in world.model else (name,):
-                    if last.get(target, (-1, {}))[0] != number:
-                        last[target] = (number, {})
-                    last[target][1][name] = None
-        return dict.fromkeys((number, name) for number, names in last.values() for name in names)
+    def _counts(self, number: int, name: str, step: int, world: System) -> bool:
+        """Tell whether no later plan has taken over all quantities that a name sets."""
+        model = world.model
+        later = [plan for start, plan in self.layers[number + 1 :] if start <= step]
+        if not later or self.layers[number][0] > step:
+            return self.layers[number][0] <= step
+        taken = {target for plan in later for one in plan for target in targets(model, one)}
+        return not taken.issuperset(targets(model, name))
 
     def _still_held(self, key: Key, step: int) -> Intervention:
         """Return what holds where a window ends: one around it, or the variable's mechanism."""
@@ -373,6 +381,11 @@ class GroupedSchedules:
         """Return the interventions of each group in which some are due."""
         dues = (schedule.due(world, step, fired) for schedule in self._schedules)
         return {group: due for group, due in enumerate(dues) if due}
+
+
+def targets(model: SCM, name: str) -> tuple[str, ...]:
+    """Return the quantities that a name sets; itself where the model does not have it."""
+    return model.targets(name) if name in model else (name,)
 
 
 def _is_state(name: str, world: System) -> bool:

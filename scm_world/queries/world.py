@@ -227,18 +227,23 @@ class World(Simulation, Questions):
         )
 
     def reset(
-        self, *, seed: int | None = None, episode: int = 0, do: Mapping[str, Any] | None = None
+        self,
+        *,
+        seed: int | None = None,
+        episode: int = 0,
+        do: Mapping[str, Any] | None = None,
+        space: AnyRegion | None = None,
     ) -> Audit | None:
         """Begin an episode, with what is given; see ``Simulation.reset``."""
         plan = self._with(do)
         if not len(self._standing) and not any(True for _ in plan.timed()):
             self._schedule, self._fired = Schedule(()), {}
-            return super().reset(seed=seed, episode=episode, do=do)
+            return super().reset(seed=seed, episode=episode, do=do, space=space)
         super().reset(seed=seed, episode=episode)
         fired: dict[Key, int] = {}
         self._schedule, self._fired = Schedule([(0, plan)]), fired
         due = self._schedule.due(self, 0, fired)
-        return self.do(due) if due else None
+        return self.do(due, space=space) if due else None
 
     def advance(self, command: Floats) -> None:
         """Advance one control step, with what is due at its beginning."""
