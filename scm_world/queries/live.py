@@ -73,7 +73,8 @@ class LiveEpisode:
     @property
     def layers(self) -> tuple[Layer, ...]:
         """What was done: plans, each with the control step from which it counts."""
-        return self._running.unit.layers
+        schedule: Any = self._running.unit.schedule
+        return tuple(schedule.layers)
 
     @property
     def actions(self) -> list[Floats]:
@@ -144,8 +145,7 @@ class LiveEpisode:
         return Plan(request)
 
     def _take(self, layers: tuple[Layer, ...]) -> None:
-        self._running.unit = replace(self._running.unit, layers=layers)
-        self._running.__dict__.pop("schedule", None)
+        self._running.unit = replace(self._running.unit, schedule=Schedule(layers))
 
     def step(self, action: Any = None) -> Floats:
         """Take a control step, and do what is due at the instant that it leads to.
@@ -176,7 +176,7 @@ class LiveEpisode:
         try:
             running.intervene(step + 1)
         except InterventionError:
-            due = running.schedule.due(self.world, step + 1, dict(running.trace.fired))
+            due = running.unit.schedule.due(self.world, step + 1, dict(running.trace.fired))
             self.do({str(name): Natural() for name in due})
             raise
         return running.trace.actions[-1]
@@ -233,7 +233,7 @@ class LiveEpisode:
         trace.vectors.append(self._arrival)
         unit = replace(
             self._running.unit,
-            layers=tuple(layer for layer in self.layers if layer[0] < steps),
+            schedule=Schedule(layer for layer in self.layers if layer[0] < steps),
             policy=Given(trace.actions),
             steps=steps,
             first=0,

@@ -264,7 +264,7 @@ class Schedule:
     """
 
     def __init__(self, layers: Iterable[Layer] = ()) -> None:
-        self.layers = tuple((start, plan) for start, plan in layers if len(plan))
+        self.layers = tuple(layers)
         for start, plan in self.layers:
             for name, act in plan.timed():
                 time = act.time
@@ -275,7 +275,7 @@ class Schedule:
                         variable=name,
                         value=act,
                     )
-        self._starts = frozenset(start for start, _ in self.layers)
+        self._starts = frozenset(start for start, plan in self.layers if len(plan))
         self._all, self._later = (
             [
                 ((number, name, index), act)
@@ -286,6 +286,11 @@ class Schedule:
             ]
             for with_untimed in (True, False)
         )
+
+    @property
+    def waits(self) -> bool:
+        """Whether anything waits for an event."""
+        return any(act.time.when is not None for _, act in self._later)
 
     def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[str, Intervention]:
         """Return what is to be done at the beginning of a control step, without times.
