@@ -20,7 +20,6 @@ from scm_world.queries import (
     load_episode,
     save_episode,
 )
-from scm_world.queries.local import local_graph
 from scm_world.variables import Box, Contact, Hard, Reaches
 
 CART_POLE = """
@@ -189,11 +188,12 @@ def test_a_model_without_actuators_moves() -> None:
     assert episode["ball.cartesian_position"][3, 2] < 0.0
 
 
-def test_local_graphs_are_refused(world: World) -> None:
-    """They are those of fingers and blocks."""
+def test_local_graphs_are_those_of_any_model(world: World) -> None:
+    """All edges but those by contacts that are not there."""
     world.reset(seed=0)
-    with pytest.raises(UnknownOption, match="world of local graphs"):
-        local_graph(world, [0.0, 0.1])
+    graph = world.local_graph()
+    declared = {(e.cause, e.effect, e.lag) for e in world.model.edges if e.when is None}
+    assert {(a, b, lag) for a, b, lag in graph.edges(data="lag")} >= declared
 
 
 # --- files ----------------------------------------------------------------------------------------

@@ -13,7 +13,6 @@ import pytest
 from scm_world.discovery import Design, collect, discover
 from scm_world.errors import EngineFailure, InterventionError, NotReset
 from scm_world.queries import World, consequences, verify
-from scm_world.queries.local import local_graph
 from scm_world.variables import Action, Box, Exogenous, Hard, Measured, Normal, Reaches
 
 HAS_BULLET = importlib.util.find_spec("pybullet") is not None
@@ -174,5 +173,5 @@ def test_a_local_graph_is_read_without_a_trace() -> None:
     world = World("pushing").given({"floor_friction": Hard(0.2, at=2)})
     world.reset(seed=5)
     before = moment(world)
-    local_graph(world, world["joint_positions"])
+    world.local_graph(world["joint_positions"])
     assert moment(world) == before
