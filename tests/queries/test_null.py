@@ -118,7 +118,7 @@ def test_what_cannot_go_stays(request_: dict[str, Null], error: type[Exception])
     assert all(np.array_equal(before[name], value) for name, value in world.values().items())
     with pytest.raises(InterventionError, match="a body of a world can"):
         world.model.do({"tool_block.mass": Null()})
-    with pytest.raises(UnknownOption, match="Clamp"):
+    with pytest.raises(UnknownOption, match="intervention of a window"):
         Null(during=(0, None))
 
 

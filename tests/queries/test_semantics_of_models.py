@@ -254,7 +254,7 @@ def test_direct_effects_leave_the_mediators_out() -> None:
 
 
 def test_effects_of_models_in_time_take_windows() -> None:
-    """At and Clamp in both arms; the label names them; natural effects are refused."""
+    """Times in both arms; the label names them; natural effects are refused."""
     level = Derived(
         name="s", parents=(Parent("s", 1), Parent("k")), mechanism=Linear(weights=(0.5, 1.0))
     )
