@@ -214,7 +214,10 @@ class StepModel:
                 for q in (self.states if not problems else ())
             ]
         for name, numbers, where, shape in given:
-            value = np.asarray(numbers)
+            try:
+                value = np.asarray(numbers)
+            except ValueError:  # a ragged list
+                value = np.asarray(None)
             if value.dtype.kind not in "biuf":
                 problems.append(f"{name} must be numbers, not {value.dtype}")
             elif value.shape != shape:

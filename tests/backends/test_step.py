@@ -299,6 +299,11 @@ def talks(parameters: Any, state: Any, action: Any, noise: Any) -> Mapping[str, 
     return {**state, "x": "one"}
 
 
+def tears(parameters: Any, state: Any, action: Any, noise: Any) -> Mapping[str, Any]:
+    """Give a ragged list."""
+    return {**state, "y": [[1.0, 2.0], [3.0]]}
+
+
 def lists(parameters: Any, state: Any, action: Any, noise: Any) -> Any:
     """Give no dict."""
     return [1.0]
@@ -330,6 +335,7 @@ def divides(parameters: Any, state: Any, action: Any, noise: Any) -> Mapping[str
         (halves, r"'n' must be whole numbers of at most 2\*\*53, not \[0.5\]"),
         (overflows, r"'n' must be whole numbers of at most 2\*\*53"),
         (talks, "'x' must be numbers"),
+        (tears, "'y' must be numbers"),
         (lists, "it must be a dict of the states by name"),
         (writes, "ValueError: .*must not be changed: let it work on a copy"),
         (misspells, "KeyError: 'mas'; it is given parameters mass; states x, y, n"),
