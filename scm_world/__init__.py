@@ -124,7 +124,7 @@ for _task in (
         gymnasium.register(
             id=_id,
             entry_point="scm_world.env:ScmWorldEnv",
-            vector_entry_point="scm_world.env.batched:ScmWorldVectorEnv",
+            vector_entry_point="scm_world.env:vector_env",
             kwargs={"task": _task},
             order_enforce=False,  # it refuses steps before a reset itself
             disable_env_checker=True,  # tests check it; wrappers would hide compute_reward

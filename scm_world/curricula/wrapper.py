@@ -282,6 +282,11 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             info = {**info, **known, "reward_terms": terms}
         return observation, reward, terminated, truncated, info
 
+    def rerun(self, actions: Iterable[Any]) -> None:
+        """Take the steps of an episode again, from its reset on."""
+        for action in actions:
+            self.step(action)
+
     def stepped(self, step: int, *, over: bool, success: bool) -> bool:
         """Note a control step; tell whether the curriculum may act after it."""
         self._stepped, self._success = True, success

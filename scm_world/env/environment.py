@@ -478,6 +478,16 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             terms[name] = float(now[name])
         return info
 
+    @property
+    def info_shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shape of each entry of ``info``, without ``reward_terms``, which is a dictionary."""
+        goals = () if self._goals is None else self._goals.spaces.items()
+        return {
+            **({"is_success": (), "success": ()} if SUCCESS in self._counted else {}),
+            **({"fractional_success": ()} if FRACTION in self._counted else {}),
+            **{name: space.shape or () for name, space in goals},
+        }
+
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene, shape (h, w, 3); None without ``render_mode="rgb_array"``.
 
