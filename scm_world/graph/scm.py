@@ -129,6 +129,7 @@ class SCM:
     __slots__ = (
         "_acts",
         "_declared",
+        "_drawable",
         "_evaluator",
         "_interventions",
         "_order",
@@ -143,6 +144,7 @@ class SCM:
         self._order: tuple[str, ...] = edges.order
         self._evaluator = Evaluator(self._declared)
         self._targets: dict[str, tuple[str, ...]] = {}  # looked up once
+        self._drawable: set[tuple[str, str]] = set()  # variables and spaces that they have
         self._temporal: frozenset[str] | None = None
         self._interventions: dict[str, Intervention] = {}
         self._acts: dict[str, AppliedIntervention] = {}
@@ -400,7 +402,7 @@ class SCM:
 
     def _copy(self, other: SCM) -> None:
         self._declared, self._temporal = other._declared, other._temporal
-        self._targets = other._targets
+        self._targets, self._drawable = other._targets, other._drawable
         self._evaluator, self._order = other._evaluator, other._order
         self._interventions, self._acts = {**other._interventions}, {**other._acts}
         self._structure = other._structure
@@ -423,7 +425,12 @@ class SCM:
         if not any_variable and not target.settable:
             reason = "is a constant" if isinstance(target, Fixed) else "is measured, not set"
             raise NotIntervenable(name, reason, settable_causes(self._declared, target.name))
-        return accepted(self._declared, self._declared[whole], value)
+        if not (isinstance(value, Draw) and isinstance(value.source, str)):
+            return accepted(self._declared, self._declared[whole], value)
+        if (whole, value.source) not in self._drawable:
+            accepted(self._declared, self._declared[whole], value)
+            self._drawable.add((whole, value.source))
+        return value
 
     # --- solving ------------------------------------------------------------------------------
 

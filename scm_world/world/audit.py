@@ -159,10 +159,10 @@ def _asked(
             backs.append(values[-1].copy())
     if len(values) < len(targets):
         return None, None
-    exact = len(backs) == len(targets) and all(map(same, backs, values))
     if targets == (name,):
         return values[0], backs[0] if backs else None
     applied = compiled.in_coordinates(name, *values)
     if len(backs) < len(targets):
         return applied, None
+    exact = all(map(same, backs, values))
     return applied, applied if exact else compiled.in_coordinates(name, *backs)

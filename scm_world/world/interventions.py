@@ -211,7 +211,7 @@ class Draft:
             self.order = tuple(n for n in structure.order if n in follow and n in static)
         else:
             self.order = compiled.static_order(self.targets)
-        drawn = (acts[target] for target in self.draws)
+        drawn = (acts[target] for target in self.draws if target not in self.boxes)
         sources = (self.source(name, act) for name, act in drawn if isinstance(act, Draw))
         if any(source.parents() for source in sources):
             self.order = tuple(n for n in self.model.structure.order if n in {*self.order})
