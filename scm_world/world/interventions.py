@@ -22,6 +22,7 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey
+from scm_world.graph.acceptance import refuse_time
 from scm_world.graph.evaluate import noise_of
 from scm_world.models import Difference, ParameterKey, Structure
 from scm_world.models.scene import SURFACES, Overlap
@@ -140,11 +141,13 @@ class Draft:
         accepted: PendingInterventions = {}
         asked: dict[str, str] = {}
         for name, value in request.items():
-            if isinstance(value, Null):  # of an entity, not of a variable; see ``restructured``
-                continue
-            if isinstance(value, Natural) and name in compiled.entity_names:
-                continue  # it is there
             try:
+                if isinstance(value, Null | Natural) and name not in model:
+                    refuse_time(name, value)
+                if isinstance(value, Null):  # of an entity, not of a variable; see ``restructured``
+                    continue
+                if isinstance(value, Natural) and name in compiled.entity_names:
+                    continue  # it is there
                 kept, act = self._checked(name, value)
                 targets = model.targets(name)
                 for target in targets:
