@@ -143,7 +143,7 @@ class Situation:
     def natural(self, name: str) -> Value | None:
         """Return a variable at the beginning without interventions; None if it is computed."""
         row = beginning(self.compiled, NoiseKey(self.noise, self.number, origin=0))
-        known = name in self.compiled.static or name in self.compiled.slices
+        known = name in self.compiled.slices or name in self.compiled.static_names
         return np.array(row[name]) if known else None
 
 
