@@ -43,6 +43,7 @@ from scm_world.world.compiled_task import (
 )
 from scm_world.world.interventions import (
     Draft,
+    Instant,
     Solution,
     difference,
     feasible,
@@ -278,11 +279,7 @@ class Simulation:
         self._base = self._step_base(at_start=True)
 
     def _draw_nature(self) -> None:
-        """Draw what is random by declaration: the noise of this episode.
-
-        Raises:
-            Infeasible: It puts two bodies in one place.
-        """
+        """Draw what is random by declaration: the noise of this episode."""
         key = self.noise_key(0)
         compiled = self.structures.natural(key)
         if not compiled.random:
@@ -293,7 +290,8 @@ class Simulation:
         problems = overlaps(compiled, base, present, row, change) if solid else []
         if problems:
             draft = Draft(self.structures, base, {compiled.random[0]: Draw("A")}, None, key)
-            raise refusal(self.structures, base, present, self.structure, draft, problems, key)
+            here = Instant(self.structures, base, present, self.structure)
+            raise refusal(here, draft, problems, key)
         if change is not None:
             self.backend.apply(change)
         self._adopt(compiled, compiled.model, row)
@@ -560,10 +558,8 @@ class Simulation:
             flat, drawn = self._anew(flat, base)
         region = self.variables_space if space is None else as_region("space", space)
         key = self.noise_key(self._index)
-        now = self._values.row
-        solution, change = feasible(
-            self.structures, base, now, self.structure, flat, region, key, twice
-        )
+        here = Instant(self.structures, base, self._values.row, self.structure)
+        solution, change = feasible(here, flat, region, key, twice)
         audit = self._commit(solution, change, flat, check, at_start=base.at_start)
         self._base = StepBase(
             base.compiled, base.model, base.row, solution.kept(), drawn or base.drawn, base.at_start
@@ -632,11 +628,7 @@ class Simulation:
         *,
         at_start: bool,
     ) -> Audit:
-        """Apply what was computed, read it back, and report; or put everything back and raise.
-
-        Raises:
-            EngineFailure: The backend does not report what it was given.
-        """
+        """Apply what was computed, read it back, and report; or put everything back and raise."""
         before, index = self._step_base(), self._index
 
         def undo() -> None:
@@ -669,12 +661,7 @@ class Simulation:
 
     @contextmanager
     def _all_or_nothing(self, before: StepBase, undo: Callable[[], None]) -> Iterator[None]:
-        """Put everything back as it was before, should something fail half way.
-
-        Args:
-            before: A copy of the present.
-            undo: Puts the backend back.
-        """
+        """Put everything back as it was before, should something fail half way."""
         kept, offset = self._values, self._offset
         try:
             yield
@@ -695,11 +682,7 @@ class Simulation:
         return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
     def _applied(self, change: Difference) -> Parameters:
-        """Read back what was applied.
-
-        Raises:
-            EngineFailure: The backend did not take it over.
-        """
+        """Read back what was applied."""
         reported = self.backend.parameters(change.parameters)
         values = change.parameters.items()
         wrong = [".".join(key) for key, value in values if not _close(value, reported[key])]
@@ -917,11 +900,7 @@ def _close(given: Floats, reported: Floats) -> bool:
 
 
 def _as_backend(backend: Any) -> Backend:
-    """Return a backend, or make the one of a name.
-
-    Raises:
-        UnknownOption: There is none of this name, or it is neither.
-    """
+    """Return a backend, or make the one of a name."""
     if isinstance(backend, Backend):
         return backend
     if isinstance(backend, str):
