@@ -215,14 +215,15 @@ class Draft:
         held = self.base.model.interventions.values()
         ties = bool(follows) or any(isinstance(act, Mechanism) for act in held)
         # Where nothing follows others than before, draws from boxes can wait for their values.
-        later = self.boxes.keys() if not ties else ()
+        draws = [t for t, (_, act) in acts.items() if isinstance(act, Draw)]
+        later = self.boxes.keys() if draws and not ties else ()
         kept = dict([acts[t] for t in acts if t not in moving and t not in later])
         self.model, cycles = self.base.model.without_cycles(kept)
         self.problems += [*{p.variable: p for p in moving.values()}.values(), *cycles]
         self.impossible = {*moving, *chain(*(problem.cycle for problem in cycles))}
         static = compiled.static
         self.targets = tuple([t for t in acts if t in static and t not in self.impossible])
-        self.draws = [t for t in self.targets if isinstance(acts[t][1], Draw)]
+        self.draws = [target for target in draws if target in self.targets]
         if ties:
             structure = self.model.structure
             follow = {*self.targets, *structure.instant_descendants(self.targets)}
@@ -712,12 +713,10 @@ def overlaps(
     base: StepBase,
     now: Row,
     then: Row,
-    change: Difference | None,
+    change: Difference,
     asked: Iterable[str] = (),
 ) -> list[Overlap]:
     """List overlaps deeper than what physics left; taking something back is always possible."""
-    if change is None:
-        return []
     moves = change.structure is not None or any(map(_shapes, change.parameters))
     if not moves and change.state is not None:
         size = compiled.mechanisms.state_size
@@ -769,7 +768,7 @@ def feasible(
     deciding = here.structures.deciding.intersection(draws)
     left, turn, tried = ATTEMPTS, 0, ""
     while left > 0:
-        asked = _drawn_anew(request, deciding, turn)
+        asked = _drawn_anew(request, deciding, turn) if turn else request
         draft = Draft(here.structures, here.base, asked, space, key, found)
         again = [name for name in draws if name not in deciding and draft.redraws(name)]
         key = replace(key, kept=frozenset(draws).difference(again)) if draws else key
@@ -783,7 +782,9 @@ def feasible(
             row, compiled = solution.row, draft.compiled
             solution.changed = changed = here.now.differing(row)
             change = difference(compiled, here.now, here.structure, row, changed)
-            problems = overlaps(compiled, draft.base, here.now, row, change, draft.asked)
+            problems = []
+            if change is not None:
+                problems = overlaps(compiled, draft.base, here.now, row, change, draft.asked)
             if draws and not problems:
                 problems = _in_obstacles(solution, draws)
             if not problems:
@@ -797,10 +798,10 @@ def feasible(
 
 
 def _drawn_anew(request: Mapping[str, Any], names: Iterable[str], turn: int) -> Mapping[str, Any]:
-    """Give some draws of a request other noise; the first turn has that of the request."""
-    streams = {name: f"{request[name].stream or name}#{turn}" for name in names} if turn else {}
+    """Give some draws of a request the noise of another turn."""
+    streams = {name: f"{request[name].stream or name}#{turn}" for name in names}
     anew = {n: request[n].model_copy(update={"stream": own}) for n, own in streams.items()}
-    return {**request, **anew} if anew else request
+    return {**request, **anew}
 
 
 def _promising(draft: Draft, key: NoiseKey, attempts: range, draws: list[str]) -> Iterator[int]:
@@ -887,6 +888,8 @@ def _nearest(
         if not blocked:
             row, compiled = solution.row, draft.compiled
             change = difference(compiled, at.now, at.structure, row, at.now.differing(row))
-            blocked = bool(overlaps(compiled, draft.base, at.now, row, change, draft.asked))
+            if change is not None:
+                found = overlaps(compiled, draft.base, at.now, row, change, draft.asked)
+                blocked = bool(found)
         low, high = (low, middle) if blocked else (middle, high)
     return between(low)

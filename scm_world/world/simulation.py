@@ -27,6 +27,7 @@ from scm_world.errors import (
 from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.models import Difference, ParameterKey, Parameters, Scene, State, Structure
 from scm_world.models.camera import Camera
+from scm_world.models.scene import Overlap
 from scm_world.tasks import Conventions, Task
 from scm_world.tasks.composition import Composition
 from scm_world.variables import Draw, Mechanism, Subset
@@ -286,8 +287,9 @@ class Simulation:
             return
         row, present, base = beginning(compiled, key), self._values.row, self._step_base()
         change = difference(compiled, present, self.structure, row, present.differing(row))
-        solid = compiled.composition.solid
-        problems = overlaps(compiled, base, present, row, change) if solid else []
+        problems: list[Overlap] = []
+        if change is not None and compiled.composition.solid:
+            problems = overlaps(compiled, base, present, row, change)
         if problems:
             draft = Draft(self.structures, base, {compiled.random[0]: Draw("A")}, None, key)
             here = Instant(self.structures, base, present, self.structure)
