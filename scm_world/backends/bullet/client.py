@@ -21,8 +21,6 @@ from scm_world.backends.bullet.build import (
     EngineBody,
     custom,
     renewed,
-    solid,
-    takes_armature,
 )
 from scm_world.backends.bullet.engine import Connection
 from scm_world.backends.bullet.honoured import realized, rebuilt
@@ -238,8 +236,6 @@ class Client:
         self._enabled = enabled
         self._parts = parts(self.engine, mj, self.joints, range(mj.ntree))
         self._scalar = [joint for joint in self.joints if mj.jnt_type[joint] not in (FREE, BALL)]
-        armed = [(r, body) for r, body in enumerate(self.bodies) if takes_armature(mj, body)]
-        self._moments = {row: solid(mj, body)[0].copy() for row, body in armed}
         self._in_force, self._trees, self._driven = [], set[int](), list[JointSet]()
         self._set_all()
 
@@ -313,8 +309,6 @@ class Client:
         yield engine.setPhysicsEngineParameter, {0: ()}, [0], names, rows
         bodies = list(self.bodies)
         rows = np.column_stack([mj.body_mass[bodies], mj.body_inertia[bodies]])
-        for row, moments in self._moments.items():
-            rows[row, 1:] = moments
         yield inertia, self.bodies, bodies, ("mass", "x", "y", "z"), rows
         scalar = self._scalar
         rigid = not disabled(mj, _OFF.mjDSBL_CONSTRAINT)
