@@ -15,13 +15,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import ContactPoint
-from scm_world.backends.bullet.build import (
-    BALL,
-    FREE,
-    EngineBody,
-    custom,
-    renewed,
-)
+from scm_world.backends.bullet.build import BALL, FREE, EngineBody, custom, renewed
 from scm_world.backends.bullet.engine import Connection
 from scm_world.backends.bullet.honoured import realized, rebuilt
 from scm_world.backends.bullet.joints import Free, JointSet, parts

@@ -13,15 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.backends.bullet.build import (
-    BALL,
-    FREE,
-    MOST_LINKS,
-    SHAPES,
-    coupled,
-    links,
-    unit_of,
-)
+from scm_world.backends.bullet.build import BALL, FREE, MOST_LINKS, SHAPES, coupled, links, unit_of
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.trees import Couplings, works
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption

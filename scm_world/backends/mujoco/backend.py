@@ -8,24 +8,12 @@ from typing import Any, ClassVar, final
 import mujoco
 
 from scm_world._types import Floats
-from scm_world.backends.base import (
-    Backend,
-    Capabilities,
-    ContactPoint,
-    EngineBatch,
-    EngineSnapshot,
-)
+from scm_world.backends.base import Backend, Capabilities, ContactPoint, EngineBatch, EngineSnapshot
 from scm_world.backends.mujoco.batch import MujocoBatch, Slot
-from scm_world.backends.mujoco.contacts import Touches
+from scm_world.backends.mujoco.contacts import Touches, named
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.errors import EngineFailure
-from scm_world.models.scene import (
-    Difference,
-    ParameterKey,
-    Parameters,
-    Scene,
-    complete,
-)
+from scm_world.models.scene import Difference, ParameterKey, Parameters, Scene, complete
 
 
 @final
@@ -110,7 +98,7 @@ class MujocoBackend(Backend):
 
         Of a Runge-Kutta step MuJoCo keeps those of the last stage alone: ``Model.staged`` says so.
         """
-        return self._last_touches().contacts()
+        return named(self._last_touches())
 
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""

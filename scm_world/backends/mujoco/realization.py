@@ -15,22 +15,11 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.contacts import Touches, touches
-from scm_world.backends.mujoco.states import (
-    MOTION,
-    LastStep,
-    into_bodies,
-    read_rows,
-    turned_bodies,
-)
+from scm_world.backends.mujoco.states import MOTION, LastStep, into_bodies, read_rows, turned_bodies
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import Infeasible, ModelError, UnknownOption
 from scm_world.models.model import REPORTED, Model
-from scm_world.models.scene import (
-    REVERSED,
-    ParameterKey,
-    Parameters,
-    reversed_ranges,
-)
+from scm_world.models.scene import REVERSED, ParameterKey, Parameters, reversed_ranges
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Everything that decides the future of a simulation of MuJoCo."""
