@@ -158,12 +158,10 @@ class BulletBackend(Backend):
 
     def step(self, command: Floats, substeps: int) -> None:
         """Hold a command for some physics steps."""
-        numbers, size = np.asarray(command, dtype=np.float64).tolist(), self.structure.n_commands
-        if len(numbers) != size:
-            raise ValueError(f"a command has {size} numbers, got {len(numbers)}")
         if substeps < 1:
             return
         at, client, now = self._at, self.client(), self._at.now
+        numbers: list[float] = np.asarray(command, dtype=np.float64).tolist()
         past = at.past if at.world is at.past else Past(now)
         try:
             client.step(numbers, substeps)

@@ -38,12 +38,7 @@ def load() -> tuple[Any, str]:
 class Connection:
     """The functions and constants of the engine, for a physics client of its own.
 
-    Args:
-        engine: The module ``pybullet``.
-
-    Attributes:
-        handle: The number of the client.
-        close: Disconnects it, once; so does the end of this object.
+    ``handle`` is the number of the client, ``close`` disconnects it; so does the end of this.
     """
 
     def __init__(self, engine: Any) -> None:

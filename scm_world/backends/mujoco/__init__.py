@@ -11,9 +11,8 @@ import re
 from contextlib import suppress
 from importlib import metadata
 
-from scm_world.errors import MissingEngine, MixedInstallation
+from scm_world.errors import MixedInstallation
 
-OLDEST = (3, 17)
 REQUIREMENT = "mujoco>=3.17,<5"
 REPAIR = f"pip uninstall -y mujoco mujoco-core mujoco-studio && pip install '{REQUIREMENT}'"
 DISTRIBUTIONS = ("mujoco", "mujoco-core", "mujoco-studio")
@@ -23,8 +22,7 @@ def check_installation() -> None:
     """Compare the versions of the installed distributions, without importing MuJoCo.
 
     Raises:
-        MissingEngine: It is not installed, or older than 3.17.
-        MixedInstallation: Versions differ.
+        MixedInstallation: They differ.
     """
     found = {}
     for name in DISTRIBUTIONS:
@@ -33,9 +31,6 @@ def check_installation() -> None:
     versions = {tuple(map(int, re.findall(r"\d+", text)[:3])) for text in found.values()}
     if len(versions) > 1:
         raise MixedInstallation("mujoco", found, REPAIR)
-    if not versions or min(versions) < OLDEST:
-        old = f"{found.popitem()[1]} is too old" if found else ""
-        raise MissingEngine("mujoco", f"pip install '{REQUIREMENT}'", old)
 
 
 check_installation()

@@ -71,17 +71,11 @@ def overlaps(
     besides: Set[Shapes] = frozenset(),
     enough: float = np.inf,
 ) -> tuple[Overlap, ...]:
-    """List all pairs of bodies that lie deeper in one another than a tolerance.
+    """List all pairs of bodies that lie deeper in one another than a tolerance [m].
 
-    Args:
-        scene: With complete parameters.
-        tolerance: How deep is too deep [m].
-        besides: Pairs of shapes that may lie in one another.
-        enough: Where some lie deeper than this in one another, the deepest alone are listed [m].
-
-    Returns:
-        One entry for each pair of names, with its greatest depth. First come bodies that move
-        freely, last those that never move; in a pair, too.
+    There is one entry for each pair of names, with its greatest depth. First come bodies that move
+    freely, last those that never move; in a pair, too. Pairs of shapes ``besides`` these count.
+    Where some lie deeper than ``enough`` [m] in one another, the deepest alone are listed.
 
     Example:
         >>> from scm_world.tasks.trifinger.system import trifinger

@@ -47,12 +47,7 @@ def lost(structure: Any, vector: Floats, time: float) -> str:
 class Realization:
     """A compiled model with parameters and a state of its own.
 
-    Args:
-        structure: The description of the model.
-        parameters: All that differ from it, and all that are compared later.
-
-    Raises:
-        ModelError: It is not a model.
+    The parameters that it is made with are all that differ from it, and all that are compared.
 
     Attributes:
         structure: What was compiled.
