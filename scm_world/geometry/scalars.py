@@ -12,11 +12,6 @@ def scalar(value: Any) -> float:
     """Return a number as a float, also one that comes as an array of shape ().
 
     Compiled code may call it, where ``float`` refuses arrays.
-
-    Example:
-        >>> import numpy as np
-        >>> scalar(np.array(3)), scalar(2)
-        (3.0, 2.0)
     """
     return float(value)
 

@@ -95,14 +95,6 @@ def shares(mj: mujoco.MjModel, shapes: list[int], usual: float) -> Floats:
     coefficient and the other at least that, if the floor has no more than it. The number of a
     moving shape depends on its own coefficient and on that of the first fixed shape alone, so
     that shapes which never touch leave one another alone to the last bit.
-
-    Args:
-        mj: With the coefficients in force.
-        shapes: Their numbers.
-        usual: See ``usual_friction``.
-
-    Returns:
-        The number of each shape.
     """
     still = mj.body_treeid[mj.geom_bodyid[shapes]] < 0
     found: Floats = np.where(mj.geom_condim[shapes] == 1, 0.0, mj.geom_friction[shapes, 0])
@@ -152,9 +144,6 @@ class Client:
     springs, dampers and media, and converts states. Nothing moves there: each of its numbers that
     concerns the engine is set in the engine when it differs from its last setting.
     After an error other than ``Infeasible`` a client is of no use.
-
-    Args:
-        engine: The module ``pybullet``.
 
     Attributes:
         engine: Its functions for this client.

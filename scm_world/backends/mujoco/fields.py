@@ -533,12 +533,7 @@ def table(mj: mujoco.MjModel, data: mujoco.MjData, trees: Couplings) -> list[Par
 
 
 def clean(name: str) -> str:
-    """Replace what may not stand in the name of an element.
-
-    Example:
-        >>> clean("arm/joint.1"), clean("left hand")
-        ('arm_joint_1', 'left_hand')
-    """
+    """Replace what may not stand in the name of an element."""
     return re.sub(r"[^\w-]", "_", name)
 
 

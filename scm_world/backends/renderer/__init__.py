@@ -321,14 +321,6 @@ def camera_pixels(
 
     Source:
         CausalWorld 1.2, ``envs/causalworld.py``: its goal world.
-
-    Example:
-        >>> from scm_world.tasks.trifinger.system import trifinger
-        >>> from scm_world.tasks.trifinger.cameras import CAMERAS
-        >>> out = np.empty((3, 3, 128, 128), dtype=np.uint8)
-        >>> camera_pixels(trifinger(blocks=("tool_block",)).default_scene(), CAMERAS, out)
-        >>> out[0, :, 127, 64].tolist()  # the floor
-        [74, 65, 60]
     """
     if goals:
         shapes = background_of(scene, obstacles=not published)
