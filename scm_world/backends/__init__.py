@@ -72,8 +72,7 @@ def make_backend(name: str) -> Backend:
     Raises:
         UnknownOption: There is no such backend.
         ModelError: What an installed package declares by this name is not a backend.
-        MissingEngine: Its engine is not installed.
-        MixedInstallation: Two versions of its engine lie in one folder.
+        MissingEngine: Its engine is not installed, or two versions of it lie in one folder.
 
     Example:
         >>> make_backend("fake").name

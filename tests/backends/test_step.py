@@ -23,7 +23,7 @@ from scm_world.errors import (
     ModelError,
     SnapshotMismatch,
     UnknownOption,
-    WrongShape,
+    WrongValue,
 )
 from scm_world.models.scene import Difference, State
 from scm_world.tasks.trifinger.system import trifinger
@@ -390,7 +390,7 @@ def test_what_does_not_exist_is_refused() -> None:
     backend = built(MODELS["scalar"])
     with pytest.raises(UnknownOption, match=r"spring.stiffness, damping"):
         backend.apply(Difference(parameters={("", "mass"): np.array(1.0)}))
-    with pytest.raises(WrongShape, match=r"spring.stiffness\): expected shape \(2,\)"):
+    with pytest.raises(WrongValue, match=r"spring.stiffness\): expected shape \(2,\)"):
         backend.apply(
             Difference(
                 parameters={("", "damping"): np.array(9.0), ("spring", "stiffness"): np.ones(3)}

@@ -11,7 +11,7 @@ import re
 from contextlib import suppress
 from importlib import metadata
 
-from scm_world.errors import MixedInstallation
+from scm_world.errors import MissingEngine
 
 REQUIREMENT = "mujoco>=3.17,<5"
 REPAIR = f"pip uninstall -y mujoco mujoco-core mujoco-studio && pip install '{REQUIREMENT}'"
@@ -22,7 +22,7 @@ def check_installation() -> None:
     """Compare the versions of the installed distributions, without importing MuJoCo.
 
     Raises:
-        MixedInstallation: They differ.
+        MissingEngine: They differ.
     """
     found = {}
     for name in DISTRIBUTIONS:
@@ -30,7 +30,8 @@ def check_installation() -> None:
             found[name] = metadata.version(name)
     versions = {tuple(map(int, re.findall(r"\d+", text)[:3])) for text in found.values()}
     if len(versions) > 1:
-        raise MixedInstallation("mujoco", found, REPAIR)
+        mixed = ", ".join(f"{name} {version}" for name, version in found.items())
+        raise MissingEngine("mujoco", REPAIR, f"versions are mixed: {mixed}")
 
 
 check_installation()
