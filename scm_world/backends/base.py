@@ -83,11 +83,7 @@ class EngineSnapshot:
         return cls(f"{backend.name} {backend.version}", payload)
 
     def opened(self, backend: Backend) -> Any:
-        """Return the payload for a backend.
-
-        Raises:
-            SnapshotMismatch: It was taken by another engine, or another version of it.
-        """
+        """Return the payload for a backend."""
         here = f"{backend.name} {backend.version}"
         if self.engine != here:
             raise SnapshotMismatch(f"a snapshot of {self.engine} cannot be restored by {here}")

@@ -12,7 +12,7 @@ from numba import njit
 from scm_world._arguments import real_number
 from scm_world._types import Value, Values
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.geometry.scalars import scalar
+from scm_world.geometry.numbers import scalar
 from scm_world.variables import Box, Derived, Function, Integers, Linear, Measured, Parent, Variable
 
 FRACTION = "fractional_success"

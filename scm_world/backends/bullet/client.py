@@ -241,11 +241,7 @@ class Client:
     # --- parameters ------------------------------------------------------------------------------
 
     def edit(self, parameters: Parameters) -> None:
-        """Change parameters that need no new bodies. What is in force already is left alone.
-
-        Raises:
-            Infeasible: Nothing can move with them. Nothing has changed.
-        """
+        """Change parameters that need no new bodies. What is in force already is left alone."""
         if parameters is self._parameters:
             return
         fresh = {k: v for k, v in parameters.items() if self._parameters.get(k) is not v}

@@ -22,9 +22,6 @@ def load() -> tuple[Any, str]:
     """Import pybullet; return the module and its version.
 
     The import writes to the C library's streams, past ``sys.stdout``; nothing of it gets through.
-
-    Raises:
-        MissingEngine: It is not installed.
     """
     try:
         with nullcontext() if sys.modules.get("pybullet") else silence():

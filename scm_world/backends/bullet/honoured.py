@@ -91,14 +91,7 @@ def _multiplied(mj: mujoco.MjModel) -> NDArray[np.bool_]:
 
 
 def accepted(structure: Any, given: Parameters, known: Parameters) -> Parameters:
-    """Check all parameters before anything is made; return them, the known arrays where they stay.
-
-    Raises:
-        ModelError: The engine cannot honour the structure; all of it that it cannot.
-        UnknownOption: There is no such parameter, or there is one that is not given.
-        NotIntervenable: A parameter that the engine lacks is not as in the model.
-        EngineFailure: A number is not finite, or a rotation has no direction.
-    """
+    """Check all parameters before anything is made; return them, as known where they stay."""
     if not isinstance(structure, Model):
         name = type(structure).__name__
         raise ModelError([f"Bullet cannot realise a {name}; it takes models"])

@@ -82,11 +82,7 @@ class MujocoBackend(Backend):
         return into
 
     def step(self, command: Floats, substeps: int) -> None:
-        """Hold a command for some physics steps.
-
-        Raises:
-            EngineFailure: Also where memory did not suffice.
-        """
+        """Hold a command for some physics steps."""
         if self.slot is not None:
             self._return()
         self._touches = None

@@ -276,12 +276,7 @@ class Realization:
         return wrong or keys
 
     def edit(self, parameters: Parameters) -> None:
-        """Write parameters, then all numbers that follow from them; unchanged ones cost nothing.
-
-        Raises:
-            UnknownOption: There is no such parameter. Nothing has changed.
-            Infeasible: The model could not move with them. Nothing has changed.
-        """
+        """Write parameters, then all numbers that follow; refuse them, or change all of them."""
         self.check(parameters)
         kept, slots = self.kept, self._slots
         before: dict[ParameterKey, Floats | None] = {}

@@ -50,11 +50,7 @@ def _visible(scene: Scene) -> VisibleModel:
 
 
 def shapes_of(scene: Scene, *, goals: bool = True) -> Shapes:
-    """Collect everything that is seen, goals last, whatever backend steps the scene.
-
-    Raises:
-        ModelError: The structure says nothing about shapes.
-    """
+    """Collect everything that is seen, goals last, whatever backend steps the scene."""
     shapes = _visible(scene).shapes()
     return shapes.joined(goal_shapes(scene.goals)) if goals and scene.goals else shapes
 
@@ -104,11 +100,7 @@ class RenderedImage:
     names: tuple[str, ...]
 
     def shows(self, name: str) -> NDArray[np.bool_]:
-        """Tell which pixels show a body, shape (h, w).
-
-        Raises:
-            UnknownOption: There is no body of this name.
-        """
+        """Tell which pixels show a body, shape (h, w)."""
         if name not in self.names:
             raise UnknownOption("body", name, self.names)
         mask: NDArray[np.bool_] = self.segmentation == self.names.index(name)
