@@ -133,13 +133,10 @@ def hull_overlap(
     position_b: ArrayLike,
     orientation_b: ArrayLike,
 ) -> float:
-    """Compute the volume that two convex polyhedra share, exact to rounding.
+    """Compute the volume that two convex polyhedra share [m³], exact to rounding.
 
     Positions are centers of mass, shape (3,) [m], and orientations quaternions (x, y, z, w) of any
     length.
-
-    Returns:
-        The volume [m³], at least zero and at most that of the smaller one.
     """
     world = np.array(hull_a.vertices) @ rotation_matrix(orientation_a).T + np.asarray(position_a)
     corners = (world - np.asarray(position_b)) @ rotation_matrix(orientation_b)

@@ -43,14 +43,7 @@ class Camera:
     far: float = 100.0
 
     def axes(self) -> Floats:
-        """Compute the directions right, up and back of the camera in the world.
-
-        Returns:
-            A rotation from the world to the camera, shape (3, 3): one direction per row.
-
-        Raises:
-            ValueError: The camera has no optical axis, or ``up`` is parallel to it.
-        """
+        """Compute the directions right, up and back of the camera in the world, one in each row."""
         back = np.subtract(self.eye, self.target)
         right = np.cross(self.up, back)
         axes = np.stack([right, np.cross(back, right), back])  # (3, 3)

@@ -19,11 +19,7 @@ DISTRIBUTIONS = ("mujoco", "mujoco-core", "mujoco-studio")
 
 
 def check_installation() -> None:
-    """Compare the versions of the installed distributions, without importing MuJoCo.
-
-    Raises:
-        MissingEngine: They differ.
-    """
+    """Compare the versions of the installed distributions, without importing MuJoCo."""
     found = {}
     for name in DISTRIBUTIONS:
         with suppress(metadata.PackageNotFoundError):

@@ -90,10 +90,7 @@ class MujocoBackend(Backend):
             raise EngineFailure(problem, self.name)
 
     def contacts(self) -> tuple[ContactPoint, ...]:
-        """List the contact points of the last physics step.
-
-        Of a Runge-Kutta step MuJoCo keeps those of the last stage alone: ``Model.staged`` says so.
-        """
+        """List the contact points of the last physics step; see ``Model.staged``."""
         return named(self._last_touches())
 
     def snapshot(self) -> EngineSnapshot:
