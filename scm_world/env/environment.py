@@ -43,7 +43,7 @@ from scm_world.env.observer import (
 from scm_world.env.rendering import Looks, Window
 from scm_world.env.vector import Vector, box
 from scm_world.errors import ActionError, ModelError, UnknownOption
-from scm_world.geometry.clipping import scaled_clip_kernel
+from scm_world.geometry.numbers import scaled_clip_kernel
 from scm_world.graph import flatten
 from scm_world.models.camera import Camera
 from scm_world.tasks import Task

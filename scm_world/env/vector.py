@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers, Value, Values
-from scm_world.geometry.clipping import scale_rows
+from scm_world.geometry.numbers import scale_rows
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.graph import SCM
 from scm_world.tasks import TIME
