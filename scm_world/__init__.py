@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from scm_world.discovery import discover
     from scm_world.env import MovingAverageAction, ScmWorldEnv
     from scm_world.errors import ScmWorldError
-    from scm_world.geometry import load_hull
+    from scm_world.geometry.hulls import load_hull
     from scm_world.queries import (
         SCM,
         At,
@@ -54,7 +54,7 @@ _NAMES = {
     "discovery": "discover",
     "env": "MovingAverageAction ScmWorldEnv",
     "errors": "ScmWorldError",
-    "geometry": "load_hull",
+    "geometry.hulls": "load_hull",
     "queries": "SCM At Clamp Contact Laboratory On Outcome Plan Reaches World do verify",
     "tasks": "ModelTask StepTask Task TriFingerTask make_task",
     "variables": "Action Box Derived Draw Exogenous Fixed Linear Measured Mechanism Natural Null "

@@ -175,7 +175,13 @@ class Backend(ABC):
     def apply(self, difference: Difference) -> None:
         """Change structure, parameters and state without advancing time.
 
-        What is not mentioned stays as it is, bit for bit.
+        What is not mentioned stays as it is, bit for bit; all of it where an error is raised.
+
+        Raises:
+            UnknownOption: There is no such parameter.
+            NotIntervenable: The engine does not have the parameter.
+            Infeasible: Nothing could move with the parameters.
+            ModelError: The engine cannot realise the structure.
         """
 
     @abstractmethod

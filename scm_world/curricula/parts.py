@@ -16,7 +16,6 @@ from scm_world.curricula.targets import matching
 from scm_world.errors import InterventionError, UnknownOption, UnknownVariable, blamed
 from scm_world.geometry.rotations import (
     from_rotation_vector,
-    quaternion_inverse,
     quaternion_product,
     to_rotation_vector,
 )
@@ -300,7 +299,8 @@ class Interpolate(Part):
 
 def _turned(one: Value, other: Value, share: float) -> Value:
     """Turn from one quaternion towards another, by a share of the angle between them."""
-    turn = to_rotation_vector(quaternion_product(other, quaternion_inverse(one)))
+    back = one * np.array([-1.0, -1.0, -1.0, 1.0]) / np.sum(one * one)  # the inverse of one
+    turn = to_rotation_vector(quaternion_product(other, back))
     between = quaternion_product(from_rotation_vector(share * turn), one)
     return np.asarray(Rotations().nearest(between))
 

@@ -600,7 +600,7 @@ class Simulation(WorldAttributes):
         commands = compiled.composition.commands
         self.translates = commands is not None and commands.applies(static)
         self.structure = compiled.structure(static)
-        self._substeps = max(1, round(self.control_period / self.structure.timestep))
+        self._substeps = max(1, round(self.control_period / float(self.structure.timestep)))
         self.version += 1
         if state is None:
             self.backend.read(values.state)

@@ -12,7 +12,7 @@ from envs import MADE, PUSHING, REACHING, make, roll
 from scm_world.backends.renderer import camera_pixels
 from scm_world.env.vector import WIDE, bounds, corners
 from scm_world.errors import InterventionError, UnknownOption
-from scm_world.geometry import from_rotation_vector, rotation_matrix
+from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
 from scm_world.graph import SCM
 from scm_world.tasks.trifinger.cameras import CAMERAS
 from scm_world.variables import Box, Derived, Exogenous, Linear

@@ -49,7 +49,6 @@ def test_texts_of_something_else_are_refused(kind: str, text: str) -> None:
         TEXTS[kind](text)
 
 
-MESH = """<mujoco><asset><mesh name="it" file="{}"/></asset><worldbody/></mujoco>"""
 INCLUDE = """<mujoco><include file="{}"/><worldbody/></mujoco>"""
 
 
@@ -71,7 +70,6 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "recipe": (".json", Recipe.load),
     "dataset": ("", lambda path: dataset_of(path.parent)),
     "model": (".xml", read_model),
-    "mesh": (".stl", lambda path: _named_by(MESH, path)),
     "included": (".xml", lambda path: _named_by(INCLUDE, path)),
     "shape": (".stl", load_hull),
 }
