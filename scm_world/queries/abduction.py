@@ -360,9 +360,13 @@ class _Abduction:
                 "observe its causes, declare inverse_noise, draw more (n), or allow a tolerance"
             )
             raise ModelError([f"{said}: {advice}"])
-        none = _source(self.model[name]) is None
-        why = "its causes give another value, and it has no noise"
-        why = why if none else "no value of its noise gives what was observed"
+        variable = self.model[name]
+        if _source(variable) is None:
+            why = "its causes give another value, and it has no noise"
+        else:
+            why = "no value of its noise gives what was observed"
+            how = getattr(variable, "inverse_noise", None)
+            why += f", found as its inverse_noise ({how}) says" if isinstance(how, str) else ""
         raise ImpossibleObservation(name, said + why)
 
     def _weights(self) -> Floats:

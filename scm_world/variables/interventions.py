@@ -21,7 +21,15 @@ from pydantic import (
 
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.variables.distributions import Distribution
-from scm_world.variables.kinds import SPACES, AsMechanism, AsParents, Parent, SpaceName, names
+from scm_world.variables.kinds import (
+    SPACES,
+    AsMechanism,
+    AsParents,
+    InverseNoise,
+    Parent,
+    SpaceName,
+    names,
+)
 from scm_world.variables.mechanisms import Concatenation, Function, Linear, Table, check_order
 from scm_world.variables.spaces import Frozen
 
@@ -142,6 +150,7 @@ class Mechanism(Frozen):
             parents in another order is refused.
         parents: The causes; the graph then has these edges in place of the others.
         noise: Distribution of the noise; that of the variable if None.
+        inverse_noise: As of ``Derived``, for counterfactuals of units observed under it.
         of: A bundle that the function gives as a whole; the variable gets its part of it.
 
     Example:
@@ -154,11 +163,12 @@ class Mechanism(Frozen):
     function: AsMechanism | None = None
     parents: AsParents = ()
     noise: Distribution | None = None
+    inverse_noise: InverseNoise | None = None
     of: str | None = None
 
     @model_serializer(mode="wrap")
     def _shorter(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return _without_bundle(handler(self), "of", "noise")
+        return _without_bundle(handler(self), "of", "noise", "inverse_noise")
 
     @property
     def equation(self) -> Function | Linear | Concatenation | Table:

@@ -52,6 +52,7 @@ def _as_mechanism(value: Any) -> Any:
 
 AsNumber = Annotated[Number, BeforeValidator(_as_number)]
 AsMechanism = Annotated[Equation, BeforeValidator(_as_mechanism)]
+InverseNoise = Literal["additive", "monotone"] | AsMechanism
 
 
 @final
@@ -319,7 +320,7 @@ class Derived(Variable):
     noise_shape: tuple[int, ...] | None = None
     start: AsNumber = 0.0
     inverse: AsMechanism | None = None
-    inverse_noise: Literal["additive", "monotone"] | AsMechanism | None = None
+    inverse_noise: InverseNoise | None = None
 
     @property
     def all_parents(self) -> tuple[Parent, ...]:
