@@ -30,8 +30,7 @@ from scm_world.graph.evaluate import earlier, first_value
 from scm_world.queries.equations import Layout
 from scm_world.queries.inversion import Found, density_of, noise_given, proposed
 from scm_world.queries.observations import Observations, observations
-from scm_world.queries.plans import Plan, numbered
-from scm_world.queries.timed import At
+from scm_world.queries.plans import Plan, at_once, numbered
 from scm_world.variables import (
     Action,
     Box,
@@ -431,17 +430,17 @@ class _Abduction:
     def _models(self, do: Mapping[str, Any]) -> list[SCM]:
         """Return the model under what is done, for each control step."""
         plan, found = Plan(numbered(self.model, do)), []
-        for name, part in plan.timed():
-            begin = getattr(part, "step", getattr(part, "start", None))
-            if begin is None or begin >= self._seen.steps:
-                allowed = (f"At and Clamp from control step 0 to {self._seen.steps - 1}",)
-                raise UnknownOption(f"time of an intervention on {name}", part, allowed)
+        for name, act in plan.timed():
+            begin = act.time.start
+            if begin is None or act.time.every is not None or begin >= self._seen.steps:
+                allowed = (f"at= and during= from control step 0 to {self._seen.steps - 1}",)
+                raise UnknownOption(f"time of an intervention on {name}", act, allowed)
         for step in range(self._seen.steps):
-            now = plan.at_start()
-            for name, part in plan.timed():
-                start, stop = (part.step, None) if isinstance(part, At) else (part.start, part.stop)
-                if start <= step and (stop is None or step < stop):
-                    now[name] = part.act
+            now = {name: act for name, acts in plan.items() for act in acts if act.time is None}
+            for name, act in plan.timed():
+                stop = act.time.during and act.time.during[1]
+                if act.time.start <= step and (stop is None or step < stop):
+                    now[name] = at_once(act)
             model = self.model.do(now)
             new = {  # it has nothing in common with what was abducted
                 name: act.model_copy(update={"stream": "counterfactual"})

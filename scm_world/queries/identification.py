@@ -78,7 +78,7 @@ def nature_graph(
     if not isinstance(model, SCM):
         raise UnknownOption("model", model, ("an SCM, such as world.model",))
     plan = Plan(nature)
-    acts = plan.at_first()
+    acts = plan.at_start()
     late = sorted(
         {name for name in plan if name not in acts} | {n for n in plan if len(plan[n]) > 1}
     )

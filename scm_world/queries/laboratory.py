@@ -16,9 +16,8 @@ from scm_world.queries.outcomes import Outcome, column
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Samples, Setting, sample
 from scm_world.queries.tables import read_protocol
-from scm_world.queries.timed import Contact, Reaches
 from scm_world.queries.twins import Twins, twins_of
-from scm_world.variables import Fixed
+from scm_world.variables import Contact, Fixed, Reaches
 from scm_world.world import Simulation
 from scm_world.world.plan import merged
 
@@ -266,8 +265,8 @@ class Laboratory:
         def sees(body: str) -> bool:  # the ground, or a body with visible variables
             return body in ("floor", "twins") or any(n.startswith(body) for n in self.visible)
 
-        for name, part in plan.timed():
-            event = getattr(part, "event", None)
+        for name, timed in plan.timed():
+            event = timed.time.when
             if isinstance(event, Reaches) and event.name not in self.visible:
                 raise Forbidden(f"wait with {name} for {event.name}", self.visible)
             if isinstance(event, Contact) and not all(map(sees, event.bodies)):

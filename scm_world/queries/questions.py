@@ -19,7 +19,7 @@ from scm_world.queries.equations import Equations, System
 from scm_world.queries.estimates import Effect, effect_of
 from scm_world.queries.live import LiveEpisode
 from scm_world.queries.outcomes import Outcome, as_outcome, is_category, usual_outcomes
-from scm_world.queries.plans import Plan, numbered
+from scm_world.queries.plans import Plan, Schedule, numbered
 from scm_world.queries.progress import Progress, part
 from scm_world.queries.rollouts import Unit, as_names, length
 from scm_world.queries.samples import Samples, Setting
@@ -84,7 +84,7 @@ class Questions(ABC):
             unit = Unit(
                 seed=seed,
                 number=episode,
-                layers=((0, plan),),
+                schedule=Schedule([(0, plan)]),
                 policy=policy,
                 steps=length(world, steps),
                 names=as_names(record),
@@ -111,7 +111,7 @@ class Questions(ABC):
             InterventionError: An intervention was refused.
         """
         plan = self._with(do)
-        made = LiveEpisode(self._asked()[0], Unit(seed, episode, ((0, plan),), policy, 1))
+        made = LiveEpisode(self._asked()[0], Unit(seed, episode, Schedule([(0, plan)]), policy, 1))
         made.begin()
         return made
 

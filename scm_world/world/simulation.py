@@ -224,7 +224,12 @@ class Simulation(WorldAttributes):
         return self.composition.cameras(_copies(self._values.now))
 
     def reset(
-        self, *, seed: int | None = None, episode: int = 0, do: Mapping[str, Any] | None = None
+        self,
+        *,
+        seed: int | None = None,
+        episode: int = 0,
+        do: Mapping[str, Any] | None = None,
+        space: AnyRegion | None = None,
     ) -> Audit | None:
         """Begin an episode. Nothing that was done in the last one remains.
 
@@ -234,6 +239,7 @@ class Simulation(WorldAttributes):
             episode: Number of the episode, with a seed.
             do: An intervention that takes part in the beginning: a block of another size stands
                 on the floor. It holds until the next reset.
+            space: In which every target of it must lie; see ``do``.
 
         Returns:
             The audit of the intervention, or None if there was none.
@@ -249,7 +255,7 @@ class Simulation(WorldAttributes):
         else:
             self.episode += 1
         self._begin()
-        return self.do(do) if do else None
+        return self.do(do, space=space) if do else None
 
     def _begin(self) -> None:
         self._lost, self._offset = "", 0

@@ -11,7 +11,7 @@ import pytest
 from scm_world import SCM
 from scm_world.discovery.data import Design, as_frame, collect
 from scm_world.errors import ImpossibleObservation, ModelError, UnknownOption, UnknownVariable
-from scm_world.queries import At, Clamp, Counterfactuals
+from scm_world.queries import Counterfactuals
 from scm_world.variables import (
     Action,
     Bernoulli,
@@ -21,6 +21,7 @@ from scm_world.variables import (
     Derived,
     Draw,
     Exogenous,
+    Hard,
     Integers,
     Laplace,
     Linear,
@@ -570,11 +571,11 @@ def lagged() -> SCM:
 @pytest.mark.parametrize(
     ("do", "replayed"),
     [
-        ({"a": At(2, 5.0)}, {"a": At(3, 5.0)}),
-        ({"a": Clamp(5.0, 2, 4)}, {"a": Clamp(5.0, 3, 5)}),
-        ({"a": Clamp(Shift(1.0), 2, 4)}, {"a": Clamp(Shift(1.0), 3, 5)}),
-        ({"k": Clamp(2.0, 3, 5)}, {"k": Clamp(2.0, 4, 6)}),
-        ({"a": (At(1, 0.0), At(4, 3.0))}, {"a": (At(2, 0.0), At(5, 3.0))}),
+        ({"a": Hard(5.0, at=2)}, {"a": Hard(5.0, at=3)}),
+        ({"a": Hard(5.0, during=(2, 4))}, {"a": Hard(5.0, during=(3, 5))}),
+        ({"a": Shift(1.0, during=(2, 4))}, {"a": Shift(1.0, during=(3, 5))}),
+        ({"k": Hard(2.0, during=(3, 5))}, {"k": Hard(2.0, during=(4, 6))}),
+        ({"a": (Hard(0.0, at=1), Hard(3.0, at=4))}, {"a": (Hard(0.0, at=2), Hard(3.0, at=5))}),
     ],
 )
 def test_interventions_with_times_are_those_of_a_replay(do: Any, replayed: Any) -> None:
@@ -587,7 +588,7 @@ def test_interventions_with_times_are_those_of_a_replay(do: Any, replayed: Any) 
         for name in model:
             np.testing.assert_allclose(found[name][episode], other[name][1:], atol=1e-12)
     with pytest.raises(UnknownOption, match="from control step 0 to 7"):
-        model.counterfactual(model.draw(2, seed=0, steps=8), do={"a": At(8, 1.0)})
+        model.counterfactual(model.draw(2, seed=0, steps=8), do={"a": Hard(1.0, at=8)})
 
 
 def test_a_hidden_series_has_the_posterior_of_the_smoother() -> None:

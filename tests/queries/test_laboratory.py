@@ -15,15 +15,8 @@ from scm_world.errors import (
     UnknownOption,
     UnknownVariable,
 )
-from scm_world.queries import (
-    Clamp,
-    Laboratory,
-    On,
-    Outcome,
-    Reaches,
-    World,
-)
-from scm_world.variables import Mechanism
+from scm_world.queries import Laboratory, Outcome, World
+from scm_world.variables import Hard, Mechanism, Reaches
 
 OUTCOMES = ("tool_block.mass", "floor_friction", Outcome("reward", "sum"))
 
@@ -64,7 +57,7 @@ def test_the_budget_is_never_exceeded() -> None:
     [
         {"gravity": [0.0, 0.0, -5.0]},
         {"floor_friction": Mechanism(np.sum, "gravity")},
-        {"floor_friction": On(Reaches("joint_positions", above=1.0), 0.2)},
+        {"floor_friction": Hard(0.2, when=Reaches("joint_positions", above=1.0))},
     ],
     ids=repr,
 )
@@ -74,7 +67,7 @@ def test_what_is_not_allowed_is_refused(request_: dict[str, Any]) -> None:
     with pytest.raises(Forbidden, match="does not let you"):
         mine.do(request_)
     assert mine.spent == 0
-    mine.do({"floor_friction": Clamp(0.2, 1, 2)})
+    mine.do({"floor_friction": Hard(0.2, during=(1, 2))})
 
 
 def test_questions_need_permission_too() -> None:

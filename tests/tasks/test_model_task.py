@@ -23,8 +23,7 @@ from scm_world.errors import (
     SnapshotMismatch,
     UnknownOption,
 )
-from scm_world.queries import Contact, On
-from scm_world.variables import Integers
+from scm_world.variables import Contact, Hard, Integers
 
 PENDULUM = """
 <mujoco model="pendulum">
@@ -153,8 +152,12 @@ def test_without_actuators_only_an_empty_action_is_one() -> None:
 def test_an_event_names_bodies_that_there_are() -> None:
     """A contact with something else could never happen."""
     with pytest.raises(UnknownOption, match="did you mean 'pole'"):
-        pendulum().rollout(do={"gravity": On(Contact("pol_e", "world"), [0.0, 0.0, 0.0])}, steps=2)
-    pendulum().rollout(do={"gravity": On(Contact("pole", "world"), [0.0, 0.0, 0.0])}, steps=2)
+        pendulum().rollout(
+            do={"gravity": Hard([0.0, 0.0, 0.0], when=Contact("pol_e", "world"))}, steps=2
+        )
+    pendulum().rollout(
+        do={"gravity": Hard([0.0, 0.0, 0.0], when=Contact("pole", "world"))}, steps=2
+    )
 
 
 # --- what happens -------------------------------------------------------------------------------
