@@ -145,7 +145,7 @@ class Mechanism(Timed):
         ('floor_color', 0)
     """
 
-    RARE: ClassVar[tuple[str, ...]] = ("noise", "of", "time")
+    RARE: ClassVar[tuple[str, ...]] = ("noise", "inverse_noise", "of", "time")
 
     kind: Literal["mechanism"] = "mechanism"
     function: AsMechanism | None = None
