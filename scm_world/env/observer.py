@@ -36,9 +36,6 @@ from scm_world.world.mechanisms import places
 BOUND = 10.0
 """Goals that saturate are positions [m], sizes [m] and unit quaternions; beyond they saturate."""
 
-STACKS = ("cameras", "channels")
-"""How the pictures of several cameras are put together."""
-
 
 @final
 class Goals:
@@ -190,7 +187,6 @@ class Observing:
     keypoints: bool | str = False
     cameras: Sequence[str | Camera] | None = None
     image_size: int | tuple[int, int] | None = None
-    stack: str = STACKS[0]
     normalize: bool = True
     goals: bool = False
     pad: Mapping[str, Any] | None = None
@@ -205,15 +201,14 @@ class Observing:
         appended = self.include or self.keypoints or self.context == "observation"
         if pictures and appended:
             raise UnknownOption("appendix of a picture", "numbers", ("context='privileged'",))
-        one_of("stack", self.stack, STACKS)
         if self.keypoints not in (False, True, "view"):
             raise UnknownOption("keypoints", self.keypoints, ("False", "True", "view"))
         if self.pad is not None and (pictures or self.keypoints):
             raise UnknownOption("pad", self.pad, ("None with pictures and keypoints",))
-        for option, usual in (("cameras", None), ("image_size", None), ("stack", STACKS[0])):
+        for option in ("cameras", "image_size"):
             value = getattr(self, option)
-            if value != usual and not pictures:
-                allowed = ("any with observation_mode='pixel'", f"{usual} in the other modes")
+            if value is not None and not pictures:
+                allowed = ("any with observation_mode='pixel'", "None in the other modes")
                 raise UnknownOption(option, value, allowed)
 
 
@@ -274,7 +269,7 @@ def observer(
     if how.mode == "pixel":
         from scm_world.env.pixels import Pixels
 
-        main = Pixels(world, how.cameras, how.image_size, how.stack)
+        main = Pixels(world, how.cameras, how.image_size)
     else:
         main = _vector(world, declaration, how, largest)
     parts: dict[str, Observer] = {"observation": main}
