@@ -301,11 +301,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         return self._delta.toward(self._read(command))
 
     def _read(self, action: ArrayLike) -> Any:
-        """Read an action or a command, shape (n,); 32-bit numbers stay what they are.
-
-        Raises:
-            ActionError: It has another shape, or is no real numbers.
-        """
+        """Read an action or a command, shape (n,); 32-bit numbers stay what they are."""
         given: Any = action
         if getattr(action, "dtype", None) is not SINGLE:
             given = doubles(action, self._given.size)

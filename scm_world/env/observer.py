@@ -82,12 +82,6 @@ def goal_reward(world: Simulation) -> Callable[[ArrayLike, ArrayLike, Any], Any]
 
     With ``weights="sparse"``, or where only ``fractional_success`` and ``success`` have weights,
     it is the reward of the step. Else the first call warns: goals do not decide dense terms.
-
-    Args:
-        world: Whose task, weights and conventions hold.
-
-    Raises:
-        UnknownOption: The reward is no weighted sum of terms.
     """
     reward: Any = world.model.declared("reward")
     if not isinstance(reward.mechanism, Linear):
@@ -106,9 +100,6 @@ def goal_reward(world: Simulation) -> Callable[[ArrayLike, ArrayLike, Any], Any]
         Returns:
             The weighted sum of the terms that goals alone decide, shape (...); times the control
             period under the conventions that say so.
-
-        Raises:
-            UnknownOption: They are no finite numbers, or have other shapes.
         """
         nonlocal warned
         size = Goals(world.compiled).size
@@ -174,11 +165,7 @@ class Observer(Protocol):
 @final
 @dataclass(frozen=True)
 class Observing:
-    """How a world is observed; see ``ScmWorldEnv`` for the fields.
-
-    Raises:
-        UnknownOption: Something does not exist, or does not go together.
-    """
+    """How a world is observed; see ``ScmWorldEnv`` for the fields."""
 
     mode: str = "structured"
     names: Sequence[str] = ()
@@ -246,20 +233,7 @@ def observer(
     goals: Goals | None,
     largest: CompiledTask,
 ) -> Observer:
-    """Put together what is asked for.
-
-    Args:
-        world: That is observed.
-        declaration: Of the structure; the observer holds for that one only.
-        how: What is asked for.
-        goals: Of the structure, if it has some.
-        largest: The structure whose layout the vectors have; the same one without padding.
-
-    Raises:
-        UnknownOption: The task has no boxes or no goals, or there is no such camera.
-        InterventionError: The structure has bodies that the largest one does not have.
-        UnknownVariable: There is no such variable.
-    """
+    """Put together what is asked for."""
     main: Observer
     if how.goals and goals is None:
         raise UnknownOption("goal_env", True, (f"False: {declaration.task.name} has no goals",))

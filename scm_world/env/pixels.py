@@ -66,11 +66,7 @@ def read_camera(camera: Any, known: Mapping[str, Camera] | None) -> Any:
 
 
 def height_and_width(option: str, size: Any) -> tuple[int, int]:
-    """Read the size of pictures: height and width, or both in one [pixels].
-
-    Raises:
-        UnknownOption: It is something else.
-    """
+    """Read the size of pictures: height and width, or both in one [pixels]."""
     numbers = np.asarray(size)
     if numbers.shape not in ((), (2,)) or not np.issubdtype(numbers.dtype, np.integer):
         raise UnknownOption(option, size, ("a whole number", "(height, width)"))
@@ -95,10 +91,6 @@ class Pixels:
         layouts: Where variables stand in vectors: there are none.
         space: uint8, shape (n, 3, h, w), with goals (2 n, 3, h, w); under the predecessor's
             conventions (2 n, h, w, 3).
-
-    Raises:
-        UnknownOption: There is no such camera, or the sizes are none or differ.
-        ModelError: The world has no shapes.
     """
 
     names: tuple[str, ...] = ()
@@ -167,13 +159,7 @@ class Pixels:
 
 
 def placed(scene: Scene, given: str | Camera, camera: Camera) -> Camera:
-    """Put a camera of a model where it is now.
-
-    Args:
-        scene: Of the present.
-        given: What was asked for.
-        camera: The same, as it is in the default scene.
-    """
+    """Put a camera of a model where it is now."""
     if given == AUTOMATIC:
         return following_camera(camera, shapes_of(scene, goals=False))
     if isinstance(given, str):
