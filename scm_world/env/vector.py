@@ -41,15 +41,8 @@ def bounds(model: SCM, name: str) -> tuple[Floats, Floats]:
 
     A declared bound that follows another variable is taken where that one makes it widest.
 
-    Args:
-        model: Where the variable is declared.
-        name: Of the variable.
-
     Returns:
         Lower and upper bound, shape (n,) each; ``∓WIDE`` where none is declared.
-
-    Raises:
-        UnknownVariable: No variable has this name.
     """
     variable = model.declared(name)
     extent = _extent(model, variable.bounds, name.rpartition(".")[2])
