@@ -1128,8 +1128,7 @@ def complaints(report: Verification, honest: Verification | None = None) -> Iter
     if honest is not None:
         seen = {edge.key for edge in honest.fired}
         yield from ({cause, effect} for cause, effect, _ in seen.intersection(report.never_fired))
-    yield from ({one.variable, one.after} for one in report.unstable)
-    yield from ({*pair} for pair in report.shared_noise)
+    yield from ({one.variable} for one in report.unstable)
 
 
 def caught(
@@ -1148,8 +1147,6 @@ def verified(
 ) -> Verification:
     """Verify a system with the budget of the study."""
     system = make()
-    if isinstance(system, SCM):
-        probes, held_out = probes + held_out, 0
     return verify(system, seed=seed, probes=probes, held_out=held_out)
 
 
