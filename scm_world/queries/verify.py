@@ -87,7 +87,6 @@ def verify(
     Raises:
         UnknownOption: ``probes`` is not a positive whole number, ``held_out`` is not a whole
             number, there are options for a world that is made, or a name does not exist.
-        SnapshotMismatch: The backend changes parameters by itself.
 
     Example:
         >>> found = verify("reaching", backend="fake", probes=1)
@@ -126,7 +125,7 @@ def _verified(
     def experiments(states: Iterator[Probe], first: int, *, held: bool) -> Iterator[Effects]:
         for number, probe in enumerate(states, first):
             one = paired.run(number, probe, missing)
-            if held and markov is not None:
+            if held and markov is not None and not one.unstable:
                 markov.run(number, probe, one)
             yield one
 

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.errors import EngineFailure, InterventionError
+from scm_world.errors import EngineFailure, InterventionError, SnapshotMismatch
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier
 from scm_world.policies.planning import action_range
@@ -96,13 +96,26 @@ class Paired:
             wanted: The declared edges that are looked for; all edges if None.
         """
         effects = Effects(exact=self.exact)
-        instants = self.look(number, probe)
+        try:
+            instants = self.look(number, probe)
+        except SnapshotMismatch:
+            if not self._is_worn(effects):
+                raise
+            return effects
         effects.rollouts += 1
         self._see_mechanisms(ProbeSetting(number, probe.kind), instants, wanted, effects)
         if self._world is not None:
             effects.touched |= {body for pair in touching_pairs(self._world) for body in pair}
             self._see_states(number, probe, instants, wanted, effects)
         return effects
+
+    def _is_worn(self, effects: Effects) -> bool:
+        """Note the parameters that the backend has changed by itself; no state comes back then."""
+        world: Any = self._world
+        now, names = world.current()[0], {k: n for n, k in world.compiled.parameter_keys.items()}
+        for key, value in world.backend.parameters(names).items():
+            effects.see_unstable(names[key], gap(value, now[names[key]]))
+        return bool(effects.unstable)
 
     def look(self, number: int, probe: Any) -> list[Instant]:
         """Return two instants of a probe state, the later one first, and two drawn ones."""
