@@ -35,7 +35,7 @@ needs_both = pytest.mark.skipif(not HAS_BULLET, reason="Bullet is not installed"
 @pytest.fixture(scope="module", params=ENGINES)
 def pushing(request: pytest.FixtureRequest) -> Verification:
     """Verify pushing with few probe states."""
-    return verify("pushing", backend=request.param, probes=4)
+    return verify("pushing", backend=request.param, probes=4, held_out=2)
 
 
 def test_pushing_has_no_undeclared_effect(pushing: Verification) -> None:
@@ -48,8 +48,8 @@ def test_pushing_has_no_undeclared_effect(pushing: Verification) -> None:
 
 def test_coverage_ends_with_what_was_seen(pushing: Verification) -> None:
     """The curve has one number per probe state, never falls, and ends with all that fired."""
-    assert (pushing.probes, pushing.held_out) == (4, 8)
-    assert len(pushing.coverage) == 12
+    assert (pushing.probes, pushing.held_out) == (4, 2)
+    assert len(pushing.coverage) == 6
     assert list(pushing.coverage) == sorted(pushing.coverage)
     assert pushing.coverage[-1] == len(pushing.fired)
     assert len(pushing.fired) + len(pushing.never_fired) == len(pushing.declared)
@@ -258,15 +258,24 @@ def test_a_servo_whose_every_command_saturates_is_named_as_such() -> None:
 
 def test_results_depend_on_the_seed_alone() -> None:
     """Two runs with one seed agree in everything but the time."""
-    one, two = (verify("reaching", probes=2, held_out=1, seed=5) for _ in range(2))
+    one, two = (verify("reaching", probes=1, held_out=1, seed=5) for _ in range(2))
     same = {"seconds": 0.0}
     assert one.model_copy(update=same) == two.model_copy(update=same)
+
+
+PENDULUM = """
+<mujoco><worldbody><body>
+  <joint name="hinge" axis="0 1 0" damping=".1"/>
+  <geom name="rod" type="capsule" size=".02" fromto="0 0 0 0 0 -.5" mass="1"/>
+</body></worldbody></mujoco>
+"""
 
 
 def test_it_ends_when_all_is_seen() -> None:
     """With every edge seen the search ends, and held-out states follow."""
     told: list[tuple[int, int]] = []
-    found = verify("reaching", probes=60, held_out=2, progress=lambda *at: told.append(at))
+    world = World.from_mjcf(PENDULUM)
+    found = verify(world, probes=60, held_out=2, progress=lambda *at: told.append(at))
     assert found.never_fired == ()
     assert (found.planned, found.held_out, found.interrupted) == (60, 2, False)
     assert found.probes < 60
@@ -319,7 +328,7 @@ def test_backends_agree_on_the_sign_of_clear_effects() -> None:
 
 def test_a_backend_agrees_with_itself() -> None:
     """The same backend twice: every effect is clear, with the same sign and size."""
-    found = World("reaching").compare("mujoco", probes=2)
+    found = World("reaching").compare("mujoco", probes=1)
     assert found.share == 1.0
     assert {one.ratio for one in found.effects} == {1.0}
     assert len(found.effects) > 10
@@ -363,23 +372,25 @@ def test_the_command_writes_a_report_and_a_picture() -> None:
 
 @pytest.mark.usefixtures("_elsewhere")
 def test_strictly_the_command_exits_0_where_the_graph_is_confirmed() -> None:
-    """With --strict a task whose edges are all seen exits 0, and 1 where some are not."""
-    reaching = ["verify", "reaching", "--strict"]
-    result = CliRunner().invoke(app, [*reaching, "--probes", "14", "--out", "here"])
+    """With --strict a system whose edges are all seen exits 0, and 1 where some are not."""
+    Path("pendulum.xml").write_text(PENDULUM)
+    seen = ["verify", "pendulum.xml", "--strict", "--probes", "6", "--out", "here"]
+    result = CliRunner().invoke(app, seen)
     assert result.exit_code == 0, result.output
     found = Verification.from_json(Path("here/report.json").read_text())
     assert found.outcome == "confirmed"
     few = ["--backend", "fake", "--probes", "1", "--held-out", "0"]
-    assert CliRunner().invoke(app, [*reaching, *few]).exit_code == 1
+    assert CliRunner().invoke(app, ["verify", "reaching", "--strict", *few]).exit_code == 1
 
 
 @needs_both
 @pytest.mark.usefixtures("_elsewhere")
 def test_the_command_compares_engines() -> None:
     """With --both the report is that of two engines."""
+    Path("pendulum.xml").write_text(PENDULUM)
     limits = ("--probes", "2", "--held-out", "1")
-    result = CliRunner().invoke(app, ("verify", "reaching", "--both", *limits))
-    folder = Path("scm-world-results/verify-reaching-both-seed0")
+    result = CliRunner().invoke(app, ("verify", "pendulum.xml", "--both", *limits))
+    folder = Path("scm-world-results/verify-pendulum-both-seed0")
     found = Comparison.from_json((folder / "comparison/report.json").read_text())
     each = [
         Verification.from_json((folder / name / "report.json").read_text())
