@@ -232,8 +232,8 @@ class World(Simulation, Questions):
             UnknownOption: There is no such backend, or ``probes`` is not a positive whole number.
 
         Example:
-            >>> World("reaching", backend="fake").compare("fake", probes=1).outcome
-            'not refuted'
+            >>> World("reaching", backend="fake").compare("fake", probes=1).share
+            1.0
         """
         return compare_backends(self, backend, probes=probes, seed=seed, progress=progress)
 

@@ -48,7 +48,7 @@ def test_a_cut_edge_is_named_where_the_honest_system_shows_it() -> None:
 
 def test_two_colors_together_are_named_together() -> None:
     """Neither of them acts alone: the effect has both as its cause, and no smaller set."""
-    report = verify(BY_NAME["label and paint act together only"].make(), probes=8, held_out=0)
+    report = verify(BY_NAME["label and paint act together only"].make(), probes=8)
     causes = {edge.cause for edge in report.undeclared if edge.effect == "lower"}
     assert causes & {"paint & label", "label & paint", "paint", "label"}
     assert all(" & " in cause or cause in ("paint", "label") for cause in causes)
@@ -56,7 +56,7 @@ def test_two_colors_together_are_named_together() -> None:
 
 def test_memory_has_a_lag() -> None:
     """What is put back after one step acts three steps later."""
-    report = verify(BY_NAME["the motor echoes after three steps"].make(), probes=2, held_out=0)
+    report = verify(BY_NAME["the motor echoes after three steps"].make(), probes=2, held_out=2)
     assert {edge.lag for edge in report.undeclared if edge.cause == "push.control"} == {4}
 
 

@@ -316,12 +316,11 @@ def test_backends_agree_on_the_sign_of_clear_effects() -> None:
     world = World("pushing")
     world.reset(seed=5)
     before = world.vector.tobytes()
-    found = world.compare("bullet", probes=4)
+    found = world.compare("bullet", probes=6)
     assert world.vector.tobytes() == before
     assert found.outcome == "confirmed"
-    effects = {one.parameter: one for one in found.effects}
-    assert effects["gravity"].same == effects["gravity"].clear > 0
-    assert effects["gravity"].ratio == pytest.approx(1.0, abs=0.01)
+    assert len(found.effects) > 3
+    assert all(0 < one.low <= one.ratio <= one.high < 3 for one in found.effects)
     assert Comparison.from_json(found.to_json()) == found
     assert "Comparison of mujoco and bullet on pushing: confirmed" in str(found)
 
@@ -335,8 +334,14 @@ def test_a_backend_agrees_with_itself() -> None:
 
 
 def test_what_shows_nothing_confirms_nothing() -> None:
-    """Without physics there is no effect to compare."""
-    found = World("reaching", backend="fake").compare("fake", probes=1)
+    """Where no parameter acts there is no effect to compare."""
+    world = World.from_step(
+        lambda p, s, a, n: {"x": s["x"]},
+        parameters=[Exogenous(name="idle", default=1.0)],
+        states=[Measured(name="x", default=0.0, parents=("x",))],
+        control_dt=0.1,
+    )
+    found = world.compare("step", probes=1)
     assert (found.effects, found.outcome) == ((), "not refuted")
 
 

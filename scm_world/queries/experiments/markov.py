@@ -22,7 +22,7 @@ from scm_world.policies.planning import action_range
 from scm_world.queries.experiments.effects import RESOLUTION, Effects, ProbeSetting, gap
 from scm_world.queries.experiments.paired import another, engine_decided, settable
 from scm_world.queries.experiments.probes import Probe, ProbeGenerator, anywhere
-from scm_world.queries.local import contact_terms, contacts_of, holds
+from scm_world.queries.local import contacts_of
 from scm_world.variables import Noise, Rotations
 from scm_world.world import Simulation
 
@@ -38,13 +38,13 @@ LATER = 3
 PLACES = 4
 """How many states are tried that both runs are put into."""
 
-NEAR = 0.1
+NEAR = 0.01
 """How far towards another value of its spaces geometry is moved: else bodies would overlap."""
 
 GEOMETRY = "m", "rad"
 """Units of what decides whether bodies overlap; orientations do as well."""
 
-BLAMED = 3
+BLAMED = 6
 """For how many variables, and how often of each, the causes of a difference are looked for."""
 
 ATTEMPTS = 4
@@ -85,9 +85,6 @@ class Markov:
             name: tuple(p for p in model.declared(name).all_parents if p.lag)
             for name in self._states
         }
-        self._terms = terms = contact_terms(world)
-        still = set(terms["still"])  # what belongs to these may act in any contact
-        terms["of"] = {n: [b for b in found if b not in still] for n, found in terms["of"].items()}
         self._least = 0.0 if world.task.generated_graph else RESOLUTION
         self._blamed: Counter[tuple[str, int]] = Counter()
 
@@ -111,22 +108,21 @@ class Markov:
     # --- the pieces -------------------------------------------------------------------------------
 
     def _groups(self, context: Mapping[str, Value]) -> list[tuple[Collection[str], list[str]]]:
-        """Group the states by their parents; by contact act only those of what touches now."""
+        """Group the states by their parents; those by contact act only where something touches."""
         groups: dict[frozenset[str], list[str]] = {}
-        held, acts = {*self._targets, *self._actions}, self._acting(context)
+        held, touching = {*self._targets, *self._actions}, self._touches(context)
         for name, parents in self._parents.items():
-            here = {p.name for p in parents if p.when != "contact" or acts(p.name, name)}
+            here = {p.name for p in parents if p.when != "contact" or touching}
             groups.setdefault(frozenset(here & held), []).append(name)
         return list(groups.items())
 
-    def _acting(self, request: Mapping[str, Value]) -> Callable[[str, str], bool]:
-        """Return what tells whether an edge by contact holds in the coming control step."""
+    def _touches(self, request: Mapping[str, Value]) -> bool:
+        """Check whether any two bodies touch in a physics step of the coming control step."""
         action = self._set(request)
         try:
-            steps = contacts_of(self._world, action)
+            return any(contacts_of(self._world, action))
         except ModelError:  # contacts are not all known
-            return lambda cause, effect: True
-        return holds(self._terms, {contact.bodies for step in steps for contact in step})
+            return True
 
     def _wish(
         self, rng: ProbeGenerator, stream: str, *, geometry: bool = False, actions: bool = True
@@ -204,14 +200,12 @@ class Markov:
         found = {key: size for key, size in found.items() if size > self._least}
         if not found:
             return {}
-        acts = self._acting(request)  # what touches now, and did not before, may act
+        touching = self._touches(request)  # what did not touch before may act now
         return {
             (name, lag): size
             for (name, lag), size in found.items()
-            if not any(
-                p.when == "contact" and p.name in changed and acts(p.name, name)
-                for p in self._parents[name]
-            )
+            if not touching
+            or not any(p.when == "contact" and p.name in changed for p in self._parents[name])
         }
 
     # --- the past ---------------------------------------------------------------------------------
@@ -237,7 +231,7 @@ class Markov:
             break
         else:
             return
-        wish = self._wish(rng, "memory")
+        wish = self._wish(rng, "memory", geometry=True)
         chosen = rng.random("half", len(wish)) < 0.5
         for half in (chosen, ~chosen):
             some = {name: wish[name] for name, one in zip(wish, half, strict=True) if one}
