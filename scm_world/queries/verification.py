@@ -43,99 +43,69 @@ class Report(BaseModel):
             raise UnreadableFile(cls.__name__, reason, "give what to_json() wrote") from None
 
 
+class EdgeReport(Report):
+    """What was found of one edge.
+
+    Attributes:
+        cause: The variable that was changed; several, joined by ``" & "``, if each is needed.
+        effect: The variable that responded, or did not.
+        lag: After how many control steps.
+    """
+
+    cause: str
+    effect: str
+    lag: int
+
+    @property
+    def key(self) -> EdgeKey:
+        """Cause, effect and lag."""
+        return self.cause, self.effect, self.lag
+
+
 @final
-class Fired(Report):
+class Fired(EdgeReport):
     """A declared edge that moved its child.
 
     Attributes:
-        cause: The variable that was changed.
-        effect: The variable that responded.
-        lag: 0 or 1.
         after: How many probe states it took.
         largest: Largest effect observed, in the unit of the child.
     """
 
-    cause: str
-    effect: str
-    lag: int
     after: int
     largest: float
 
-    @property
-    def key(self) -> EdgeKey:
-        """Cause, effect and lag."""
-        return self.cause, self.effect, self.lag
-
 
 @final
-class Undeclared(Report):
-    """An effect without an edge.
+class Undeclared(EdgeReport):
+    """An effect without an edge; at a lag of 2 or more, something remembers what no state holds.
 
     Attributes:
-        cause: The variable that was changed; several, joined by ``" & "``, if each is needed.
-        effect: The variable that should not have responded.
-        lag: After how many control steps; from 2 on, something remembers what no state holds.
         size: Largest effect observed, in the unit of the child.
         probe: Number of the probe state in which it was observed.
         kind: How this probe state came about.
-        change: By how much the cause was moved, flattened; empty if no world was intervened on.
+        change: By how much the cause was moved, flattened; empty if a mechanism was evaluated.
     """
 
-    cause: str
-    effect: str
-    lag: int
     size: float
     probe: int
     kind: str
     change: tuple[float, ...]
-
-    @property
-    def key(self) -> EdgeKey:
-        """Cause, effect and lag."""
-        return self.cause, self.effect, self.lag
 
     def __str__(self) -> str:
         return f"{arrow(self.key)}: {self.size:.3g} in probe {self.probe} ({self.kind})"
 
 
 @final
-class Unstable(Report):
-    """A variable that differs by itself: in a second run, or evaluated a second time.
-
-    Attributes:
-        variable: That differs.
-        size: Largest difference, in the unit of the variable.
-    """
-
-    variable: str
-    size: float
-
-    def __str__(self) -> str:
-        return f"{self.variable}: {self.size:.3g}"
-
-
-@final
-class Unseen(Report):
+class Unseen(EdgeReport):
     """A declared edge that moved its child in no probe state.
 
     Attributes:
-        cause: The variable that was changed, or could not be.
-        effect: The variable that did not respond.
-        lag: 0 or 1.
         states: In how many probe states the cause was changed.
         reason: Why nothing was seen, as far as the experiments tell.
     """
 
-    cause: str
-    effect: str
-    lag: int
     states: int
     reason: str
-
-    @property
-    def key(self) -> EdgeKey:
-        """Cause, effect and lag."""
-        return self.cause, self.effect, self.lag
 
     def __str__(self) -> str:
         return f"{arrow(self.key)}: {self.reason}"
@@ -160,7 +130,8 @@ class Verification(Report):
         provenance: How many declared edges were seen, how many there are, and how many effects
             without an edge were seen, by what decides the effect: ``"engine"``, ``"readout"``
             (computed from states) or ``"definition"``.
-        unstable: What differed though nothing had been changed.
+        unstable: By how much a variable differed though nothing had been changed: in a second run,
+            or evaluated a second time.
         planned: How many probe states there may have been, without those.
         interrupted: Whether it was stopped (Ctrl-C) before it was through.
         rollouts: Control steps simulated in an experiment of their own.
@@ -183,7 +154,7 @@ class Verification(Report):
     probes: int
     held_out: int = 0
     provenance: dict[str, tuple[int, int, int]] = {}
-    unstable: tuple[Unstable, ...] = ()
+    unstable: dict[str, float] = {}
     planned: int
     interrupted: bool
     rollouts: int
@@ -283,7 +254,11 @@ class Verification(Report):
             ("noise floor (run twice)", f"{self.floor:g}", self.floor == 0.0),
             ("never seen", self._reasons(), None),
             ("undeclared effects", listed(map(str, self.undeclared)), not self.undeclared),
-            ("differs by itself", listed(map(str, self.unstable)), not self.unstable),
+            (
+                "differs by itself",
+                listed(f"{name}: {size:.3g}" for name, size in self.unstable.items()),
+                not self.unstable,
+            ),
             ("seconds", f"{self.seconds:.1f}", None),
         )
 

@@ -21,7 +21,6 @@ from scm_world.queries.verification import (
     Fired,
     Undeclared,
     Unseen,
-    Unstable,
     Verification,
     by_provenance,
     named,
@@ -180,9 +179,7 @@ def _verified(
         floor=effects.floor,
         threshold=effects.threshold,
         provenance=by_provenance(model, declared, observed, wrong),
-        unstable=tuple(
-            Unstable(variable=name, size=size) for name, size in sorted(effects.unstable.items())
-        ),
+        unstable=effects.unstable,
         fired=tuple(
             Fired(**named(key), after=after[key], largest=effects.largest[key])
             for key in sorted(observed.intersection(declared))
