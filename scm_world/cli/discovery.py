@@ -220,7 +220,7 @@ def _numbers(report: DiscoveryReport) -> Iterator[tuple[str, str, bool | None]]:
         yield "options", ", ".join(report.arguments), None
     yield "probe states", states, None if complete else False
     yield "rollouts, at least needed", f"{report.rollouts}, {report.bound}", None
-    yield "noise floor (do and undo)", f"{report.floor:.3g}", None
+    yield "noise floor (run twice)", f"{report.floor:.3g}", None
     yield "threshold", f"{report.threshold:.3g}", None
     yield "largest effect without an edge", f"{report.inert:.3g}", None
     yield "precision", f"{score.precision:.4f}", None
