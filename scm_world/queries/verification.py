@@ -135,8 +135,6 @@ class Verification(Report):
         planned: How many probe states there may have been, without those.
         interrupted: Whether it was stopped (Ctrl-C) before it was through.
         rollouts: Control steps simulated in an experiment of their own.
-        floor: Largest difference between two runs without a change.
-        threshold: An effect must exceed it.
         fired: Declared edges that were seen.
         unseen: Declared edges that were not, with the reasons.
         undeclared: Effects without an edge.
@@ -158,13 +156,16 @@ class Verification(Report):
     planned: int
     interrupted: bool
     rollouts: int
-    floor: float
-    threshold: float
     fired: tuple[Fired, ...]
     unseen: tuple[Unseen, ...]
     undeclared: tuple[Undeclared, ...]
     seconds: float
     versions: dict[str, str]
+
+    @property
+    def floor(self) -> float:
+        """The largest difference between two runs without a change."""
+        return max(self.unstable.values(), default=0.0)
 
     @property
     def never_fired(self) -> tuple[EdgeKey, ...]:

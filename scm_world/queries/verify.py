@@ -176,8 +176,6 @@ def _verified(
         planned=probes,
         interrupted=interrupted,
         rollouts=effects.rollouts,
-        floor=effects.floor,
-        threshold=effects.threshold,
         provenance=by_provenance(model, declared, observed, wrong),
         unstable=effects.unstable,
         fired=tuple(

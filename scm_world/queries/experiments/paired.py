@@ -118,7 +118,10 @@ class Paired:
         return bool(effects.unstable)
 
     def look(self, number: int, probe: Any) -> list[Instant]:
-        """Return two instants of a probe state, the later one first, and two drawn ones."""
+        """Return two instants of a probe state, the later one first, and three that are drawn.
+
+        In the last one, each cause of a mechanism is moved by itself.
+        """
         if self._world is None:
             first = self._model.solve(self._idle, key=NoiseKey(self._noise, number, 0))
             key = NoiseKey(self._noise, number, 1)
@@ -130,7 +133,15 @@ class Paired:
             self._world.step(probe.action)
             instants = [Instant(self._world.values(), self._world.previous()), here]
         self._kept = [*self._kept, *instants][-2 * REMEMBERED :]
-        return [*instants, *(self._drawn(number, turn, instants[-1]) for turn in (0, 1))]
+        now, rng = instants[-1], ProbeGenerator(self._noise, number)
+        moved = {
+            name: value
+            for name in {cause: None for causes in self._causes.values() for cause, _ in causes}
+            for value in (another(self._model, name, now.values, rng, "moved", 1.0),)
+            if value is not None
+        }
+        others = [self._drawn(number, turn, now) for turn in (0, 1)]
+        return [*instants, *others, now._replace(values=moved)]
 
     def _drawn(self, number: int, turn: int, now: Instant) -> Instant:
         """Draw everything that has no parents, and compute what follows from it.
@@ -167,7 +178,7 @@ class Paired:
         the same has to come out.
         """
         others = [*instants, *self._kept]
-        bases = [instants[0], instants[-2]]
+        bases = [instants[0], instants[2]]
         if self._world is None:  # experiments are counted, and every unit is another circumstance
             bases = [bases[setting.probe % 2]]
         done = set[tuple[str, int, int]]()
