@@ -52,7 +52,7 @@ from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Simulation
 from scm_world.world.compiled_task import CompiledTask
-from scm_world.world.plan import merged
+from scm_world.world.interventions import merged
 
 RENDER_MODES = ("rgb_array", "human")
 SINGLE = np.dtype(np.float32)

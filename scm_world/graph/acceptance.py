@@ -83,8 +83,9 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
             by = value.by if np.ndim(value.by) else np.full(variable.shape, value.by)
             coerce(variable, by)
             return value
-    number = coerce(variable, _plain(variable, value))
-    if variable.bounds is not None and not variable.bounds.parents():
+    number = coerce(variable, _plain(variable, value) if isinstance(value, Hard) else value)
+    bounds = variable.bounds
+    if bounds is not None and not bounds.parents() and not bounds.contains(number, {}):
         check_bounds(variable, number, {})
     return Hard(number.tolist())
 
@@ -117,9 +118,7 @@ def _known(declared: Mapping[str, Variable], names: Any) -> None:
             raise UnknownVariable(name, declared)
 
 
-def _plain(variable: Variable, value: Any) -> Any:
-    if not isinstance(value, Hard):
-        return value
+def _plain(variable: Variable, value: Hard) -> Any:
     matrix = len(variable.shape) > 1 and np.size(value.value) == np.prod(variable.shape)
     return np.reshape(value.value, variable.shape) if matrix else value.value
 

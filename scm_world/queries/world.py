@@ -23,7 +23,7 @@ from scm_world.queries.twins import AnyTwins, twins_of
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit, Simulation, WorldSnapshot
-from scm_world.world.plan import merged
+from scm_world.world.interventions import merged
 
 
 @final
