@@ -66,7 +66,8 @@ def _box(
 @njit(cache=True)
 def _height(point: Floats, plane: Floats) -> float:
     """Compute how far within a plane a point is [m]."""
-    return plane[3] - plane[0] * point[0] - plane[1] * point[1] - plane[2] * point[2]
+    height: float = plane[3] - plane[0] * point[0] - plane[1] * point[1] - plane[2] * point[2]
+    return height
 
 
 @njit(cache=True)
