@@ -17,20 +17,17 @@ from scm_world.work.processes import Worker, cores
 
 
 def test_how_many_processes_there_are_changes_nothing() -> None:
-    """Two or three: bit for bit what one environment after another says."""
+    """Two, for three environments: bit for bit what one environment after another says."""
     pytest.importorskip("pybullet")
     options: dict[str, Any] = {"backend": "bullet", "max_episode_length": 3}
-    there = [{"workers": workers} for workers in (2, 3)]
-    executors = [("loop", {}), *(("processes", how) for how in there)]
     said = []
-    for executor, how in executors:
+    for executor, how in (("loop", {}), ("processes", {"workers": 2})):
         envs = make(executor, 3, autoreset_mode="SameStep", **how, **options)
         mine = [envs.reset(seed=1), *(envs.step(action) for action in actions(5, 3))]
         envs.do([None, {"floor_friction": 0.3}, {"tool_block.mass": "B"}])
         said.append([*mine, envs.present(), *(envs.step(action) for action in actions(2, 3, 1))])
         envs.close()
-    for other in said[1:]:
-        check_same(other, said[0])
+    check_same(said[1], said[0])
 
 
 def test_the_fastest_executor_is_taken() -> None:
