@@ -14,7 +14,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from scm_world._types import Floats, Integers
-from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption, WrongShape
+from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption, WrongValue
 from scm_world.models.scene import (
     Difference,
     ParameterKey,
@@ -175,7 +175,13 @@ class Backend(ABC):
     def apply(self, difference: Difference) -> None:
         """Change structure, parameters and state without advancing time.
 
-        What is not mentioned stays as it is, bit for bit.
+        What is not mentioned stays as it is, bit for bit; all of it where an error is raised.
+
+        Raises:
+            UnknownOption: There is no such parameter.
+            NotIntervenable: The engine does not have the parameter.
+            Infeasible: Nothing could move with the parameters.
+            ModelError: The engine cannot realise the structure.
         """
 
     @abstractmethod
@@ -315,7 +321,7 @@ class InMemory(Backend, ABC):
             for key, value in difference.parameters.items():
                 shape = self._known(key).shape
                 if np.shape(value) != shape:
-                    raise WrongShape(".".join(key).strip("."), value, shape, np.shape(value))
+                    raise WrongValue(".".join(key).strip("."), value, shape, np.shape(value))
         self._keep(difference.parameters)
         if difference.state is not None:
             self._place(difference.state)

@@ -13,19 +13,20 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from scm_world._arguments import one_of, real_numbers
-from scm_world._types import Floats
+from scm_world._types import Floats, Values
 from scm_world.errors import ActionError, Infeasible, InterventionError, UnknownOption
-from scm_world.graph import flatten
+from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.tasks import Task, make_task
 from scm_world.variables import Draw, Null
 from scm_world.variables.kinds import SPACES, SpaceName
+from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.structures import StructureCache
 
 Init = TypeVar("Init", bound=Callable[..., None])
 
-RESETS = ("do", "episode")
+RESETS = ("do", "episode", "space")
 """Options of a reset."""
 
 
@@ -160,6 +161,7 @@ def begin(
     acts: Mapping[str, Any],
     attempts: int,
     episode: int | None = None,
+    space: AnyRegion | None = None,
 ) -> None:
     """Reset a world, with an intervention that may draw something impossible.
 
@@ -170,6 +172,7 @@ def begin(
         attempts: How often bodies may be drawn into one place until that is an error. Every
             attempt is the beginning of the next episode, so it draws again.
         episode: Number of the first one within the noise.
+        space: In which every target must lie.
 
     Raises:
         InterventionError: The intervention was refused, at the last attempt.
@@ -178,7 +181,7 @@ def begin(
         seed = world.noise.seed
     for left in reversed(range(attempts)):
         try:
-            world.reset(seed=seed, episode=episode or 0, do=acts)
+            world.reset(seed=seed, episode=episode or 0, do=acts, space=space)
         except Infeasible:
             if not left:
                 raise
@@ -209,13 +212,29 @@ def warn_of_changes(
 
 def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledTask:
     """Give the structure in which an episode begins after an intervention at its reset."""
-    family = world.structures
+    family, key = world.structures, world.noise_key(0)
+    found = structure_after(family, acts, family.head, family.head.solve(), key)
+    return found or family.natural(None)
+
+
+def structure_after(
+    structures: StructureCache, acts: Mapping[str, Any], held: SCM, static: Values, key: NoiseKey
+) -> CompiledTask | None:
+    """Return the structure after an intervention; None where it decides nothing of that.
+
+    Args:
+        structures: Of the task.
+        acts: By name; others than those that decide the structure may be among them.
+        held: The model before, with the interventions that hold.
+        static: Values before.
+        key: Where to draw.
+    """
     mine: dict[str, Any] = {}
     for name, value in acts.items():
-        if name in family.head:
+        if name in structures.head:
             try:
-                mine[name] = family.head.accept(name, value)
-            except InterventionError:  # the reset will say so
+                mine[name] = structures.head.accept(name, value)
+            except InterventionError:  # the intervention will be refused
                 continue
-    found = family.after(mine, family.head, family.head.solve(), world.noise_key(0))
-    return family.natural(None) if found is None else family.compiled(found)
+    found = structures.after(mine, held, static, key)
+    return None if found is None else structures.compiled(found)

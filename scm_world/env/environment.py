@@ -360,6 +360,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             options: ``{"do": {…}}``: an intervention that holds for the whole episode. Where it
                 sets what ``start`` or a random goal sets too, it counts. ``{"episode": n}``: the
                 number of the episode within the noise; the next one if not given, 0 with a seed.
+                ``{"space": …}``: the space in which every target must lie.
 
         Raises:
             UnknownOption: Another key.
@@ -368,9 +369,9 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         """
         super().reset(seed=None if seed is None else whole_number("seed", seed, least=0))
         asked_for = reset_options(options, RESETS)
-        request = self._acts(asked_for.get("do"))
-        number = asked_for.get("episode")
-        begin(self.world, seed, request, self._attempts, number)
+        request = self.beginning(asked_for.get("do"))
+        number, space = asked_for.get("episode"), asked_for.get("space")
+        begin(self.world, seed, request, self._attempts, number, space)
         self._done = [(0, request)] if request else []
         now = self._look()
         for name in self._terms:
@@ -379,8 +380,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             self._window.show(self.world.scene())
         return self._observer.observe(now), self._info(now)
 
-    def _acts(self, do: Mapping[str, Any] | None) -> dict[str, Any]:
-        """Put together what is done at a reset."""
+    def beginning(self, do: Mapping[str, Any] | None) -> dict[str, Any]:
+        """Return all that is done at a reset: goal, ``start``, and what the caller asks for."""
         mine = asked(do)
         if not (self._start or self._random_goal):
             return mine
@@ -476,6 +477,16 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         for name in self._terms:
             terms[name] = float(now[name])
         return info
+
+    @property
+    def info_shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shape of each entry of ``info``, without ``reward_terms``, which is a dictionary."""
+        goals = () if self._goals is None else self._goals.spaces.items()
+        return {
+            **({"is_success": (), "success": ()} if SUCCESS in self._counted else {}),
+            **({"fractional_success": ()} if FRACTION in self._counted else {}),
+            **{name: space.shape or () for name, space in goals},
+        }
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene, shape (h, w, 3); None without ``render_mode="rgb_array"``.

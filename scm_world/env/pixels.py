@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from scm_world._types import Values
 from scm_world.backends.renderer import (
-    ORIGINAL,
-    PLAIN,
     camera_pixels,
     following_camera,
     scene_camera,
+    shape_of_pixels,
     shapes_of,
     views_of,
 )
@@ -138,8 +137,8 @@ class Pixels:
         self._follows = [not published and isinstance(c, str) and c in usual for c in given]
         self._cameras = _sized(found, size)
         self.layouts: Layouts = {}
-        self._convention = ORIGINAL if published else PLAIN
-        one, n = self._convention.shape(self._cameras[0]), len(given)
+        self._published = published
+        one, n = shape_of_pixels(self._cameras[0], published=published), len(given)
         self._goals: NDArray[np.uint8] = np.empty((n, *one), dtype=np.uint8)
         self._shape = (2 * n if self._shows_goals else n, *one)
         self._stacks = stack == "channels"
@@ -153,19 +152,19 @@ class Pixels:
         """Put the channels of all pictures together, if that is asked for."""
         if not self._stacks:
             return pictures
-        if self._convention.channels_last:
+        if self._published:
             return np.concatenate(pictures, axis=-1)
         return pictures.reshape(-1, *self._shape[2:])
 
     def observe(self, now: Values) -> NDArray[np.uint8]:
         """Draw; pictures of the goals are kept until someone intervenes."""
         scene = self._world.describe(*self._world.current())  # drawn immediately: no copies
-        layout, n = self._convention, len(self._cameras)
+        published, n = self._published, len(self._cameras)
         pictures: NDArray[np.uint8] = np.empty(self._shape, dtype=np.uint8)
         if not self._shows_goals:
             pairs = zip(self._given, self._cameras, strict=True)
             cameras = [placed(scene, given, camera) for given, camera in pairs]
-            camera_pixels(scene, cameras, pictures, convention=layout)
+            camera_pixels(scene, cameras, pictures, published=published)
             return self._stacked(pictures)
         if self._version != self._world.version:
             self._version = self._world.version
@@ -176,8 +175,8 @@ class Pixels:
                 else camera
                 for camera, follows in zip(self._cameras, self._follows, strict=True)
             )
-            camera_pixels(scene, self._cameras, self._goals, goals=True, convention=layout)
-        camera_pixels(scene, self._cameras, pictures[:n], convention=layout)
+            camera_pixels(scene, self._cameras, self._goals, goals=True, published=published)
+        camera_pixels(scene, self._cameras, pictures[:n], published=published)
         pictures[n:] = self._goals
         return self._stacked(pictures)
 

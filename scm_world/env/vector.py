@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers, Value, Values
-from scm_world.geometry import rotation_matrix
 from scm_world.geometry.clipping import scale_rows
+from scm_world.geometry.rotations import rotation_matrix
 from scm_world.graph import SCM
 from scm_world.tasks import TIME
 from scm_world.variables import Box, Categories, Normal, Rotations

@@ -36,15 +36,10 @@ def scaled_clip_kernel(
 def scale_rows(
     matrix: Floats, rows: Integers, sources: Integers, shifts: Floats, scale: Floats, out: Any
 ) -> None:
-    """Gather numbers of some rows, saturate them at their bounds, and scale them.
+    """Gather numbers of some rows, saturate them at their bounds, and scale them into 32 bits.
 
-    Args:
-        matrix: The matrix, shape (n, w).
-        rows: Which are written, shape (m,).
-        sources: The column of each number, shape (k,).
-        shifts: Added to the numbers before anything else where not 0, shape (k,).
-        scale: Lower bounds, upper bounds, gains and offsets, shape (4, k).
-        out: Where they are written, shape (n, k), 32-bit.
+    ``sources`` has the column of each number, ``shifts`` what is added to it first, ``scale`` the
+    lower and upper bounds, gains and offsets, shape (4, k).
     """
     for row in rows:
         for j in range(sources.size):

@@ -8,13 +8,7 @@ from scm_world._types import ArrayLike, Floats
 
 
 def to_cylindrical(position: ArrayLike) -> Floats:
-    """Give radius, azimuth and height of points.
-
-    Args:
-        position: Shape (..., 3) [m].
-
-    Returns:
-        Radius [m], azimuth [rad] in (-pi, pi], zero on the axis, and height [m]; shape (..., 3).
+    """Return radius [m], azimuth [rad] in (-pi, pi], zero on the axis, and height [m] of points.
 
     Example:
         >>> to_cylindrical([0.0, 2.0, 1.0])
@@ -31,13 +25,7 @@ def to_cylindrical(position: ArrayLike) -> Floats:
 
 
 def from_cylindrical(cylindrical: ArrayLike) -> Floats:
-    """Give the cartesian coordinates of points.
-
-    Args:
-        cylindrical: Radius [m], azimuth [rad] and height [m], shape (..., 3).
-
-    Returns:
-        Shape (..., 3) [m].
+    """Return the cartesian coordinates [m] of radius [m], azimuth [rad] and height [m].
 
     Example:
         >>> from_cylindrical([2.0, 0.0, 1.0])

@@ -21,17 +21,17 @@ from scm_world._types import ArrayLike, Floats
 from scm_world.geometry.rotations import rotation_kernel, rotation_matrix
 
 NOTHING = 1e-15  # of the volume of a solid: a piece of it that can be left out
-_SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
-_CUBE = np.array(
+_SQUARE = ((0, 0), (1, 0), (1, 1), (0, 1))
+_ENDS = np.array(
     [
-        (2 * axis + (side < 0), *np.roll((side, *start), axis), *np.roll((side, *end), axis))
+        (np.roll((side > 0, *start), axis) @ (1, 2, 4), np.roll((side > 0, *end), axis) @ (1, 2, 4))
         for axis in range(3)
         for side in (1, -1)
         for start, end in zip(_SQUARE, _SQUARE[side:] + _SQUARE[:side], strict=True)
-    ],
-    dtype=np.float64,
+    ]
 )
-"""The edges of the cube from -1 to 1, shape (24, 7)."""
+"""Both corners of each edge of a cube, four for each side; corner n is at 1 along an axis where bit
+``axis`` of n is set, shape (24, 2)."""
 
 
 @njit(cache=True)
@@ -42,16 +42,19 @@ def _box(
 
     Planes are unit outward normals and offsets; inside is ``normal · x <= offset``.
     """
-    rotation = np.empty((3, 3))
+    rotation, corner = np.empty((3, 3)), np.empty((8, 3))
     rotation_kernel(orientation, rotation)
+    for n in range(8):
+        for k in range(3):
+            corner[n, k] = position[k]
+            for axis in range(3):
+                side = 0.5 - (n >> axis & 1)
+                corner[n, k] -= side * size[axis] * rotation[k, axis]
     for n in range(24):
-        edges[n, 0] = _CUBE[n, 0]
-        for end in (1, 4):
-            for k in range(3):
-                x = position[k]
-                for axis in range(3):
-                    x += 0.5 * _CUBE[n, end + axis] * size[axis] * rotation[k, axis]
-                edges[n, end + k] = x
+        edges[n, 0] = n // 4
+        for k in range(3):
+            edges[n, 1 + k] = corner[_ENDS[n, 0], k]
+            edges[n, 4 + k] = corner[_ENDS[n, 1], k]
     for n in range(6):
         axis, sign = n // 2, 1.0 - 2.0 * (n % 2)
         planes[n, 3] = 0.5 * size[axis]
@@ -61,15 +64,10 @@ def _box(
 
 
 @njit(cache=True)
-def _heights(edges: Floats, plane: Floats) -> Floats:
-    """Compute how far within a plane both ends of edges are, shape (n, 2) [m]."""
-    heights = np.empty((len(edges), 2))
-    for e in range(len(edges)):
-        for end in range(2):
-            heights[e, end] = plane[3]
-            for k in range(3):
-                heights[e, end] -= plane[k] * edges[e, 1 + 3 * end + k]
-    return heights
+def _height(point: Floats, plane: Floats) -> float:
+    """Compute how far within a plane a point is [m]."""
+    height: float = plane[3] - plane[0] * point[0] - plane[1] * point[1] - plane[2] * point[2]
+    return height
 
 
 @njit(cache=True)
@@ -78,11 +76,10 @@ def _cut(edges: Floats, plane: Floats, sign: float) -> Floats:
     n, faces = len(edges), 0
     for e in range(n):
         faces = max(faces, int(edges[e, 0]) + 1)
-    heights = _heights(edges, plane)
     crossed, hubs = np.zeros(faces, dtype=np.bool_), np.empty((faces, 3))
     kept, count = np.empty((3 * n, 7)), 0
     for e in range(n):
-        start, end = sign * heights[e, 0], sign * heights[e, 1]
+        start, end = sign * _height(edges[e, 1:4], plane), sign * _height(edges[e, 4:], plane)
         if start < 0.0 and end < 0.0:
             continue
         here, count = count, count + 1
@@ -133,11 +130,14 @@ def _volume(edges: Floats) -> float:
 
 @njit(cache=True)
 def _apart(edges: Floats, planes: Floats) -> bool:
-    """Tell whether a plane of one solid has the whole of another one beyond it."""
-    apart = False
-    for n in range(len(planes)):
-        apart = apart or _heights(edges, planes[n]).max() <= 0.0
-    return apart
+    """Return whether a plane of one solid has the whole of another one beyond it."""
+    for plane in planes:
+        for edge in edges:
+            if _height(edge[1:4], plane) > 0.0:  # each corner begins an edge
+                break
+        else:
+            return True
+    return False
 
 
 @njit(cache=True)

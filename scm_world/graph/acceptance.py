@@ -25,12 +25,28 @@ from scm_world.variables import (
 from scm_world.variables.checks import check_bounds, check_draw, coerce
 
 
+def refuse_time(name: str, act: Any) -> None:
+    """Refuse an intervention with a time, where there is no episode for it.
+
+    Raises:
+        InterventionError: It has one.
+    """
+    if getattr(act, "time", None) is not None:
+        raise InterventionError(
+            f"do({name}): a time ({act.time}) counts in the plan of an episode: give it to "
+            "rollout, sample, effect, counterfactual, given, or reset(do=…) of a World",
+            variable=name,
+            value=act,
+        )
+
+
 def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -> Intervention:
     """Return a checked intervention: type, shape, finite, fixed bounds, known parents.
 
     Raises:
         InterventionError: What is wrong with it.
     """
+    refuse_time(variable.name, value)
     match value:
         case Draw():
             check_draw(variable, value)

@@ -115,18 +115,10 @@ def camera_from(
     width: int = 128,
     height: int = 128,
 ) -> Camera:
-    """Make a camera from plain numbers.
+    """Make a camera from plain numbers, with a quaternion (x, y, z, w) of any length.
 
     The first axis of the camera points to the right of the picture, the second one down and the
     third one forward.
-
-    Args:
-        name: What the camera is called.
-        position: Where it stands, z from the table top, shape (3,) [m].
-        orientation: Quaternion (x, y, z, w) of any length, shape (4,).
-        field_of_view: Vertical opening angle [deg].
-        width: Of the picture [pixels].
-        height: Of the picture [pixels].
 
     Raises:
         ValueError: The quaternion is zero or not finite, or a shape is wrong.

@@ -131,12 +131,7 @@ class Shapes(NamedTuple):
 
 
 def mesh_of(vertices: ArrayLike, faces: ArrayLike, normals: ArrayLike | None = None) -> Mesh:
-    """Make a mesh.
-
-    Args:
-        vertices: Shape (n, 3) [m].
-        faces: Counterclockwise seen from outside, shape (m, 3).
-        normals: See ``Mesh``; those of the triangles if not given.
+    """Make a mesh; its normals are those of the triangles if not given.
 
     Example:
         >>> mesh_of(np.eye(3), [[0, 1, 2]]).normals[0, 0].round(3).tolist()

@@ -27,7 +27,7 @@ from scm_world.output.reading import read_arrays
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.episodes import Episode
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.plans import Plan
+from scm_world.queries.plans import Plan, Schedule
 from scm_world.queries.rollouts import Trace, Unit
 from scm_world.queries.twins import AnyTwins, EquationTwins, Twins, twins_of
 from scm_world.tasks import ModelTask, Task, make_task, tasks
@@ -192,10 +192,10 @@ def load_episode(
     about, actions, states, lengths = _read(file)
     try:
         twins = _twins(about, world, file, trusted)
-        layers = tuple(
+        schedule = Schedule(
             (int(start), Plan.from_dict(plan, trusted=trusted)) for start, plan in about["layers"]
         )
-        unit = Unit(about["seed"], about["number"], layers, Given(list(actions)), about["steps"])
+        unit = Unit(about["seed"], about["number"], schedule, Given(list(actions)), about["steps"])
         with twins.twin() as twin:
             trace = unit.run(twin)
     except DAMAGED as error:

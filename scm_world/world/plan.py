@@ -19,6 +19,7 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey
+from scm_world.graph.acceptance import refuse_time
 from scm_world.models import State
 from scm_world.variables import Draw, Hard, Intervention, Natural, Null, divided
 from scm_world.variables.subsets import AnyRegion, as_region
@@ -153,11 +154,13 @@ def _accepted(
     asked: dict[str, str] = {}
     problems: list[InterventionError] = []
     for name, value in request.items():
-        if isinstance(value, Null):  # of an entity, not of a variable; see ``restructured``
-            continue
-        if isinstance(value, Natural) and name in compiled.entity_names:
-            continue  # it is there
         try:
+            if isinstance(value, Null | Natural) and name not in model:
+                refuse_time(name, value)
+            if isinstance(value, Null):  # of an entity, not of a variable; see ``restructured``
+                continue
+            if isinstance(value, Natural) and name in compiled.entity_names:
+                continue  # it is there
             kept, act = _checked(base, name, value)
             targets = model.targets(name)
             twice = next((target for target in targets if target in asked), None)

@@ -18,12 +18,11 @@ from scm_world.errors import (
     CyclicModel,
     EngineFailure,
     InterventionError,
-    NotFinite,
     NotReset,
     ScmWorldError,
     SnapshotMismatch,
     UnknownOption,
-    WrongShape,
+    WrongValue,
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
@@ -225,7 +224,12 @@ class Simulation(WorldAttributes):
         return self.composition.cameras(_copies(self._values.now))
 
     def reset(
-        self, *, seed: int | None = None, episode: int = 0, do: Mapping[str, Any] | None = None
+        self,
+        *,
+        seed: int | None = None,
+        episode: int = 0,
+        do: Mapping[str, Any] | None = None,
+        space: AnyRegion | None = None,
     ) -> Audit | None:
         """Begin an episode. Nothing that was done in the last one remains.
 
@@ -235,6 +239,7 @@ class Simulation(WorldAttributes):
             episode: Number of the episode, with a seed.
             do: An intervention that takes part in the beginning: a block of another size stands
                 on the floor. It holds until the next reset.
+            space: In which every target of it must lie; see ``do``.
 
         Returns:
             The audit of the intervention, or None if there was none.
@@ -250,7 +255,7 @@ class Simulation(WorldAttributes):
         else:
             self.episode += 1
         self._begin()
-        return self.do(do) if do else None
+        return self.do(do, space=space) if do else None
 
     def _begin(self) -> None:
         self._lost, self._offset = "", 0
@@ -469,9 +474,9 @@ class Simulation(WorldAttributes):
                 for target in targets:
                     value, declared = model.evaluate(target, values), model.declared(target)
                     if np.shape(value) != declared.shape:
-                        raise WrongShape(name, act, declared.shape, np.shape(value))
+                        raise WrongValue(name, act, declared.shape, np.shape(value))
                     if not np.isfinite(value).all():
-                        raise NotFinite(name, value)
+                        raise WrongValue(name, value)
             except CyclicModel:
                 continue  # refused with the reason
             except InterventionError as problem:
@@ -601,7 +606,7 @@ class Simulation(WorldAttributes):
         commands = compiled.composition.commands
         self.translates = commands is not None and commands.applies(static)
         self.structure = compiled.structure(static)
-        self._substeps = max(1, round(self.control_period / self.structure.timestep))
+        self._substeps = max(1, round(self.control_period / float(self.structure.timestep)))
         self.version += 1
         if state is None:
             self.backend.read(values.state)

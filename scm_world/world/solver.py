@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.errors import InterventionError, NotFinite, OutOfBounds, WrongShape
+from scm_world.errors import InterventionError, OutOfBounds, WrongValue
 from scm_world.graph import NoiseKey
 from scm_world.graph.evaluate import noise_of
 from scm_world.variables import (
@@ -214,7 +214,7 @@ class Solver:
             try:
                 known[name] = value = self.model.evaluate(name, known, self._key)
                 if value.shape != variable.shape:  # of a mechanism that a user gave
-                    raise WrongShape(name, value, variable.shape, np.shape(value))
+                    raise WrongValue(name, value, variable.shape, np.shape(value))
                 check_bounds(variable, value, self._context() if follows else {})
             except InterventionError as problem:
                 self.problems.append(problem)
@@ -385,7 +385,7 @@ class Solver:
         found = list(problems)
         for name in self.asked:
             bundle = self._task.model.declared(name)
-            wrong = {p.variable: p for p in found if isinstance(p, OutOfBounds | NotFinite)}
+            wrong = {p.variable: p for p in found if isinstance(p, OutOfBounds | WrongValue)}
             if wrong.keys().isdisjoint(bundle.parts):
                 continue
             parts = [

@@ -14,13 +14,8 @@ from matplotlib.image import imread
 from robot_scenes import link_frames
 
 from scm_world._types import Floats
-from scm_world.backends.renderer import (
-    NOTHING,
-    RenderedImage,
-    body_names,
-    png,
-    render,
-)
+from scm_world.backends.renderer import RenderedImage, body_names, png, render
+from scm_world.backends.renderer.shapes import NOTHING
 from scm_world.errors import UnknownOption
 from scm_world.models import GoalRegion, ParameterKey, Scene
 from scm_world.models.camera import Camera

@@ -10,8 +10,8 @@ from robot_scenes import box_hull, link_frames
 
 from scm_world._types import Floats
 from scm_world.backends.renderer import body_names, render
-from scm_world.geometry import from_rotation_vector, rotation_matrix
 from scm_world.geometry.hulls import Hull, hull_of
+from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
 from scm_world.models import GoalRegion, Light, Scene
 from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger import hardware

@@ -23,7 +23,7 @@ from scm_world.errors import (
     ModelError,
     SnapshotMismatch,
     UnknownOption,
-    WrongShape,
+    WrongValue,
 )
 from scm_world.models.scene import Difference, State
 from scm_world.tasks.trifinger.system import trifinger
@@ -299,6 +299,11 @@ def talks(parameters: Any, state: Any, action: Any, noise: Any) -> Mapping[str, 
     return {**state, "x": "one"}
 
 
+def tears(parameters: Any, state: Any, action: Any, noise: Any) -> Mapping[str, Any]:
+    """Give a ragged list."""
+    return {**state, "y": [[1.0, 2.0], [3.0]]}
+
+
 def lists(parameters: Any, state: Any, action: Any, noise: Any) -> Any:
     """Give no dict."""
     return [1.0]
@@ -330,6 +335,7 @@ def divides(parameters: Any, state: Any, action: Any, noise: Any) -> Mapping[str
         (halves, r"'n' must be whole numbers of at most 2\*\*53, not \[0.5\]"),
         (overflows, r"'n' must be whole numbers of at most 2\*\*53"),
         (talks, "'x' must be numbers"),
+        (tears, "'y' must be numbers"),
         (lists, "it must be a dict of the states by name"),
         (writes, "ValueError: .*must not be changed: let it work on a copy"),
         (misspells, "KeyError: 'mas'; it is given parameters mass; states x, y, n"),
@@ -384,7 +390,7 @@ def test_what_does_not_exist_is_refused() -> None:
     backend = built(MODELS["scalar"])
     with pytest.raises(UnknownOption, match=r"spring.stiffness, damping"):
         backend.apply(Difference(parameters={("", "mass"): np.array(1.0)}))
-    with pytest.raises(WrongShape, match=r"spring.stiffness\): expected shape \(2,\)"):
+    with pytest.raises(WrongValue, match=r"spring.stiffness\): expected shape \(2,\)"):
         backend.apply(
             Difference(
                 parameters={("", "damping"): np.array(9.0), ("spring", "stiffness"): np.ones(3)}

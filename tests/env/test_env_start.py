@@ -9,7 +9,7 @@ from envs import PUSHING, REACHING, make
 
 from scm_world import Draw
 from scm_world.env.arguments import asked
-from scm_world.errors import Infeasible, InterventionError, OutOfSpace, UnknownOption
+from scm_world.errors import Infeasible, InterventionError, OutOfBounds, UnknownOption
 from scm_world.models.scene import TOLERANCE
 from scm_world.tasks import Pushing
 from scm_world.tasks.trifinger.entities.block_world import overlaps
@@ -72,7 +72,7 @@ def test_interventions_stay_in_the_space_that_is_asked_for() -> None:
     """With a space for variables, an intervention outside of it is refused."""
     env = make(variables_space="A")
     env.reset(seed=0, options={"do": {"tool_block.mass": 0.03}})
-    with pytest.raises(OutOfSpace):
+    with pytest.raises(OutOfBounds):
         env.unwrapped.do({"tool_block.mass": 0.09})
 
 

@@ -10,7 +10,8 @@ import pytest
 
 from scm_world import geometry
 from scm_world._types import ArrayLike, Floats
-from scm_world.geometry import aabb_overlap_fraction, rotation_matrix
+from scm_world.geometry.filling import aabb_overlap_fraction
+from scm_world.geometry.rotations import rotation_matrix
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 

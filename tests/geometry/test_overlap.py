@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from scm_world import geometry
 from scm_world._types import ArrayLike, Floats
-from scm_world.geometry import aabb_overlap_fraction
+from scm_world.geometry.filling import aabb_overlap_fraction
 from scm_world.geometry.rotations import (
     from_rotation_vector,
     quaternion_product,

@@ -17,7 +17,6 @@ import pytest
 
 from scm_world.backends import read_model
 from scm_world.backends.renderer import (
-    Convention,
     automatic_camera,
     body_names,
     camera_pixels,
@@ -320,13 +319,12 @@ def test_pixels_for_policies(scene: Scene) -> None:
     camera_pixels(wanted, (camera,), then, goals=True)
     ball = image.shows("ball")
     plain = render(wanted, camera, colors=False)
-    last = Convention(channels_last=True)
 
     np.testing.assert_array_equal(now[0].transpose(1, 2, 0)[ball], image.rgb[ball])
     assert (then[0, 1][ball] > 100).all()
     other = np.empty((1, *SIZE, 3), np.uint8)
-    camera_pixels(wanted, (camera,), other, convention=last)
-    np.testing.assert_array_equal(other[0], now[0].transpose(1, 2, 0))
+    camera_pixels(wanted, (camera,), other, published=True)
+    np.testing.assert_array_equal(other[0][::-1], now[0].transpose(1, 2, 0))
     np.testing.assert_array_equal(plain.depth, image.depth)
     np.testing.assert_array_equal(plain.segmentation, image.segmentation)
 

@@ -29,7 +29,6 @@ from scm_world.graph.files import from_dict, from_json
 from scm_world.output import reading
 from scm_world.policies import load_sb2
 from scm_world.queries import Plan, World, load_episode, save_episode
-from scm_world.queries.tables import read_protocol
 from scm_world.training.recipe import Recipe
 from scm_world.variables import Derived, Exogenous
 
@@ -50,7 +49,6 @@ def test_texts_of_something_else_are_refused(kind: str, text: str) -> None:
         TEXTS[kind](text)
 
 
-MESH = """<mujoco><asset><mesh name="it" file="{}"/></asset><worldbody/></mujoco>"""
 INCLUDE = """<mujoco><include file="{}"/><worldbody/></mujoco>"""
 
 
@@ -71,9 +69,7 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "curriculum": (".json", Curriculum.load),
     "recipe": (".json", Recipe.load),
     "dataset": ("", lambda path: dataset_of(path.parent)),
-    "settings": (".csv", lambda path: read_protocol(path, World("pushing", backend="fake").model)),
     "model": (".xml", read_model),
-    "mesh": (".stl", lambda path: _named_by(MESH, path)),
     "included": (".xml", lambda path: _named_by(INCLUDE, path)),
     "shape": (".stl", load_hull),
 }

@@ -18,7 +18,7 @@ from scm_world.errors import (
     InterventionError,
     SeveralProblems,
     SnapshotMismatch,
-    WrongType,
+    WrongValue,
 )
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables import Exogenous, Hard, Measured, Mechanism
@@ -210,7 +210,7 @@ def test_a_pickled_snapshot_has_a_checksum() -> None:
 def test_masked_arrays_are_refused() -> None:
     """What lies under a mask is not applied."""
     world = begin("fake", "pushing")
-    with pytest.raises(WrongType):
+    with pytest.raises(WrongValue):
         world.do({"gravity": np.ma.masked_array([0.0, 0.0, -5.0], mask=[0, 0, 1])})
 
 
@@ -219,7 +219,7 @@ def test_mechanisms_give_numbers(given: Any) -> None:
     """What a mechanism of a user gives is checked like a value, and named."""
     world = begin("fake", "pushing")
     values = world.values()
-    with pytest.raises(WrongType, match="floor_color"):
+    with pytest.raises(WrongValue, match="floor_color"):
         world.do({"floor_color": Mechanism(lambda friction: given, ["floor_friction"])})
     assert same(world.values(), values)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, Capabilities, ContactPoint, EngineSnapshot
-from scm_world.backends.bullet.client import Client, Instant, SavedState, Step
+from scm_world.backends.bullet.client import Client, Instant, Past, SavedState
 from scm_world.backends.bullet.engine import load
 from scm_world.backends.bullet.honoured import accepted, settle, supports
 from scm_world.errors import EngineFailure, Infeasible
@@ -26,7 +26,7 @@ class Record:
     """What a backend holds, and its snapshot.
 
     Attributes:
-        past: The last step, or the canonical world if there was none since.
+        past: All up to the last step.
         last: The world after it.
         now: The world with what was changed since.
         world: That from which live bodies come to the present by taking on parameters alone: the
@@ -34,10 +34,10 @@ class Record:
         saved: The engine's own state after the last step, if one was kept.
     """
 
-    past: Step | Instant
+    past: Past
     last: Instant
     now: Instant
-    world: Step | Instant
+    world: Past
     saved: SavedState | None = None
 
 
@@ -59,7 +59,7 @@ class BulletBackend(Backend):
 
     name: ClassVar[str] = "bullet"
     capabilities: ClassVar[Capabilities] = Capabilities(
-        supports=supports, remarks=lambda backend, before: backend.client().remarks(before)
+        supports=supports, remarks=lambda backend, before: backend.client().twin.remarks(before)
     )
 
     _at: Record
@@ -79,13 +79,8 @@ class BulletBackend(Backend):
         """Return the client that holds the present."""
         return self._holding(self._at.world, self._at.now.parameters)
 
-    def _holding(self, world: Step | Instant, parameters: Parameters) -> Client:
-        """Return a client in a world, with the parameters that its live bodies took on since.
-
-        Raises:
-            Infeasible: Nothing can move with the parameters. Nothing has changed.
-            EngineFailure: The engine refused.
-        """
+    def _holding(self, world: Past, parameters: Parameters) -> Client:
+        """Return a client in a world, with the parameters that its live bodies took on since."""
         at: Record | None = vars(self).get("_at")
         client = next((one for one in self._clients if one.holds is world), None)
         try:
@@ -121,19 +116,13 @@ class BulletBackend(Backend):
         same = "_at" in vars(self) and structure == self.structure
         known = self._at.now.parameters if same else {}
         parameters = accepted(structure, scene.parameters, known)
-        world = Instant(structure, parameters, settle(structure, scene.state))
+        now = Instant(structure, parameters, settle(structure, scene.state))
+        world = Past(now)
         self._holding(world, parameters)
-        self._at = Record(world, world, world, world)
+        self._at = Record(world, now, now, world)
 
     def apply(self, difference: Difference) -> None:
-        """Change structure, parameters and state without advancing time.
-
-        Raises:
-            ModelError: The engine cannot honour the new structure.
-            UnknownOption: The scene has no such parameter.
-            NotIntervenable: The engine has no such parameter.
-            EngineFailure: A value is not finite, or the engine refused. The world is as it was.
-        """
+        """Change structure, parameters and state without advancing time."""
         now, structure = self._at.now, difference.structure
         state, known = now.structure.empty_state().with_vector(now.state), now.parameters
         given: Parameters = {**known, **difference.parameters}
@@ -146,21 +135,16 @@ class BulletBackend(Backend):
         if difference.state is not None:
             vector = settle(structure, difference.state, state)
         now = Instant(structure, parameters, vector)
-        at = self._at
-        world: Step | Instant = now
+        at, world = self._at, Past(now)
         if now.differs_lightly(at.last):
             world = at.past
-        elif isinstance(at.world, Instant) and now.differs_lightly(at.world):
+        elif not at.world.steps and now.differs_lightly(at.world.start):
             world = at.world
         self._holding(world, parameters)
         self._at = replace(at, now=now, world=world)
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Read parameters back; see ``Realization.parameters``.
-
-        Raises:
-            UnknownOption: The scene has no such parameter.
-        """
+        """Read parameters back; see ``Realization.parameters``."""
         return self.client().twin.parameters(keys)
 
     def read(self, into: Any = None) -> Any:
@@ -180,15 +164,15 @@ class BulletBackend(Backend):
         if substeps < 1:
             return
         at, client, now = self._at, self.client(), self._at.now
-        past = at.past if at.world is at.past else now
+        past = at.past if at.world is at.past else Past(now)
         try:
             client.step(numbers, substeps)
             state = client.read()
         except Exception as error:
             self._drop(client)  # torques that were not stepped would count twice
             raise EngineFailure(f"Bullet could not step: {error}", self.name) from error
-        total = substeps + (past.total if isinstance(past, Step) else 0)
-        client.holds = past = Step(past, now.parameters, numbers, substeps, total)
+        steps = *past.steps, (now.parameters, numbers, substeps)
+        client.holds = past = Past(past.start, steps)
         last = Instant(now.structure, now.parameters, state)
         self._at = Record(past, last, last, past)
 
@@ -201,18 +185,14 @@ class BulletBackend(Backend):
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""
         at = self._at
-        if isinstance(at.past, Step) and at.past.total >= LONG and at.saved is None:
+        if at.saved is None and sum(substeps for *_, substeps in at.past.steps) >= LONG:
             for client in self._clients:
                 if client.holds is at.past:
                     self._at = replace(at, saved=client.save())
         return EngineSnapshot.of(self, self._at)
 
     def restore(self, snapshot: EngineSnapshot) -> None:
-        """Go back to a snapshot.
-
-        Raises:
-            SnapshotMismatch: It was taken by another engine, or another version of it.
-        """
+        """Go back to a snapshot."""
         self._at = snapshot.opened(self)
         self.client()
 

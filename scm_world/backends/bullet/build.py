@@ -104,12 +104,6 @@ def renewed(
     """Make what is missing, remove what is not needed, and return all units.
 
     Everything stays in one order: what comes after something new is new, too.
-
-    Args:
-        engine: The functions of a physics client.
-        before: The units in it.
-        mj: With the parameters in force.
-        touching: The shapes that can touch something.
     """
     data, kept = mujoco.MjData(mj), 0
     mujoco.mj_kinematics(mj, data)
@@ -238,11 +232,8 @@ def _describe(unit: EngineBody, mj: mujoco.MjModel, data: mujoco.MjData, paired:
 def _shape(mj: mujoco.MjModel, geom: int, origin: Floats | None) -> dict[str, Any]:
     """Return the arguments that make a collision shape.
 
-    Args:
-        mj: The model.
-        geom: The shape.
-        origin: Of the frame that it is made in, which is turned like the body, in the frame of the
-            body [m]; in its own frame if None.
+    ``origin`` is that of the frame that it is made in, which is turned like the body, in the frame
+    of the body [m]; it is made in its own frame if None.
     """
     radius, half, _ = size = mj.geom_size[geom].tolist()
     kind = int(mj.geom_type[geom])

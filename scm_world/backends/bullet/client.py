@@ -67,43 +67,16 @@ class Instant:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Step:
-    """A control step, and through ``before`` all those since the last canonical world.
+class Past:
+    """A canonical world, and the control steps since.
 
     Attributes:
-        before: The world that it started from.
-        parameters: All that were in force.
-        command: That was held.
-        substeps: For how many physics steps.
-        total: How many there were since the canonical world.
+        start: The canonical world.
+        steps: For each, all parameters in force, the command, and for how many physics steps.
     """
 
-    before: Step | Instant
-    parameters: Parameters
-    command: list[float]
-    substeps: int
-    total: int
-
-    def __reduce__(self) -> Any:
-        first, steps = since(self)
-        return _chain, (first, [(one.parameters, one.command, one.substeps) for one in steps])
-
-
-def since(world: Step | Instant) -> tuple[Instant, list[Step]]:
-    """Return the last canonical world, and the steps since."""
-    steps = []
-    while isinstance(world, Step):
-        steps.append(world)
-        world = world.before
-    return world, steps[::-1]
-
-
-def _chain(world: Any, rows: list[tuple[Parameters, list[float], int]]) -> Any:
-    total = 0
-    for parameters, command, substeps in rows:
-        total += substeps
-        world = Step(world, parameters, command, substeps, total)
-    return world
+    start: Instant
+    steps: tuple[tuple[Parameters, list[float], int], ...] = ()
 
 
 @final
@@ -202,7 +175,7 @@ class Client:
 
     def __init__(self, engine: Any) -> None:
         self.engine = engine = Connection(engine)
-        self.holds: Step | Instant | None = None
+        self.holds: Past | None = None
         self._model: Model | None = None
         self._parameters: Parameters = {}  # in force
         self._in_force: list[Floats] = []  # rows of settings that are in force
@@ -215,13 +188,13 @@ class Client:
 
     # --- bodies ----------------------------------------------------------------------------------
 
-    def replay(self, world: Step | Instant) -> None:
+    def replay(self, world: Past) -> None:
         """Bring about a world, independently of what was here before.
 
         Bodies stay where all their shapes stay; all else that depends on the past, the contact
         caches, is cleared by entering the collision objects again, always in one order.
         """
-        self.holds, (first, steps) = None, since(world)
+        self.holds, first = None, world.start
         self._free(self._saved)  # beyond a canonical world they are not exact
         self._construct(realized(first.structure), first.parameters)
         self.twin.reset()  # what the last step left there must not matter
@@ -230,9 +203,9 @@ class Client:
             part.put(self.twin.data)
         for place in self.geoms.values():  # pairs decide what touches
             self.engine.setCollisionFilterGroupMask(*place, 0, 0)
-        for one in steps:
-            self.edit(one.parameters)
-            self.step(one.command, one.substeps)
+        for parameters, command, substeps in world.steps:
+            self.edit(parameters)
+            self.step(command, substeps)
         self.holds = world
 
     def _construct(self, model: Model, parameters: Parameters) -> None:
@@ -380,22 +353,6 @@ class Client:
             np.flatnonzero(mj.body_gravcomp),
         )
         return self._pulled.union(mj.body_treeid[np.concatenate(bodies)].tolist())
-
-    def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """List which frictions were changed without an effect; see ``shares``."""
-        twin, found = self.twin, list[str]()
-        now = shares(twin.model, self._dynamic, self._usual)
-        for key, old in before.items():
-            if key[1] == "friction":
-                present = twin.kept[key]
-                twin.edit({key: old})
-                if np.array_equal(shares(twin.model, self._dynamic, self._usual), now):
-                    found.append(
-                        f"{'.'.join(key)} has no effect: the larger coefficient of two shapes "
-                        "counts, and those of the others are larger"
-                    )
-                twin.edit({key: present})
-        return tuple(found)
 
     def _needs_joints_alone(self) -> bool:
         """Return whether forces follow from coordinates of joints, and no damper is implicit."""

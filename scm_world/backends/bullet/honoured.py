@@ -110,15 +110,7 @@ def _hinged(mj: mujoco.MjModel) -> NDArray[np.bool_]:
 
 
 def accepted(structure: Any, given: Parameters, known: Parameters) -> Parameters:
-    """Check what is to be built, before anything is made.
-
-    Args:
-        structure: The bodies.
-        given: All parameters.
-        known: Those in force, if the structure stays.
-
-    Returns:
-        The parameters; those that do not change are the same arrays.
+    """Check all parameters before anything is made; return them, the known arrays where they stay.
 
     Raises:
         ModelError: The engine cannot honour the structure; all of it that it cannot.
@@ -163,12 +155,7 @@ def _check(row: Parameter, honoured: bool, value: Floats) -> None:
 
 
 def settle(model: Model, given: State, last: State | None = None) -> Floats:
-    """Return the vector of a state with unit quaternions; what cannot be set is as it was last.
-
-    Raises:
-        ValueError: It is a state of another structure.
-        EngineFailure: A number is not finite.
-    """
+    """Return the vector of a state with unit quaternions; what cannot be set is as it was last."""
     layout, vector = model.layout, given.vector.copy()
     if vector.size != layout.size:
         raise ValueError(f"expected a state of {layout.size} numbers, got {given!r}")

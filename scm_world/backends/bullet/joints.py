@@ -194,13 +194,9 @@ def _to_centers(
 ) -> None:
     """Compute the motion of the centers of free bodies, and of their principal axes.
 
-    Args:
-        positions: ``qpos``.
-        velocities: ``qvel``.
-        starts: Where each body begins in the two, shape (n, 2).
-        centers: Centers of mass in the frames of the bodies, shape (n, 3) [m].
-        axes: From principal axes to those frames, quaternions (w, x, y, z), shape (n, 4).
-        into: Position, quaternion (x, y, z, w), velocity and spin in the world, shape (n, 13).
+    Bodies begin at ``starts`` in ``qpos`` and ``qvel``, shape (n, 2). In their frames they have
+    centers of mass (n, 3) [m] and principal axes, quaternions (w, x, y, z). Written are position,
+    quaternion (x, y, z, w), velocity and spin in the world, shape (n, 13).
     """
     for i in range(len(into)):
         q, v = starts[i, 0], starts[i, 1]

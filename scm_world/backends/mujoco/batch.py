@@ -13,7 +13,6 @@ from mujoco.batch import Batch, SimulationError
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import EngineBatch
-from scm_world.backends.mujoco.reading import callbacks
 from scm_world.backends.mujoco.realization import FULL, STATE, Realization, lost
 from scm_world.errors import EngineFailure
 
@@ -118,7 +117,7 @@ class MujocoBatch(EngineBatch):
 
         Raises:
             EngineFailure: A number is not finite afterwards, or memory did not suffice; all were
-                stepped. Or a callback of the user is in use; none was.
+                stepped.
         """
         if self._process != os.getpid():
             # Threads do not survive a fork, so all simulations are made again. The old ones cannot
@@ -126,8 +125,6 @@ class MujocoBatch(EngineBatch):
             _LEFT_BEHIND.append((self._groups, self._slots))
             self._groups, self._slots = {}, [None] * len(self._backends)
             self._process, self._last = os.getpid(), None
-        if found := callbacks():
-            raise EngineFailure("; ".join(found), "mujoco")
         everyone = len(which) == len(self._backends)
         slots = [backend.slot for backend in self._backends] if everyone else None
         if self._last is not None and slots == self._slots:

@@ -63,12 +63,6 @@ class VisibleModel:
 
     Where a model says of a body how it looks besides how it collides, in groups of geoms that are
     both shown, only how it looks is.
-
-    Args:
-        structure: A model that MuJoCo can realise.
-
-    Attributes:
-        names: Of the bodies, by number.
     """
 
     def __init__(self, structure: Any) -> None:
@@ -135,12 +129,7 @@ class VisibleModel:
         return tuple(name for name in names if name)
 
     def camera(self, name: str, size: tuple[int, int]) -> Camera:
-        """Return one of the model's own cameras, where it stands now.
-
-        Args:
-            name: One of ``cameras``.
-            size: Height and width of its picture [pixels].
-        """
+        """Return one of the model's own cameras, where it stands now."""
         model, data, i = self.model, self.data, self.model.camera(name).id
         mujoco.mj_comPos(model, data)
         mujoco.mj_camlight(model, data)
@@ -234,16 +223,9 @@ def _stage(structure: Any, thread: int) -> VisibleModel:
 
 
 def visible(scene: Scene) -> VisibleModel:
-    """Put a scene into MuJoCo; where its structure was seen before, that costs little.
+    """Put a scene into MuJoCo, until the next call in this thread.
 
-    Args:
-        scene: Of any backend.
-
-    Returns:
-        The scene, until the next call in this thread.
-
-    Raises:
-        ModelError: MuJoCo cannot realise the structure, so that there are no pictures of it.
+    Where its structure was seen before, that costs little.
     """
     shown = _stage(scene.structure, threading.get_ident())
     shown.place(scene)

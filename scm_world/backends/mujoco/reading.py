@@ -39,23 +39,6 @@ _CONTROLS = {
 }
 
 
-CALLBACKS = {
-    name: getattr(mujoco, f"get_mjcb_{name}")
-    for name in ("control", "passive", "act_dyn", "act_gain", "act_bias", "contactfilter")
-}
-"""What gives the callbacks of a user that act on the physics."""
-
-
-def callbacks() -> list[str]:
-    """List why no model can have the callbacks that are in use; usually there are none."""
-    return [
-        f"the callback mjcb_{name} is in use: what it acts on is unknown; call "
-        f"mujoco.set_mjcb_{name}(None)"
-        for name, callback in CALLBACKS.items()
-        if callback() is not None
-    ]
-
-
 _TRIANGLE = np.ones((3, 3)) - (2.0 - 1e-6) * np.eye(3)
 """Takes moments of inertia to numbers that are not negative if none exceeds the sum of others."""
 
@@ -129,9 +112,6 @@ def read_model(
             names nothing; or states are left out.
         UnknownOption: A setting or keyframe does not exist.
     """
-    found = callbacks()
-    if found:
-        raise ModelError(found)
     sealed, own_name, where, replaced = read_source(
         source, fixed_base=fixed_base, options=dict(settings or {})
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from scm_world.backends.mujoco.backend import MujocoBackend
 from scm_world.backends.mujoco.realization import Realization
-from scm_world.geometry import rotation_matrix
+from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models.scene import GoalRegion, Scene
 from scm_world.models.shapes import GOAL_OPACITY
 
