@@ -142,12 +142,9 @@ class Situation:
 
     def natural(self, name: str) -> Value | None:
         """Return a variable at the beginning without interventions; None if it is computed."""
-        static, state = beginning(self.compiled, NoiseKey(self.noise, self.number, origin=0))
-        if name in static:
-            return np.array(static[name])
-        where = self.compiled.slices.get(name)
-        shape = self.model.declared(name).shape
-        return None if where is None else state.vector[where].reshape(shape)
+        row = beginning(self.compiled, NoiseKey(self.noise, self.number, origin=0))
+        known = name in self.compiled.slices or name in self.compiled.static_names
+        return np.array(row[name]) if known else None
 
 
 class Part(Frozen):

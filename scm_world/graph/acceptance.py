@@ -83,8 +83,9 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
             by = value.by if np.ndim(value.by) else np.full(variable.shape, value.by)
             coerce(variable, by)
             return value
-    number = coerce(variable, _plain(variable, value))
-    if variable.bounds is not None and not variable.bounds.parents():
+    number = coerce(variable, _plain(variable, value) if isinstance(value, Hard) else value)
+    bounds = variable.bounds
+    if bounds is not None and not bounds.parents() and not bounds.contains(number, {}):
         check_bounds(variable, number, {})
     return Hard(number.tolist())
 
@@ -99,7 +100,9 @@ def _complete(variable: Variable, value: Mechanism) -> Mechanism:
     if value.function is None and (own is None or own.noise is None):
         said = "it has no noise that could be another one"
     elif value.function is None and own is not None:
-        return value.model_copy(update={"function": own.mechanism, "parents": own.parents})
+        fields = ("parents", "inverse_noise")
+        kept = {"function": own.mechanism, **{name: getattr(own, name) for name in fields}}
+        return value.model_copy(update=kept)
     elif value.noise is not None and not value.equation.takes_noise:
         said = "its function does not take noise; give it an argument `noise`"
     elif isinstance(value.function, Function) and value.equation.takes_noise:
@@ -117,9 +120,7 @@ def _known(declared: Mapping[str, Variable], names: Any) -> None:
             raise UnknownVariable(name, declared)
 
 
-def _plain(variable: Variable, value: Any) -> Any:
-    if not isinstance(value, Hard):
-        return value
+def _plain(variable: Variable, value: Hard) -> Any:
     matrix = len(variable.shape) > 1 and np.size(value.value) == np.prod(variable.shape)
     return np.reshape(value.value, variable.shape) if matrix else value.value
 

@@ -19,7 +19,7 @@ from scm_world.queries.tables import read_protocol
 from scm_world.queries.twins import Twins, twins_of
 from scm_world.variables import Contact, Fixed, Reaches
 from scm_world.world import Simulation
-from scm_world.world.plan import merged
+from scm_world.world.interventions import merged
 
 QUESTIONS = ("see", "do", "counterfactual")
 

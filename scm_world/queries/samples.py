@@ -30,7 +30,7 @@ from scm_world.queries.plans import Plan, Schedule
 from scm_world.queries.progress import Progress
 from scm_world.queries.rollouts import Unit, as_names, length
 from scm_world.queries.twins import AnyTwins, EquationTwins
-from scm_world.world.plan import merged
+from scm_world.world.interventions import merged
 
 STEPS = 25
 """Control steps of an episode by default: one second at 25 steps a second."""

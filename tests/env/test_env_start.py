@@ -14,7 +14,7 @@ from scm_world.models.scene import TOLERANCE
 from scm_world.tasks import Pushing
 from scm_world.tasks.trifinger.entities.block_world import overlaps
 from scm_world.world import Simulation
-from scm_world.world.plan import merged
+from scm_world.world.interventions import merged
 
 
 def test_start_is_applied_at_every_reset() -> None:

@@ -28,8 +28,9 @@ from scm_world.errors import (
     UnknownVariable,
     WrongValue,
 )
+from scm_world.models import Difference
 from scm_world.variables import Draw, Normal, Null, Scale, Shift
-from scm_world.world.plan import plan_intervention
+from scm_world.world.interventions import feasible
 
 NAN = float("nan")
 HUGE = 1e308
@@ -222,15 +223,19 @@ def test_an_engine_is_told_the_difference_of_the_scenes(backend: str, task: str)
         world = begin(backend, task)
         request = {name: other(world, name)}
         key = world.noise_key(world.index)
-        plan = plan_intervention(world.structures, world._step_base(), request, None, key)
-        told = world._present().difference(plan)
-        then = plan.compiled.describe(plan.static, plan.state)
+        base = world._step_base()
+        solution, told = feasible(
+            world.structures, base, base.row, world.structure, request, None, key
+        )
+        compiled, row = solution.compiled, solution.row
+        then = compiled.describe(row, compiled.state_of(row))
         now = world.scene()
         if now.structure != then.structure:
             expected = dict(then.parameters)
         else:
             pairs = then.parameters.items()
             expected = {k: v for k, v in pairs if not np.array_equal(v, now.parameters[k])}
+        told = told or Difference()
         assert told.parameters.keys() == expected.keys()
         assert all(np.array_equal(told.parameters[k], v) for k, v in expected.items())
         stays = now.structure == then.structure and now.state.coincides(then.state)

@@ -26,10 +26,8 @@ class Scalars:
         self._links = [(multibody, list(group.values())) for multibody, group in groups.items()]
         self._ask, self._tell = engine.getJointStates, engine.setJointMotorControlArray
         self._put, self._mode = engine.resetJointState, engine.TORQUE_CONTROL
-        self._positions, self._velocities = (
-            _run(mj.jnt_qposadr[joints]),
-            _run(mj.jnt_dofadr[joints]),
-        )
+        self._positions = _run(mj.jnt_qposadr[joints])
+        self._velocities = _run(mj.jnt_dofadr[joints])
         self._references = mj.qpos0[self._positions]
         self._shifted = bool(self._references.any())
 

@@ -52,7 +52,7 @@ from scm_world.queries.twins import AnyTwins, EquationTwins
 from scm_world.variables import Noise, Normal
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import Simulation
-from scm_world.world.plan import merged
+from scm_world.world.interventions import merged
 
 STREAM = "sensor of"
 """Begins the names of the streams; draws of ``sensor_noise`` itself have another one."""
