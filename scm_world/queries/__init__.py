@@ -2,7 +2,7 @@
 
 from scm_world.policies.scripted import Random
 from scm_world.queries.abduction import Counterfactuals
-from scm_world.queries.agreement import Agreement
+from scm_world.queries.comparison import Comparison
 from scm_world.queries.consequences import Consequence, Consequences, consequences
 from scm_world.queries.differences import ButFor, Divergence, EpisodeDifference, but_for, compare
 from scm_world.queries.episode_files import load_episode, save_episode
@@ -16,13 +16,13 @@ from scm_world.queries.plans import Plan, do
 from scm_world.queries.questions import SCM
 from scm_world.queries.samples import Samples, Setting
 from scm_world.queries.verification import Verification
-from scm_world.queries.verify import verify, verify_engines
+from scm_world.queries.verify import verify
 from scm_world.queries.world import World
 
 __all__ = [
     "SCM",
-    "Agreement",
     "ButFor",
+    "Comparison",
     "Consequence",
     "Consequences",
     "Counterfactuals",
@@ -50,5 +50,4 @@ __all__ = [
     "nature_graph",
     "save_episode",
     "verify",
-    "verify_engines",
 ]

@@ -12,10 +12,12 @@ import networkx as nx
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends import Backend
+from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import System
 from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Key, Plan, Schedule
+from scm_world.queries.progress import Progress
 from scm_world.queries.questions import Questions
 from scm_world.queries.twins import AnyTwins, twins_of
 from scm_world.tasks import ModelTask, StepTask
@@ -41,6 +43,25 @@ class World(Simulation, Questions):
         >>> episode.counterfactual({}) == episode
         True
     """
+
+    @classmethod
+    def of(cls, world: Simulation) -> Self:
+        """Return a world like another one, at the same instant, that can be asked.
+
+        Args:
+            world: Such as ``env.unwrapped.world``; it is left as it is.
+
+        Example:
+            >>> import gymnasium
+            >>> env = gymnasium.make("scm_world/Pushing-v0", backend="fake")
+            >>> _ = env.reset(seed=0)
+            >>> with World.of(env.unwrapped.world) as world:
+            ...     world.effect("reward", do={"floor_friction": 0.9}, n=2, steps=3).n
+            2
+        """
+        build, (_, *how) = Simulation.__reduce__(world)
+        made: Self = build(cls, *how)
+        return made
 
     @classmethod
     def from_mjcf(
@@ -209,6 +230,31 @@ class World(Simulation, Questions):
         """
         factual = self.rollout(policy, seed=seed, episode=episode, steps=steps, record=record)
         return factual.counterfactual(do, at=at, actions=actions, record=record)
+
+    def compare(
+        self, backend: str, *, probes: int = 12, seed: int = 0, progress: Progress | None = None
+    ) -> Comparison:
+        """Compare the effects of parameters on two backends: their signs and sizes.
+
+        In states that are made of the same numbers on both, each parameter is changed alike, and
+        a control step is taken. What counts are effects that are ten times as large as the
+        difference of the two backends without any change.
+
+        Args:
+            backend: Name of the other backend.
+            probes: Number of states.
+            seed: Of states and values.
+            progress: Called with (finished, planned) after each state.
+
+        Raises:
+            MissingEngine: The backend is not installed.
+            UnknownOption: There is no such backend, or ``probes`` is not a positive whole number.
+
+        Example:
+            >>> World("reaching", backend="fake").compare("fake", probes=1).share
+            1.0
+        """
+        return compare_backends(self, backend, probes=probes, seed=seed, progress=progress)
 
     def local_graph(self, action: ArrayLike | None = None) -> nx.MultiDiGraph:
         """Return the declared graph with the edges that hold now, whose conditions are met.

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from scm_world._arguments import whole_number
@@ -411,6 +412,24 @@ class Simulation:
     def action_high(self) -> Floats:
         """Upper end of all actions, shape (n_actions,)."""
         return self.compiled.action_bounds[1]
+
+    @property
+    def action_space(self) -> gymnasium.spaces.Box:
+        """The space of actions in SI units."""
+        low, high = self.compiled.action_bounds
+        return gymnasium.spaces.Box(low, high, dtype=np.float64)
+
+    @property
+    def observation_space(self) -> gymnasium.spaces.Dict:
+        """The space of the observed variables by name, in SI units; nothing is clipped."""
+        names = (part.variable for part in self.task.observation.rows)
+        shapes = {name: self.model.declared(name).shape for name in names}
+        return gymnasium.spaces.Dict(
+            {
+                name: gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float64)
+                for name, shape in shapes.items()
+            }
+        )
 
     @property
     def identity(self) -> tuple[Any, ...]:
