@@ -807,6 +807,7 @@ class Simulation:
             engine=self.backend.snapshot(),
             present=self._step_base(),
             base=self._base,
+            index=self._index,
             offset=self._offset,
             seed=self.noise.seed,
             episode=self.episode,

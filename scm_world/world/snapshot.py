@@ -67,7 +67,8 @@ class WorldSnapshot:
         engine: The engine's part; bytes that ``unpacked`` reads once it was pickled.
         present: The world, its memory of one control step ago included.
         base: The world at this control step before anyone intervened; None after a step.
-        offset: By how much interventions have moved the clock; noise follows the steps taken.
+        index: The control step.
+        offset: By how much interventions have moved the index; noise follows the steps taken.
         seed: Of the noise.
         episode: Number of the episode.
         world: Task, options and names of all variables, to tell worlds apart.
@@ -77,6 +78,7 @@ class WorldSnapshot:
     engine: EngineSnapshot | bytes
     present: StepBase | SavedBase
     base: StepBase | SavedBase | None
+    index: int
     offset: int
     seed: int
     episode: int
