@@ -666,7 +666,8 @@ class Simulation:
                 self.backend.apply(change)
                 reported = self._applied(change)
             row, changed = solution.row, solution.changed
-            if change is None and not changed and row[CONTROL_INDEX] == index:
+            stays = solution.compiled is self.compiled and row[CONTROL_INDEX] == index
+            if stays and change is None and not changed:
                 self._adopt_model(solution.model)
                 self.version += 1
             else:
@@ -674,7 +675,7 @@ class Simulation:
             now = self._values.row
             audit = report(request, solution, change, before, now, inertia, reported, self.backend)
             self._offset += self._index - index
-            if at_start and (change is not None or changed):
+            if at_start and not (stays and change is None and not changed):
                 self._forget()
             if check is not None:
                 check()
