@@ -178,7 +178,7 @@ class Paired:
         the same has to come out.
         """
         others = [*instants, *self._kept]
-        bases = [instants[0], instants[2]]
+        bases = instants[:3]
         if self._world is None:  # experiments are counted, and every unit is another circumstance
             bases = [bases[setting.probe % 2]]
         done = set[tuple[str, int, int]]()
