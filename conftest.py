@@ -6,6 +6,8 @@ from importlib.util import find_spec
 # Before numpy is imported: threads of its BLAS in several workers mostly wait for one another.
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
+# Tests start a hundred processes that import the package: only the first compiles it.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 NEEDS = {
     "stable_baselines3": ["scm_world/training/agents.py", "scm_world/training/sb3.py"],

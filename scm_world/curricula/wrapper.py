@@ -72,7 +72,7 @@ class CurriculumRunner:
             compiled = structure_after(world.structures, acts, held, held.solve(), key) or compiled
         plan = self._plan(compiled)
         self._schedule = Schedule([(0, plan)])
-        options = {"episode": number, "do": {**plan.at_start(), **mine}}
+        options: dict[str, Any] = {"do": {**plan.at_start(), **mine}}
         space = self.curriculum.space
         return options if space is None else {**options, "space": space}
 
@@ -244,11 +244,15 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             self._turn.memory = Memory(self._next[0], self._next[1].stages)
         elif given.get("episode") is not None:
             self.memory.episode = whole_number("episode", given["episode"], least=0)
-        noise, number = self.where or (secrets.randbits(63), 0)
-        if seed is not None:
-            noise, number = whole_number("seed", seed, least=0), 0
-        elif self._place is not None or not self._begun:
-            seed = noise
+        world, number = self._inner.world, 0
+        if seed is None and self._place is not None:
+            seed, number = self._place
+            given = {"episode": number, **given}
+        elif seed is None and world.has_begun:
+            number = world.episode + 1
+        elif seed is None:
+            seed = secrets.randbits(63)
+        noise = world.noise.seed if seed is None else whole_number("seed", seed, least=0)
         if given.get("episode") is not None:
             number = given["episode"]
         mine = self._turn.begin(self._inner, noise, number, given.get("do"))

@@ -8,7 +8,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
@@ -508,25 +508,27 @@ def _run_here(
 
     The processes of a worker pool may not have children, so threads wait for these.
     """
-    started: list[_Isolated] = []
-    stopped = Event()
+    missing = [group for group in groups if group]
+    processes = [_Isolated(timeout) for _ in range(min(workers, len(missing)))]
+    remaining, stopped = iter(missing), Event()
 
-    def work(group: Sequence[_Job]) -> None:
-        with closing(_Isolated(timeout)) as process:
-            started.append(process)
-            for job in group:
-                if stopped.is_set():
-                    return
-                keep(process(job))
+    def work(process: _Isolated) -> None:
+        with closing(process):
+            for group in remaining:  # shared: each group goes to the first process that is free
+                for job in group:
+                    if stopped.is_set():
+                        return
+                    keep(process(job))
 
     with ThreadPoolExecutor(workers) as pool:
-        futures = [pool.submit(work, group) for group in groups if group]
+        futures = [pool.submit(work, process) for process in processes]
         try:
+            wait(futures, return_when=FIRST_EXCEPTION)
             for future in futures:
                 future.result()
         except BaseException:
             stopped.set()
-            for process in tuple(started):
+            for process in processes:
                 process.interrupt()
             raise
 

@@ -31,11 +31,7 @@ RESETS = ("do", "episode", "space")
 
 
 def refuse_unknown(given: Iterable[str], *known: Callable[..., Any]) -> None:
-    """Refuse keywords that none of some functions takes, with the nearest one that there is.
-
-    Raises:
-        UnknownOption: There is one.
-    """
+    """Refuse keywords that none of some functions takes, with the nearest one that there is."""
     names = dict.fromkeys(name for one in known for name in signature(one).parameters)
     choices = [name for name in names if name not in ("self", "options", "member")]
     for name in given:
@@ -55,11 +51,7 @@ def known_options(init: Init) -> Init:
 
 
 def reset_options(options: Any, known: Iterable[str]) -> dict[str, Any]:
-    """Read the options of a reset, by name.
-
-    Raises:
-        UnknownOption: They are no dictionary, or there is no such option.
-    """
+    """Read the options of a reset, by name."""
     given = {} if options is None else options
     if not isinstance(given, Mapping):
         raise UnknownOption("options of a reset", options, ("a dictionary", *known))
@@ -81,15 +73,7 @@ def finite(size: int) -> str:
 
 
 def doubles(action: Any, size: int) -> Floats:
-    """Read an action, or several.
-
-    Args:
-        action: What was given.
-        size: How many numbers it should be, for the message.
-
-    Raises:
-        ActionError: It is no real numbers.
-    """
+    """Read an action, or several."""
     try:
         return real_numbers(action)
     except (TypeError, ValueError):
@@ -108,11 +92,7 @@ def action_scale(world: Simulation) -> tuple[Floats, Floats]:
 
 
 def names_of(option: str, given: Sequence[str]) -> tuple[str, ...]:
-    """Read a list of names.
-
-    Raises:
-        UnknownOption: It is one text.
-    """
+    """Read a list of names."""
     if isinstance(given, str):
         raise UnknownOption(option, given, (f"a list of names, such as [{given!r}]",))
     return tuple(given)
@@ -121,11 +101,7 @@ def names_of(option: str, given: Sequence[str]) -> tuple[str, ...]:
 def made_task(
     task: Task | StructureCache | str, options: Mapping[str, Any] | None
 ) -> Task | StructureCache:
-    """Make a task of a name, with its options; or take one, or its structures.
-
-    Raises:
-        UnknownOption: There are options for a task that is made.
-    """
+    """Make a task of a name, with its options; or take one, or its structures."""
     if isinstance(task, str):
         return make_task(task, **(options or {}))
     if options:
@@ -163,20 +139,7 @@ def begin(
     episode: int | None = None,
     space: AnyRegion | None = None,
 ) -> None:
-    """Reset a world, with an intervention that may draw something impossible.
-
-    Args:
-        world: To reset.
-        seed: Of the noise.
-        acts: What is done at the reset.
-        attempts: How often bodies may be drawn into one place until that is an error. Every
-            attempt is the beginning of the next episode, so it draws again.
-        episode: Number of the first one within the noise.
-        space: In which every target must lie.
-
-    Raises:
-        InterventionError: The intervention was refused, at the last attempt.
-    """
+    """Reset a world, with an intervention that may draw something impossible."""
     if episode is not None and seed is None:
         seed = world.noise.seed
     for left in reversed(range(attempts)):
@@ -193,13 +156,7 @@ def begin(
 def warn_of_changes(
     structure: CompiledTask, start: Mapping[str, Any], goals: SpaceName | None
 ) -> None:
-    """Warn where episodes draw which bodies there are: what is observed has several shapes then.
-
-    Args:
-        structure: Of the first episode.
-        start: What is done at every reset.
-        goals: The space of random goals, if there are some.
-    """
+    """Warn where episodes draw which bodies there are: what is observed has several shapes then."""
     goal = {} if goals is None else structure.task.sample_goal(goals)
     deciding = structure.task.decided_by
     drawn = [name for name in deciding if isinstance({**goal, **start}.get(name), Draw)]
@@ -220,15 +177,7 @@ def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledT
 def structure_after(
     structures: StructureCache, acts: Mapping[str, Any], held: SCM, static: Values, key: NoiseKey
 ) -> CompiledTask | None:
-    """Return the structure after an intervention; None where it decides nothing of that.
-
-    Args:
-        structures: Of the task.
-        acts: By name; others than those that decide the structure may be among them.
-        held: The model before, with the interventions that hold.
-        static: Values before.
-        key: Where to draw.
-    """
+    """Return the structure after an intervention; None where it decides nothing of that."""
     mine: dict[str, Any] = {}
     for name, value in acts.items():
         if name in structures.head:

@@ -31,7 +31,6 @@ from scm_world.env.arguments import (
 from scm_world.env.copies import Copied
 from scm_world.env.delta import COMMAND, PREFIX, Delta, checked_mode
 from scm_world.env.observer import (
-    STACKS,
     Goals,
     Observation,
     Observer,
@@ -43,7 +42,7 @@ from scm_world.env.observer import (
 from scm_world.env.rendering import Looks, Window
 from scm_world.env.vector import Vector, box
 from scm_world.errors import ActionError, ModelError, UnknownOption
-from scm_world.geometry.clipping import scaled_clip_kernel
+from scm_world.geometry.numbers import scaled_clip_kernel
 from scm_world.graph import flatten
 from scm_world.models.camera import Camera
 from scm_world.tasks import Task
@@ -108,8 +107,6 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         cameras: Names (``"60"``, ``"120"``, ``"300"``, ``"overview"``) or cameras, for
             ``"pixel"``; the three of the robot if None.
         image_size: Height and width of pictures, or both in one [pixels].
-        stack: Of the pictures of ``"pixel"``: ``"cameras"``: one after another, shape
-            (2 n, 3, h, w); ``"channels"``: as convolutional networks take them, (6 n, h, w).
         normalize_observations: Give numbers in [-1, 1] instead of SI units.
         goal_env: Give a dictionary with ``observation``, ``achieved_goal``, ``desired_goal``, and
             have a method ``compute_reward``: see ``GoalReward``.
@@ -171,7 +168,6 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         pad: Mapping[str, Any] | None = None,
         cameras: Sequence[str | Camera] | None = None,
         image_size: int | tuple[int, int] | None = None,
-        stack: str = STACKS[0],
         normalize_observations: bool = True,
         goal_env: bool = False,
         start: Mapping[str, Any] | None = None,
@@ -194,7 +190,6 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             keypoints=keypoints,
             cameras=cameras,
             image_size=image_size,
-            stack=stack,
             normalize=normalize_observations,
             goals=goal_env,
             pad=pad,
@@ -306,11 +301,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         return self._delta.toward(self._read(command))
 
     def _read(self, action: ArrayLike) -> Any:
-        """Read an action or a command, shape (n,); 32-bit numbers stay what they are.
-
-        Raises:
-            ActionError: It has another shape, or is no real numbers.
-        """
+        """Read an action or a command, shape (n,); 32-bit numbers stay what they are."""
         given: Any = action
         if getattr(action, "dtype", None) is not SINGLE:
             given = doubles(action, self._given.size)

@@ -105,12 +105,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
 
     @abstractmethod
     def _act(self, method: str, given: Mapping[int, Mapping[str, Any]]) -> dict[int, Any]:
-        """Call a method that changes environments, in all that are named or in none.
-
-        Args:
-            method: ``reset``, or any other one; its answers are returned.
-            given: The keyword arguments, by the index of the environment.
-        """
+        """Call a method that changes environments, in all that are named or in none."""
 
     @abstractmethod
     def call_in(self, indices: Iterable[int], name: str, *args: Any, **kwargs: Any) -> list[Any]:
@@ -388,9 +383,6 @@ class Alike:
 
         Returns:
             Its answer; and the observation and the info afterwards.
-
-        Raises:
-            InterventionError: There are other bodies in it than in the others then.
         """
         answer = env.get_wrapper_attr(method)(**given)
         inner: Any = env.unwrapped
@@ -494,11 +486,7 @@ def masked_infos(columns: Mapping[str, Any], which: Mask) -> dict[str, Any]:
 
 
 def read_mode(given: AutoresetMode | str) -> AutoresetMode:
-    """Read when an environment that is done is reset.
-
-    Raises:
-        UnknownOption: There is no such mode.
-    """
+    """Read when an environment that is done is reset."""
     try:
         return AutoresetMode(given)
     except ValueError:
@@ -508,13 +496,6 @@ def read_mode(given: AutoresetMode | str) -> AutoresetMode:
 
 def read_seeds(seed: Any, size: int) -> list[Any]:
     """Return the seed of each environment.
-
-    Args:
-        seed: One for the first, the next numbers are for the others; a list; or None.
-        size: How many environments there are.
-
-    Raises:
-        UnknownOption: It is none of these.
 
     Example:
         >>> read_seeds(7, 3)
@@ -530,11 +511,7 @@ def read_seeds(seed: Any, size: int) -> list[Any]:
 
 
 def read_mask(mask: Any, size: int) -> Mask:
-    """Read which environments are meant; all if None.
-
-    Raises:
-        UnknownOption: It is no array of truth values, or none of them is true.
-    """
+    """Read which environments are meant; all if None."""
     if mask is None:
         return np.ones(size, bool)
     read = isinstance(mask, np.ndarray) and mask.shape == (size,) and mask.dtype == np.bool_
@@ -546,15 +523,6 @@ def read_mask(mask: Any, size: int) -> Mask:
 
 def spread(what: str, given: Any, size: int, among: Iterable[int] | None = None) -> dict[int, Any]:
     """Return what is asked of each environment.
-
-    Args:
-        what: Named in the error.
-        given: One for all; a list with one, or None, for each; or a mapping by index.
-        size: How many environments there are.
-        among: Those that may be named; all if None.
-
-    Raises:
-        UnknownOption: A list of another length, or an index that does not exist.
 
     Example:
         >>> spread("do", [None, {"floor_friction": 0.4}], 2)
@@ -576,11 +544,7 @@ def spread(what: str, given: Any, size: int, among: Iterable[int] | None = None)
 
 
 def index_of(index: Any, size: int) -> int:
-    """Read the index of an environment.
-
-    Raises:
-        UnknownOption: There is none.
-    """
+    """Read the index of an environment."""
     try:
         number = operator.index(index)
     except TypeError:
@@ -600,9 +564,6 @@ def read_actions(actions: Any, which: Mask, size: int) -> Floats:
 
     Returns:
         Shape (n, size).
-
-    Raises:
-        ActionError: Another shape, or a number that is not finite, where one is stepped.
     """
     given = doubles(actions, size)
     if given.shape != (which.size, size):

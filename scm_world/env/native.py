@@ -237,11 +237,7 @@ class NativeVectorEnv(ScmWorldVectorEnv):
             terms[name][row] = value  # of the step: an intervention earns nothing
 
     def _explain(self, row: int) -> None:
-        """Raise the error that an environment whose reward is not finite would raise alone.
-
-        Raises:
-            ModelError: Its reward is not a finite number.
-        """
+        """Raise the error that an environment whose reward is not finite would raise alone."""
         self._bring(row)
         env = self._inner[row]
         try:

@@ -152,11 +152,7 @@ class ProcessVectorEnv(ScmWorldVectorEnv):
 
     @contextmanager
     def _in_step(self) -> Iterator[None]:
-        """Ask all processes; one that is not like the others any more ends all of them.
-
-        Raises:
-            EngineFailure: One of them ended, or they were interrupted before.
-        """
+        """Ask all processes; one that is not like the others any more ends all of them."""
         if self._lost:
             raise EngineFailure(self._lost, PROCESS)
         try:
@@ -203,10 +199,6 @@ class Member(gymnasium.Wrapper[Any, Any, Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Call the method that is asked of this environment, such as ``reset``, if any is.
 
-        Args:
-            seed: Not used: it is among the arguments of the method.
-            options: ``"asked"``: names and arguments, pickled, by the number of the environment.
-
         Returns:
             The present observation and info, with ``"answer"`` or ``"error"``.
         """
@@ -249,9 +241,6 @@ class Member(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def answer(self, asked: bytes) -> tuple[Any, Exception | None]:
         """Call a method, or read an attribute, if this environment is among those asked.
-
-        Args:
-            asked: Numbers of environments, name, and arguments, pickled.
 
         Returns:
             The answer and an error: one of them is None.

@@ -224,7 +224,7 @@ class EpisodeRunner:
         """
         turn = self._turn(protocol)
         turn.memory.episode = episode
-        options = turn.begin(self.env, seed, episode)
+        options = {"episode": episode, **turn.begin(self.env, seed, episode)}
         return turn, self.env.reset(seed=seed, options=options)[0]
 
     def _turn(self, protocol: Protocol) -> CurriculumRunner:

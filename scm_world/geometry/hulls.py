@@ -133,18 +133,10 @@ def hull_overlap(
     position_b: ArrayLike,
     orientation_b: ArrayLike,
 ) -> float:
-    """Compute the volume that two convex polyhedra share, exact to rounding.
+    """Compute the volume that two convex polyhedra share [m³], exact to rounding.
 
     Positions are centers of mass, shape (3,) [m], and orientations quaternions (x, y, z, w) of any
     length.
-
-    Returns:
-        The volume [m³], at least zero and at most that of the smaller one.
-
-    Example:
-        >>> cube, upright = hull_of(np.indices((2, 2, 2)).reshape(3, 8).T), [0.0, 0.0, 0.0, 1.0]
-        >>> round(hull_overlap(cube, [0.0, 0.0, 0.0], upright, cube, [0.5, 0.0, 0.0], upright), 9)
-        0.5
     """
     world = np.array(hull_a.vertices) @ rotation_matrix(orientation_a).T + np.asarray(position_a)
     corners = (world - np.asarray(position_b)) @ rotation_matrix(orientation_b)

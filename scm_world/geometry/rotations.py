@@ -39,10 +39,6 @@ def canonical(quaternion: ArrayLike) -> Floats:
 
     Half turns have w = 0; of their two names the one is taken whose first component that is not
     zero is positive. Applying the function twice changes no bit.
-
-    Example:
-        >>> canonical([0.0, 0.0, 0.0, -2.0])
-        array([0., 0., 0., 1.])
     """
     given = np.asarray(quaternion, dtype=np.float64)
     x, y, z, w = _components(given)
@@ -54,13 +50,7 @@ def canonical(quaternion: ArrayLike) -> Floats:
 
 
 def quaternion_product(p: ArrayLike, q: ArrayLike) -> Floats:
-    """Compose two rotations, first q, then p: a quaternion of any sign and length.
-
-    Example:
-        >>> quarter = from_rotation_vector([0.0, 0.0, np.pi / 2])
-        >>> quaternion_product(quarter, quarter).round(12)
-        array([0., 0., 1., 0.])
-    """
+    """Compose two rotations, first q, then p: a quaternion of any sign and length."""
     a, b, c, d = _components(p)
     x, y, z, w = _components(q)
     return np.stack(
@@ -75,12 +65,7 @@ def quaternion_product(p: ArrayLike, q: ArrayLike) -> Floats:
 
 
 def rotation_matrix(quaternion: ArrayLike) -> Floats:
-    """Compute the matrix that turns coordinates of the body into those of the world, (..., 3, 3).
-
-    Example:
-        >>> rotation_matrix([0.0, 0.0, 1.0, 0.0]) @ [1.0, 0.0, 0.0]
-        array([-1.,  0.,  0.])
-    """
+    """Compute the matrix (..., 3, 3) that turns coordinates of the body into those of the world."""
     given = np.array(quaternion, dtype=np.float64, order="C")
     _components(given)
     _squared_norm(given)
@@ -90,12 +75,7 @@ def rotation_matrix(quaternion: ArrayLike) -> Floats:
 
 
 def from_rotation_vector(vector: ArrayLike) -> Floats:
-    """Return the unit quaternion with w >= 0 of axis times angle, shape (..., 3) [rad].
-
-    Example:
-        >>> from_rotation_vector([0.0, 0.0, 0.0])
-        array([0., 0., 0., 1.])
-    """
+    """Return the unit quaternion with w >= 0 of axis times angle, shape (..., 3) [rad]."""
     given = np.asarray(vector, dtype=np.float64)
     angle = np.sqrt(np.sum(given * given, axis=-1, keepdims=True))
     imaginary = 0.5 * np.sinc(angle / (2.0 * np.pi)) * given
@@ -106,10 +86,6 @@ def to_rotation_vector(quaternion: ArrayLike) -> Floats:
     """Return axis times angle, shape (..., 3) [rad], with an angle in [0, pi].
 
     It is accurate to rounding near both ends.
-
-    Example:
-        >>> to_rotation_vector([0.0, 0.0, 1.0, 0.0])
-        array([0.        , 0.        , 3.14159265])
     """
     unit = canonical(quaternion)
     imaginary, real = unit[..., :3], unit[..., 3:]

@@ -100,7 +100,9 @@ def _complete(variable: Variable, value: Mechanism) -> Mechanism:
     if value.function is None and (own is None or own.noise is None):
         said = "it has no noise that could be another one"
     elif value.function is None and own is not None:
-        return value.model_copy(update={"function": own.mechanism, "parents": own.parents})
+        fields = ("parents", "inverse_noise")
+        kept = {"function": own.mechanism, **{name: getattr(own, name) for name in fields}}
+        return value.model_copy(update=kept)
     elif value.noise is not None and not value.equation.takes_noise:
         said = "its function does not take noise; give it an argument `noise`"
     elif isinstance(value.function, Function) and value.equation.takes_noise:

@@ -318,11 +318,7 @@ class Evaluator:
         return value
 
     def _called(self, variable: Any, arguments: list[Value], given: Mapping[str, Any]) -> Value:
-        """Call the function of a variable.
-
-        Raises:
-            FunctionFailure: It raised an error.
-        """
+        """Call the function of a variable."""
         function = self._bound(variable)
         try:
             return np.asarray(function(*arguments, **given))

@@ -205,11 +205,13 @@ class SCM:
             noise = given.noise
             if isinstance(variable, Derived) and given.equation.takes_noise:
                 noise = noise or variable.noise
+            back = None if noise is None else given.inverse_noise
             return Derived(
                 name=name,
                 parents=given.parents,
                 mechanism=given.equation,
                 noise=noise,
+                inverse_noise=back,
                 **common,
                 **spaces,
             )

@@ -347,28 +347,26 @@ class _Abduction:
         return np.array([called([p[i] for p in parents], _row(noise, i), shape) for i in rows])
 
     def _weigh(self, name: str, wrong: Value, *, unsure: bool) -> None:
-        """Leave out draws that contradict an observation; refuse what no draw gives.
-
-        Raises:
-            ImpossibleObservation: The model cannot give it.
-            ModelError: It can, for all that is known, but no draw of what was not observed does.
-        """
+        """Leave out draws that contradict an observation; refuse what no draw gives."""
         self._log_weights[wrong] = -np.inf
         lost = np.isinf(self._log_weights.reshape(self._rows, self.n)).all(axis=1)
         if not lost.any():
             return
         said = f"in row {lost.argmax()}, " if self._rows > 1 else ""
         if unsure:  # the model may give it: it was not met
+            said = f"{name!r}: {said}none of {self.n} draws gives what was observed"
             advice = (
                 "observe its causes, declare inverse_noise, draw more (n), or allow a tolerance"
             )
-            said = f"{name!r}: {said}none of {self.n} draws gives what was observed: {advice}"
-            raise ModelError([said])
-        if _source(self.model[name]) is None:
-            said += "its causes give another value, and it has no noise"
+            raise ModelError([f"{said}: {advice}"])
+        variable = self.model[name]
+        if _source(variable) is None:
+            why = "its causes give another value, and it has no noise"
         else:
-            said += "no value of its noise gives what was observed"
-        raise ImpossibleObservation(name, said)
+            why = "no value of its noise gives what was observed"
+            how = getattr(variable, "inverse_noise", None)
+            why += f", found as its inverse_noise ({how}) says" if isinstance(how, str) else ""
+        raise ImpossibleObservation(name, said + why)
 
     def _weights(self) -> Floats:
         """Return the weights of the draws, shape (rows, n); each row sums to 1."""
@@ -430,12 +428,7 @@ class _Abduction:
         )
 
     def _models(self, do: Mapping[str, Any]) -> list[SCM]:
-        """Return the model under what is done, for each control step.
-
-        Raises:
-            InterventionError: An intervention was refused.
-            UnknownOption: One is due after the last step, or waits for an event.
-        """
+        """Return the model under what is done, for each control step."""
         plan, found = Plan(numbered(self.model, do)), []
         for name, act in plan.timed():
             begin = act.time.start

@@ -159,11 +159,11 @@ def _monotone(
     log: Floats = density.log_density(root) - density.log_slope(gives, root)
     if not wide.any():
         return Found(root, log)
-    cdf, sf, middle = density.frozen.cdf, density.frozen.sf, density.frozen.ppf(0.5)
+    cdf, sf = density.frozen.cdf, density.frozen.sf
     mass = np.maximum(cdf(high) - cdf(low), sf(low) - sf(high))  # exact in both tails
     left = density.frozen.ppf(cdf(low) + shares * (cdf(high) - cdf(low)))
     right = density.frozen.isf(sf(low) + shares * (sf(high) - sf(low)))
-    within = np.clip(np.where(low > middle, right, left), low, high)
+    within = np.clip(np.where(low > centre, right, left), low, high)
     return Found(np.where(wide, within, root), np.where(wide, _log(mass), log), drawn=True)
 
 

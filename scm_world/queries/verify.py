@@ -88,7 +88,7 @@ def verify(
             number, there are options for a world that is made, or a name does not exist.
 
     Example:
-        >>> found = verify("reaching", backend="fake", probes=1)
+        >>> found = verify("reaching", backend="fake", probes=1, held_out=0)
         >>> found.floor, found.undeclared, found.outcome  # without physics nothing moves
         (0.0, (), 'not refuted')
     """

@@ -45,6 +45,25 @@ class World(Simulation, Questions):
     """
 
     @classmethod
+    def of(cls, world: Simulation) -> Self:
+        """Return a world like another one, at the same instant, that can be asked.
+
+        Args:
+            world: Such as ``env.unwrapped.world``; it is left as it is.
+
+        Example:
+            >>> import gymnasium
+            >>> env = gymnasium.make("scm_world/Pushing-v0", backend="fake")
+            >>> _ = env.reset(seed=0)
+            >>> with World.of(env.unwrapped.world) as world:
+            ...     world.effect("reward", do={"floor_friction": 0.9}, n=2, steps=3).n
+            2
+        """
+        build, (_, *how) = Simulation.__reduce__(world)
+        made: Self = build(cls, *how)
+        return made
+
+    @classmethod
     def from_mjcf(
         cls,
         source: Any,

@@ -286,12 +286,8 @@ class Task(ABC):
     ) -> dict[str, list[str]]:
         """Return the groups of variables that curricula know by a word, such as ``"poses"``.
 
-        ``"unphysical"`` are those that ``@physics`` leaves out.
-
-        Args:
-            model: The variables of the structure.
-            spaced: The roots and states that have a space.
-            bodies: Names of the bodies that move.
+        ``"unphysical"`` are those that ``@physics`` leaves out. Given are all variables, the roots
+        and states that have a space, and the bodies that move.
         """
         return {}
 

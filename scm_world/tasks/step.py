@@ -34,10 +34,6 @@ class ProcessNoise(Commands):
 
     A draw depends on seed, episode, control step and name only: interventions on other
     variables do not change it.
-
-    Args:
-        sources: What is drawn from, by name.
-        shapes: Of one draw.
     """
 
     def __init__(

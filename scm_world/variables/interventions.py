@@ -16,7 +16,15 @@ from pydantic import ConfigDict, Field, model_validator
 
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.variables.distributions import Distribution
-from scm_world.variables.kinds import SPACES, AsMechanism, AsParents, Parent, SpaceName, names
+from scm_world.variables.kinds import (
+    SPACES,
+    AsMechanism,
+    AsParents,
+    InverseNoise,
+    Parent,
+    SpaceName,
+    names,
+)
 from scm_world.variables.mechanisms import Concatenation, Function, Linear, Table, check_order
 from scm_world.variables.spaces import Frozen
 from scm_world.variables.times import Timed
@@ -128,6 +136,7 @@ class Mechanism(Timed):
             parents in another order is refused.
         parents: The causes; the graph then has these edges in place of the others.
         noise: Distribution of the noise; that of the variable if None.
+        inverse_noise: As of ``Derived``, for counterfactuals of units observed under it.
         of: A bundle that the function gives as a whole; the variable gets its part of it.
 
     Example:
@@ -136,12 +145,13 @@ class Mechanism(Timed):
         ('floor_color', 0)
     """
 
-    RARE: ClassVar[tuple[str, ...]] = ("noise", "of", "time")
+    RARE: ClassVar[tuple[str, ...]] = ("noise", "inverse_noise", "of", "time")
 
     kind: Literal["mechanism"] = "mechanism"
     function: AsMechanism | None = None
     parents: AsParents = ()
     noise: Distribution | None = None
+    inverse_noise: InverseNoise | None = None
     of: str | None = None
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
-from typing import Annotated, Any, Literal, final, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, final, get_args
 
 import numpy as np
 from pydantic import BeforeValidator, Field, WrapValidator, model_validator
@@ -52,6 +52,7 @@ def _as_mechanism(value: Any) -> Any:
 
 AsNumber = Annotated[Number, BeforeValidator(_as_number)]
 AsMechanism = Annotated[Equation, BeforeValidator(_as_mechanism)]
+InverseNoise = Literal["additive", "monotone"] | AsMechanism
 
 
 @final
@@ -292,8 +293,26 @@ class Exogenous(Variable):
         return self
 
 
+class _Computed(Variable):
+    """A variable that names its parents."""
+
+    if TYPE_CHECKING:
+        parents: AsParents
+        mechanism: Any
+
+    @property
+    def all_parents(self) -> tuple[Parent, ...]:
+        """The edges into this variable."""
+        return self.parents
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The parents of a bundle; nothing for other variables."""
+        return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
+
+
 @final
-class Derived(Variable):
+class Derived(_Computed):
     """A Python function of its parents.
 
     Attributes:
@@ -319,17 +338,7 @@ class Derived(Variable):
     noise_shape: tuple[int, ...] | None = None
     start: AsNumber = 0.0
     inverse: AsMechanism | None = None
-    inverse_noise: Literal["additive", "monotone"] | AsMechanism | None = None
-
-    @property
-    def all_parents(self) -> tuple[Parent, ...]:
-        """The edges into this variable."""
-        return self.parents
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """The parents of a bundle; nothing for other variables."""
-        return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
+    inverse_noise: InverseNoise | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -363,7 +372,7 @@ class Derived(Variable):
 
 
 @final
-class Measured(Variable):
+class Measured(_Computed):
     """Something that physics decides, or a readout of it.
 
     A state (``mechanism`` None, ``settable_state`` True) can be set at an instant; physics
@@ -389,16 +398,6 @@ class Measured(Variable):
     start: AsMechanism | None = None
     carry: AsMechanism | None = None
     restart: tuple[str, ...] = ()
-
-    @property
-    def all_parents(self) -> tuple[Parent, ...]:
-        """The edges into this variable."""
-        return self.parents
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """The parents of a bundle; nothing for other variables."""
-        return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
 
     @property
     def role(self) -> Role:

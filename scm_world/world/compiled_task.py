@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scm_world._arguments import real_numbers, whole_number
 from scm_world._types import ArrayLike, Floats, Integers, Value, Values
 from scm_world.errors import ActionError, InterventionError, ModelError, UnknownOption
-from scm_world.geometry.clipping import clip_kernel
+from scm_world.geometry.numbers import clip_kernel
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
 from scm_world.models.scene import SURFACES

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from typing import Any, final
@@ -78,6 +78,24 @@ def merged(model: SCM, *requests: Mapping[str, Any]) -> dict[str, Any]:
 
 def _targets(model: SCM, name: str) -> tuple[str, ...]:
     return model.targets(name) if name in model else (name,)
+
+
+@final
+@dataclass
+class Instant:
+    """A world when someone intervenes.
+
+    Attributes:
+        structures: Of the task.
+        base: The world as physics left it.
+        now: The present values.
+        structure: What the backend has compiled.
+    """
+
+    structures: StructureCache
+    base: StepBase
+    now: Row
+    structure: Structure
 
 
 @final
@@ -456,12 +474,7 @@ class Solution:
         return np.asarray(value)
 
     def _followed(self, requested: Variable, act: Mechanism) -> Value:
-        """Compute the value that a state is set to.
-
-        Raises:
-            InterventionError: It should follow what is neither a parameter nor a state, or the
-                function gives something of another shape or type.
-        """
+        """Compute the value that a state is set to."""
         known, values = self.compiled.static | self.compiled.slices.keys(), self._earlier
         unknown = [p.name for p in act.parents if p.lag or p.name not in known]
         if unknown:
@@ -726,10 +739,7 @@ def _overlaps_before(base: StepBase) -> tuple[Overlap, ...]:
 
 
 def feasible(
-    structures: StructureCache,
-    base: StepBase,
-    now: Row,
-    structure: Structure,
+    here: Instant,
     request: Mapping[str, Any],
     space: AnyRegion | None,
     key: NoiseKey,
@@ -743,10 +753,7 @@ def feasible(
     each of these draws is followed by some of the rest.
 
     Args:
-        structures: Of the task.
-        base: The world as physics left it.
-        now: The present values.
-        structure: What the backend has compiled.
+        here: The world.
         request: The intervention, with dotted names.
         space: Every target has to lie in, if any.
         key: Where to draw.
@@ -759,10 +766,11 @@ def feasible(
             draw was.
     """
     draws = [name for name, act in request.items() if isinstance(act, Draw)]
-    deciding = structures.deciding.intersection(draws)
+    deciding = here.structures.deciding.intersection(draws)
     left, turn, tried = ATTEMPTS, 0, ""
     while left > 0:
-        draft = Draft(structures, base, _drawn_anew(request, deciding, turn), space, key, found)
+        asked = _drawn_anew(request, deciding, turn)
+        draft = Draft(here.structures, here.base, asked, space, key, found)
         again = [name for name in draws if name not in deciding and draft.redraws(name)]
         key = replace(key, kept=frozenset(draws).difference(again)) if draws else key
         attempts = range(min(left, CHUNK) if deciding else ATTEMPTS) if again else range(1)
@@ -772,9 +780,10 @@ def feasible(
                 wrong = solution.solve()
             if wrong:
                 raise_all(wrong)
-            solution.changed = now.differing(solution.row)
-            change = difference(draft.compiled, now, structure, solution.row, solution.changed)
-            problems = overlaps(draft.compiled, draft.base, now, solution.row, change, draft.asked)
+            row, compiled = solution.row, draft.compiled
+            solution.changed = changed = here.now.differing(row)
+            change = difference(compiled, here.now, here.structure, row, changed)
+            problems = overlaps(compiled, draft.base, here.now, row, change, draft.asked)
             if draws and not problems:
                 problems = _in_obstacles(solution, draws)
             if not problems:
@@ -784,7 +793,7 @@ def feasible(
                 tried = tried if deciding else "whatever is drawn, "
                 break
         left, turn = left - attempt - 1 if deciding else 0, turn + 1
-    raise refusal(structures, base, now, structure, draft, problems, key, tried)
+    raise refusal(here, draft, problems, key, tried)
 
 
 def _drawn_anew(request: Mapping[str, Any], names: Iterable[str], turn: int) -> Mapping[str, Any]:
@@ -832,14 +841,7 @@ def _in_obstacles(solution: Solution, draws: Iterable[str]) -> list[Overlap]:
 
 
 def refusal(
-    structures: StructureCache,
-    base: StepBase,
-    now: Row,
-    structure: Structure,
-    draft: Draft,
-    problems: list[Overlap],
-    key: NoiseKey,
-    tried: str = "",
+    here: Instant, draft: Draft, problems: list[Overlap], key: NoiseKey, tried: str = ""
 ) -> Infeasible:
     """Return the error that names the target to blame, and its nearest feasible value."""
     bodies = {body for overlap in problems for body in overlap.bodies}
@@ -850,38 +852,27 @@ def refusal(
 
     name = max(draft.request, key=blame)
     key = replace(key, attempt=0, kept=frozenset())
-    found = _nearest(structures, base, now, structure, draft.request, key)
+    found = _nearest(here, draft.request, key)
     reasons = [tried + str(problem) for problem in problems]
     return Infeasible(name, draft.request[name], reasons, None if found is None else found[name])
 
 
 def _nearest(
-    structures: StructureCache,
-    base: StepBase,
-    now: Row,
-    structure: Structure,
-    request: Mapping[str, Any],
-    key: NoiseKey,
-    *,
-    halvings: int = 20,
+    at: Instant, request: Mapping[str, Any], key: NoiseKey, *, halvings: int = 20
 ) -> dict[str, Any] | None:
-    """Search the straight line from the present values to the wanted ones for the last feasible.
-
-    Returns:
-        A value for each target, or None where a target is no plain number or nothing is feasible.
-    """
+    """Search the straight line from the present values to the wanted ones for the last feasible."""
     here: dict[str, Value] = {}
     there: dict[str, Value] = {}
-    model = base.compiled.model
+    model = at.base.compiled.model
     for name, value in request.items():
-        if name in structures.head or name not in model:
+        if name in at.structures.deciding or name not in model:
             return None  # bodies come and go: there is nothing between
         try:
             plain = value.value if isinstance(value, Hard) else value
             there[name] = coerce(model.declared(name), plain)
         except InterventionError:
             return None
-        here[name] = base.compiled.coordinates(name, now)
+        here[name] = at.base.compiled.coordinates(name, at.now)
 
     def between(part: float) -> dict[str, Any]:
         return {name: (here[name] + part * (there[name] - here[name])).tolist() for name in here}
@@ -889,13 +880,13 @@ def _nearest(
     low, high = 0.0, 1.0
     for _ in range(halvings):
         middle = 0.5 * (low + high)
-        draft = Draft(structures, base, between(middle), None, key)
+        draft = Draft(at.structures, at.base, between(middle), None, key)
         solution = Solution(draft, key)
         with np.errstate(all="ignore"):
             blocked = bool(solution.solve())  # outside the bounds on the way
         if not blocked:
             row, compiled = solution.row, draft.compiled
-            change = difference(compiled, now, structure, row, now.differing(row))
-            blocked = bool(overlaps(compiled, draft.base, now, row, change, draft.asked))
+            change = difference(compiled, at.now, at.structure, row, at.now.differing(row))
+            blocked = bool(overlaps(compiled, draft.base, at.now, row, change, draft.asked))
         low, high = (low, middle) if blocked else (middle, high)
     return between(low)

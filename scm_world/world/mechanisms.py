@@ -366,12 +366,7 @@ def _size(shape: tuple[int, ...]) -> int:
 
 
 def _positional(mechanism: Any, count: int) -> tuple[Any, tuple[Any, ...]]:
-    """Split the function of a mechanism into one without constants, and these in order.
-
-    Args:
-        mechanism: Of a variable.
-        count: How many parents it has.
-    """
+    """Split the function of a mechanism into one without constants, and these in order."""
     if isinstance(mechanism, Linear):
         return Stacked(weighted_sum), (np.array(mechanism.weights), mechanism.intercept)
     function = mechanism.bind()

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from scm_world._arguments import whole_number
@@ -25,14 +26,14 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.models import Difference, Parameters, Scene, State, Structure
+from scm_world.models import Difference, ParameterKey, Parameters, Scene, State, Structure
 from scm_world.models.camera import Camera
-from scm_world.tasks import Task
+from scm_world.tasks import Conventions, Task
+from scm_world.tasks.composition import Composition
 from scm_world.variables import Draw, Mechanism, Subset
 from scm_world.variables.checks import check_subset
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.variables.subsets import AnyRegion, as_region
-from scm_world.world.attributes import WorldAttributes
 from scm_world.world.audit import Audit, report
 from scm_world.world.compiled_task import (
     CompiledTask,
@@ -43,6 +44,7 @@ from scm_world.world.compiled_task import (
 )
 from scm_world.world.interventions import (
     Draft,
+    Instant,
     Solution,
     difference,
     feasible,
@@ -59,7 +61,7 @@ from scm_world.world.values import PresentValues
 READ_BACK = 1e-6  # how far a backend may report a number from what it was given
 
 
-class Simulation(WorldAttributes):
+class Simulation:
     """The causal model of a task, stepped by a physics backend; ``scm_world.World`` adds questions.
 
     Args:
@@ -278,11 +280,7 @@ class Simulation(WorldAttributes):
         self._base = self._step_base(at_start=True)
 
     def _draw_nature(self) -> None:
-        """Draw what is random by declaration: the noise of this episode.
-
-        Raises:
-            Infeasible: It puts two bodies in one place.
-        """
+        """Draw what is random by declaration: the noise of this episode."""
         key = self.noise_key(0)
         compiled = self.structures.natural(key)
         if not compiled.random:
@@ -293,7 +291,8 @@ class Simulation(WorldAttributes):
         problems = overlaps(compiled, base, present, row, change) if solid else []
         if problems:
             draft = Draft(self.structures, base, {compiled.random[0]: Draw("A")}, None, key)
-            raise refusal(self.structures, base, present, self.structure, draft, problems, key)
+            here = Instant(self.structures, base, present, self.structure)
+            raise refusal(here, draft, problems, key)
         if change is not None:
             self.backend.apply(change)
         self._adopt(compiled, compiled.model, row)
@@ -304,6 +303,157 @@ class Simulation(WorldAttributes):
         Noise follows the steps that were taken: an intervention on ``control_index`` leaves it.
         """
         return NoiseKey(self.noise, self.episode, index - self._offset, origin=0)
+
+    # --- the task and the options -------------------------------------------------------------
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle through a snapshot: another backend, the same future bit for bit."""
+        try:
+            snapshot = self.snapshot()
+        except NotReset:
+            snapshot = None
+        options = {
+            "backend": self.backend.name,
+            "preset": self.options.preset,
+            "action_mode": self.action_mode,
+            "frame_skip": self.frame_skip,
+            "max_episode_length": self.given_length,
+            "conventions": self.conventions.name,
+            "variables_space": self.variables_space,
+        }
+        usual = self.task.choices["resolution"][0]
+        if self.resolution != usual:  # logs and files of before have none
+            options["resolution"] = self.resolution
+        return _copied, (type(self), self.structures.task, options, snapshot)
+
+    @property
+    def engine(self) -> str:
+        """Name and version of the physics engine."""
+        return f"{self.backend.name} {self.backend.version}"
+
+    @property
+    def task(self) -> Task:
+        """The task, with its present plan."""
+        return self.compiled.task
+
+    @property
+    def model(self) -> SCM:
+        """The causal model of the present structure, without interventions."""
+        return self.compiled.model
+
+    @property
+    def composition(self) -> Composition:
+        """The entities."""
+        return self.compiled.composition
+
+    @property
+    def slices(self) -> Mapping[str, slice]:
+        """Where each state stands in the state vector."""
+        return self.compiled.slices
+
+    @property
+    def parameter_keys(self) -> Mapping[str, ParameterKey]:
+        """Which physical parameter each variable sets."""
+        return self.compiled.parameter_keys
+
+    @property
+    def static_names(self) -> tuple[str, ...]:
+        """Everything that interventions alone decide, causes before effects."""
+        return self.compiled.static_names
+
+    @property
+    def computed(self) -> tuple[str, ...]:
+        """Variables that are computed from what moves, causes before effects."""
+        return self.compiled.computed
+
+    @property
+    def conventions(self) -> Conventions:
+        """Ours or the predecessor's."""
+        return self.options.conventions
+
+    @property
+    def action_mode(self) -> str:
+        """How the system is commanded."""
+        return self.options.action_mode
+
+    @property
+    def resolution(self) -> str:
+        """How finely the variables are cut."""
+        return self.options.resolution
+
+    @property
+    def frame_skip(self) -> int:
+        """Length of a control step in units of the task; 4 ms for the robot."""
+        return self.options.frame_skip
+
+    @property
+    def control_period(self) -> float:
+        """Length of a control step [s]."""
+        return self.options.control_period
+
+    @property
+    def given_length(self) -> int | None:
+        """Length of an episode in control steps, if one was given."""
+        return self.options.given_length
+
+    @property
+    def max_episode_length(self) -> int:
+        """Length of an episode in control steps."""
+        return self.structures.steps
+
+    @property
+    def action_low(self) -> Floats:
+        """Lower end of all actions, shape (n_actions,)."""
+        return self.compiled.action_bounds[0]
+
+    @property
+    def action_high(self) -> Floats:
+        """Upper end of all actions, shape (n_actions,)."""
+        return self.compiled.action_bounds[1]
+
+    @property
+    def action_space(self) -> gymnasium.spaces.Box:
+        """The space of actions in SI units."""
+        low, high = self.compiled.action_bounds
+        return gymnasium.spaces.Box(low, high, dtype=np.float64)
+
+    @property
+    def observation_space(self) -> gymnasium.spaces.Dict:
+        """The space of the observed variables by name, in SI units; nothing is clipped."""
+        names = (part.variable for part in self.task.observation.rows)
+        shapes = {name: self.model.declared(name).shape for name in names}
+        return gymnasium.spaces.Dict(
+            {
+                name: gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float64)
+                for name, shape in shapes.items()
+            }
+        )
+
+    @property
+    def identity(self) -> tuple[Any, ...]:
+        """What two worlds have in common if one can take up a snapshot of the other."""
+        return (*self._settings, self.structures.digest)
+
+    @property
+    def _settings(self) -> tuple[Any, ...]:
+        numbers = (self.frame_skip, self.max_episode_length)
+        options = (self.options.preset, self.action_mode, self.conventions.name)
+        usual = self.task.choices["resolution"][0]
+        finer = () if self.resolution == usual else (self.resolution,)
+        return (self.task.name, *options, *numbers, *finer)
+
+    def __fingerprint__(self) -> dict[str, Any]:
+        """Return what decides what happens here, except versions: the task, and the options."""
+        options = (self.backend.name, self.variables_space, self._settings)
+        return {**self.structures.__fingerprint__(), "options": options}
+
+    def describe(self, values: Values, state: State) -> Scene:
+        """Describe the scene that some values stand for."""
+        return self.compiled.describe(values, state)
+
+    def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
+        """Name some variables and what follows them at lag 0, without physics, causes first."""
+        return self.compiled.static_order(targets)
 
     # --- a control step -----------------------------------------------------------------------
 
@@ -427,10 +577,8 @@ class Simulation(WorldAttributes):
             flat, drawn = self._anew(flat, base)
         region = self.variables_space if space is None else as_region("space", space)
         key = self.noise_key(self._index)
-        now = self._values.row
-        solution, change = feasible(
-            self.structures, base, now, self.structure, flat, region, key, twice
-        )
+        here = Instant(self.structures, base, self._values.row, self.structure)
+        solution, change = feasible(here, flat, region, key, twice)
         audit = self._commit(solution, change, flat, check, at_start=base.at_start)
         self._base = StepBase(
             base.compiled, base.model, base.row, solution.kept(), drawn or base.drawn, base.at_start
@@ -499,11 +647,7 @@ class Simulation(WorldAttributes):
         *,
         at_start: bool,
     ) -> Audit:
-        """Apply what was computed, read it back, and report; or put everything back and raise.
-
-        Raises:
-            EngineFailure: The backend does not report what it was given.
-        """
+        """Apply what was computed, read it back, and report; or put everything back and raise."""
         before, index = self._step_base(), self._index
 
         def undo() -> None:
@@ -536,12 +680,7 @@ class Simulation(WorldAttributes):
 
     @contextmanager
     def _all_or_nothing(self, before: StepBase, undo: Callable[[], None]) -> Iterator[None]:
-        """Put everything back as it was before, should something fail half way.
-
-        Args:
-            before: A copy of the present.
-            undo: Puts the backend back.
-        """
+        """Put everything back as it was before, should something fail half way."""
         kept, offset = self._values, self._offset
         try:
             yield
@@ -562,11 +701,7 @@ class Simulation(WorldAttributes):
         return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
     def _applied(self, change: Difference) -> Parameters:
-        """Read back what was applied.
-
-        Raises:
-            EngineFailure: The backend did not take it over.
-        """
+        """Read back what was applied."""
         reported = self.backend.parameters(change.parameters)
         values = change.parameters.items()
         wrong = [".".join(key) for key, value in values if not _close(value, reported[key])]
@@ -766,6 +901,13 @@ class Simulation(WorldAttributes):
             raise EngineFailure(f"{self._lost}; {advice}", self.backend.name)
 
 
+def _copied(kind: Any, task: Task, options: Mapping[str, Any], snapshot: Any) -> Any:
+    world = kind(task, **options)
+    if snapshot is not None:
+        world.restore(snapshot)
+    return world
+
+
 def _copies(values: Values) -> dict[str, Value]:
     return {name: np.array(value) for name, value in values.items()}
 
@@ -777,11 +919,7 @@ def _close(given: Floats, reported: Floats) -> bool:
 
 
 def _as_backend(backend: Any) -> Backend:
-    """Return a backend, or make the one of a name.
-
-    Raises:
-        UnknownOption: There is none of this name, or it is neither.
-    """
+    """Return a backend, or make the one of a name."""
     if isinstance(backend, Backend):
         return backend
     if isinstance(backend, str):

@@ -183,11 +183,7 @@ def _possible(variable: Variable, values: Values) -> bool:
 
 
 def _head(task: Task) -> SCM:
-    """Cut the model of what decides the structure out of what the task's entities share.
-
-    Raises:
-        ModelError: A deciding variable, or a cause of one, is not declared in ``shared``.
-    """
+    """Cut the model of what decides the structure out of what the task's entities share."""
     shared = {variable.name: variable for variable in task.shared()}
     wanted = _with_causes(task.decided_by, shared)
     missing = sorted(wanted - shared.keys())

@@ -171,10 +171,10 @@ def name(request: pytest.FixtureRequest) -> str:
 
 
 def test_every_parameter_is_undone_exactly(name: str) -> None:
-    """Each is set, read back and set back; the model and 50 steps are as before, bit for bit."""
+    """Each is set, read back and set back; the model and 20 steps are as before, bit for bit."""
     backend, model = built(name), described(name)
     start, now = backend.snapshot(), arrays(backend.realization.model)
-    expected = play(backend, 50)
+    expected = play(backend, 20)
     inert = []
     for row in model.parameters:
         backend.restore(start)
@@ -187,7 +187,7 @@ def test_every_parameter_is_undone_exactly(name: str) -> None:
             inert.append(row.name)
         backend.apply(Difference(parameters={row.key: value}))
         assert changed(now, arrays(backend.realization.model)) == [], row.name
-        assert np.array_equal(play(backend, 50), expected), row.name
+        assert np.array_equal(play(backend, 20), expected), row.name
     assert inert == []
 
 

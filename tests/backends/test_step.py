@@ -23,7 +23,6 @@ from scm_world.errors import (
     ModelError,
     SnapshotMismatch,
     UnknownOption,
-    WrongValue,
 )
 from scm_world.models.scene import Difference, State
 from scm_world.tasks.trifinger.system import trifinger
@@ -386,16 +385,10 @@ def test_a_function_of_arrays_is_held_to_the_same(function: Any, message: str) -
 
 
 def test_what_does_not_exist_is_refused() -> None:
-    """Unknown parameters, wrong shapes, other modes and bodies are errors; nothing changes."""
+    """Unknown parameters, other modes and bodies are errors; nothing changes."""
     backend = built(MODELS["scalar"])
     with pytest.raises(UnknownOption, match=r"spring.stiffness, damping"):
         backend.apply(Difference(parameters={("", "mass"): np.array(1.0)}))
-    with pytest.raises(WrongValue, match=r"spring.stiffness\): expected shape \(2,\)"):
-        backend.apply(
-            Difference(
-                parameters={("", "damping"): np.array(9.0), ("spring", "stiffness"): np.ones(3)}
-            )
-        )
     assert backend.parameters([("", "damping")])["", "damping"] == 0.1
     with pytest.raises(UnknownOption, match=r"no parameter is named 'mass\.inertia'"):
         backend.parameters([("mass", "inertia")])

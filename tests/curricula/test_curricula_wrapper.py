@@ -200,6 +200,22 @@ def test_two_wrappers_act_one_after_the_other() -> None:
         assert (value(env, MASS), value(env, "floor_friction")) == (0.04, 0.3)
     assert found == [0.02, 0.03, 0.03]
     assert env.memory.episode == inner.memory.episode == 2
+    env.reset(seed=7)
+    assert env.memory.episode == inner.memory.episode == 3
+    assert env.unwrapped.world.episode == 0
+
+
+def test_an_environment_that_has_begun_goes_on_in_its_noise() -> None:
+    """The first reset under a curriculum is the next episode of the same seed."""
+    masses = []
+    for _ in range(2):
+        env = under({})
+        env.env.reset(seed=5)
+        env = CurriculumEnv(env.env, resample(MASS))
+        env.reset()
+        masses.append(value(env, MASS))
+        assert (env.unwrapped.world.noise.seed, env.unwrapped.world.episode) == (5, 1)
+    assert masses[0] == masses[1]
 
 
 def test_wrappers_may_be_inside_and_outside() -> None:

@@ -134,10 +134,11 @@ def test_scores_are_those_of_the_reference(name: str) -> None:
 def test_models_are_problems(tmp_path: Path) -> None:
     """An object stands beside names; two of them are told apart, and results are read again."""
     models = [random_model("er2:4", seed) for seed in (1, 2)]
-    result = benchmark(["pooled"], [*models, "er2:4"], budgets=[40], seeds=1, out=tmp_path / "r")
+    asked: dict[str, Any] = {"budgets": [40], "seeds": 1, "standardised": False}
+    result = benchmark(["pooled"], [*models, "er2:4"], **asked, out=tmp_path / "r")
     assert len(result.problems) == 3
     assert {run.status for run in result.runs} == {"done"}
-    again = benchmark(["pooled"], [*models, "er2:4"], budgets=[40], seeds=1, out=tmp_path / "r")
+    again = benchmark(["pooled"], [*models, "er2:4"], **asked, out=tmp_path / "r")
     assert [run.key for run in again.runs] == [run.key for run in result.runs]
 
 
@@ -155,7 +156,8 @@ def test_the_order_of_declaration_is_no_hint() -> None:
         for cause, effect in pairwise("abcde")
     ]
     learners = ["user_learners:rightward", "bipartite"]
-    result = benchmark(learners, [SCM(line)], [40], seeds=4, data=["observational"])
+    seen = {"data": ["observational"], "standardised": False}
+    result = benchmark(learners, [SCM(line)], [40], seeds=4, **seen)
     mine, theirs = ([r for r in result.runs if r.learner == name] for name in learners)
     assert all(run.found.names == tuple("abcde") for run in result.runs if run.found)
     assert np.mean([run.scores["recall"] for run in mine]) < 0.8

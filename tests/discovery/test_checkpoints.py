@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
 from scm_world import World, discover
+from scm_world.cli import app
 from scm_world.discovery import DiscoveryReport
 from scm_world.errors import UnreadableFile, UnwritableFolder
 from scm_world.output import durable
@@ -115,10 +117,10 @@ def test_files_are_on_the_disk_before_they_have_their_name(
 
 def test_a_killed_command_goes_on(tmp_path: Path) -> None:
     """``kill -9`` loses at most the probe state in work."""
-    command = [sys.executable, "-m", "scm_world", "discover", "pushing", "--backend", "fake"]
-    command += ["--probes", "3"]
+    words = ["discover", "pushing", "--backend", "fake", "--probes", "3", "--out"]
     out = tmp_path / "out"
-    process = subprocess.Popen([*command, "--out", str(out)], stdout=subprocess.DEVNULL)  # noqa: S603 # ours
+    command = [sys.executable, "-m", "scm_world", *words, str(out)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)  # noqa: S603 # ours
     deadline = time.monotonic() + 120.0
     while not (out / "progress.json").exists() and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -127,7 +129,7 @@ def test_a_killed_command_goes_on(tmp_path: Path) -> None:
     done = json.loads((out / "progress.json").read_text())["done"]
     assert 1 <= done < 3
     for folder in (out, tmp_path / "plain"):
-        subprocess.run([*command, "--out", str(folder)], check=True, capture_output=True)  # noqa: S603 # ours
+        assert CliRunner().invoke(app, [*words, str(folder)]).exit_code == 0
     reports = [json.loads((tmp_path / f / "report.json").read_text()) for f in ("out", "plain")]
     for report in reports:
         del report["seconds"]

@@ -91,7 +91,7 @@ def test_impossible_draws_are_followed_by_another_episode_if_asked_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With attempts an impossible draw is followed by the next episode; without it is an error."""
-    monkeypatch.setattr("scm_world.world.feasibility.ATTEMPTS", 1)
+    monkeypatch.setattr("scm_world.world.interventions.ATTEMPTS", 1)
     start = {"tool_block.cylindrical_position": "B"}
     once, often = make(start=start), make(start=start, attempts=20)
     episodes = []

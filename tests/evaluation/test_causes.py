@@ -49,8 +49,8 @@ def by_name(causes: Causes) -> Mapping[str, Cause]:
 
 def test_known_effects_are_recovered() -> None:
     """With many episodes, shares and contrasts are those that were put in."""
-    drawn, scores = episodes(0, n=20_000)
-    found = by_name(find_causes(drawn, scores, permutations=100))
+    drawn, scores = episodes(0, n=8_000)
+    found = by_name(find_causes(drawn, scores, permutations=40))
     for name, share in SHARES.items():
         assert found[name].share.value == pytest.approx(share, abs=0.02), name
     assert found["line"].column.contrast.value == pytest.approx(-2 / 3, abs=0.03)

@@ -105,8 +105,7 @@ evaluate({{"mine": linear}}, "P0,P6", n=150, backend="fake", env={{"max_episode_
 """
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT], ids=["kill", "ctrl-c"])
+@pytest.mark.parametrize(("sent", "workers"), [(signal.SIGKILL, 2), (signal.SIGINT, 1)])
 def test_interrupted_and_resumed_is_uninterrupted(
     sent: signal.Signals, workers: int, tmp_path: Path
 ) -> None:

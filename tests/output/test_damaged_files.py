@@ -140,22 +140,12 @@ def episode_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save_episode(episode, tmp_path_factory.mktemp("episodes") / "one.npz")
 
 
-@pytest.mark.parametrize("steps", [10**9, 2, -1, 1.5, True, "3", None])
-def test_an_episode_says_no_more_steps_than_it_holds(
-    episode_file: Path, tmp_path: Path, steps: Any
-) -> None:
-    """It is refused before a step is taken."""
-    with np.load(episode_file) as arrays:
-        found = dict(arrays)
-    found["about"] = np.array(json.dumps({**json.loads(str(found["about"])), "steps": steps}))
-    np.savez_compressed(tmp_path / "other.npz", **found)
-    with pytest.raises(UnreadableFile, match="control steps"):
-        load_episode(tmp_path / "other.npz")
-
-
 @pytest.mark.parametrize(
     "changed",
-    [{"layers": 3}, {"layers": [[0]]}, {"options": "x"}, {"task": {}}, {"arguments": [1]}],
+    [
+        *({"layers": 3}, {"layers": [[0]]}, {"options": "x"}, {"task": {}}, {"arguments": [1]}),
+        *({"instants": []}, {"instants": None}, {"format": "scm_world/episode/2"}),
+    ],
 )
 def test_an_episode_that_says_something_else_is_refused(
     episode_file: Path, tmp_path: Path, changed: dict[str, Any]

@@ -640,6 +640,11 @@ def test_another_noise_is_drawn_and_not_the_one_that_was_found() -> None:
     assert other["y"] == pytest.approx([7.0, 9.0], abs=0.02)
     same = model.counterfactual(seen, do={"y": Mechanism(lambda x, noise: 10 * x + noise, ["x"])})
     assert (same.exact, same["y"].tolist()) == (True, [11.0, 18.0])
+    cubic = model.do({"y": Mechanism(cubed, ["x"], inverse_noise="monotone")})
+    under = cubic.counterfactual({"x": 1.0, "y": 1.0 + 0.5**3 + 0.05}, do={"x": 2.0})
+    assert (under.exact, under["y"]) == (True, pytest.approx(2.175))
+    noisier = model.do({"y": Mechanism(noise=Normal(0.0, 9.0))}).counterfactual(seen, do={"x": 0.0})
+    assert (noisier.exact, noisier["y"].tolist()) == (True, [1.0, -2.0])
     drawn = model.counterfactual(seen, do={"x": Draw(Normal(10.0, 1.0))})
     assert not drawn.exact
     assert drawn["y"] == pytest.approx([21.0, 18.0], abs=0.3)

@@ -16,7 +16,7 @@ from scm_world.world import Simulation
 SMALLER: Mapping[str, Mapping[str, Any]] = {
     "towers": {"number_of_blocks_in_tower": (1, 2, 2)},
     "stacked_blocks": {"num_of_levels": 2, "max_level_width": 0.075},
-    "creative_stacked_blocks": {"num_of_levels": 3, "max_level_width": 0.075},
+    "creative_stacked_blocks": {"num_of_levels": 3, "max_level_width": 0.04},
     "general": {"nums_objects": 2},
 }
 """Options that keep a suite short in which every quantity of every block is set."""
@@ -82,7 +82,7 @@ class TestMujoco(OnEveryTask):
     """On MuJoCo, the default engine of all tasks."""
 
     backend = "mujoco"
-    tasks = (*TASKS, WEDGE)
+    tasks = (*KINDS, WEDGE)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("pybullet") is None, reason="needs pybullet")

@@ -237,7 +237,8 @@ def test_a_network_of_convolutions_takes_stacked_channels() -> None:
     """The checker of Stable-Baselines3 has nothing to say, and its network learns."""
     from stable_baselines3.common.env_checker import check_env
 
-    options: dict[str, Any] = {"observation_mode": "pixel", "stack": "channels", "image_size": 36}
-    env = gymnasium.make(PUSHING, backend="fake", max_episode_length=4, **options)
+    options: dict[str, Any] = {"observation_mode": "pixel", "image_size": 36}
+    pictures = gymnasium.make(PUSHING, backend="fake", max_episode_length=4, **options)
+    env = gymnasium.wrappers.ReshapeObservation(pictures, (18, 36, 36))
     check_env(env, skip_render_check=True)
     sb3.PPO("CnnPolicy", env, n_steps=4, batch_size=4, device="cpu").learn(4)

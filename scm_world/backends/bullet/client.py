@@ -15,15 +15,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import ContactPoint
-from scm_world.backends.bullet.build import (
-    BALL,
-    FREE,
-    EngineBody,
-    custom,
-    renewed,
-    solid,
-    takes_armature,
-)
+from scm_world.backends.bullet.build import BALL, FREE, EngineBody, custom, renewed
 from scm_world.backends.bullet.engine import Connection
 from scm_world.backends.bullet.honoured import realized, rebuilt
 from scm_world.backends.bullet.joints import Free, JointSet, parts
@@ -103,14 +95,6 @@ def shares(mj: mujoco.MjModel, shapes: list[int], usual: float) -> Floats:
     coefficient and the other at least that, if the floor has no more than it. The number of a
     moving shape depends on its own coefficient and on that of the first fixed shape alone, so
     that shapes which never touch leave one another alone to the last bit.
-
-    Args:
-        mj: With the coefficients in force.
-        shapes: Their numbers.
-        usual: See ``usual_friction``.
-
-    Returns:
-        The number of each shape.
     """
     still = mj.body_treeid[mj.geom_bodyid[shapes]] < 0
     found: Floats = np.where(mj.geom_condim[shapes] == 1, 0.0, mj.geom_friction[shapes, 0])
@@ -160,9 +144,6 @@ class Client:
     springs, dampers and media, and converts states. Nothing moves there: each of its numbers that
     concerns the engine is set in the engine when it differs from its last setting.
     After an error other than ``Infeasible`` a client is of no use.
-
-    Args:
-        engine: The module ``pybullet``.
 
     Attributes:
         engine: Its functions for this client.
@@ -238,8 +219,6 @@ class Client:
         self._enabled = enabled
         self._parts = parts(self.engine, mj, self.joints, range(mj.ntree))
         self._scalar = [joint for joint in self.joints if mj.jnt_type[joint] not in (FREE, BALL)]
-        armed = [(r, body) for r, body in enumerate(self.bodies) if takes_armature(mj, body)]
-        self._moments = {row: solid(mj, body)[0].copy() for row, body in armed}
         self._in_force, self._trees, self._driven = [], set[int](), list[JointSet]()
         self._set_all()
 
@@ -262,11 +241,7 @@ class Client:
     # --- parameters ------------------------------------------------------------------------------
 
     def edit(self, parameters: Parameters) -> None:
-        """Change parameters that need no new bodies. What is in force already is left alone.
-
-        Raises:
-            Infeasible: Nothing can move with them. Nothing has changed.
-        """
+        """Change parameters that need no new bodies. What is in force already is left alone."""
         if parameters is self._parameters:
             return
         fresh = {k: v for k, v in parameters.items() if self._parameters.get(k) is not v}
@@ -313,8 +288,6 @@ class Client:
         yield engine.setPhysicsEngineParameter, {0: ()}, [0], names, rows
         bodies = list(self.bodies)
         rows = np.column_stack([mj.body_mass[bodies], mj.body_inertia[bodies]])
-        for row, moments in self._moments.items():
-            rows[row, 1:] = moments
         yield inertia, self.bodies, bodies, ("mass", "x", "y", "z"), rows
         scalar = self._scalar
         rigid = not disabled(mj, _OFF.mjDSBL_CONSTRAINT)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from functools import partial
 from typing import Any, final
 
 import mujoco
@@ -15,21 +16,18 @@ from scm_world.backends.bullet.build import BALL, FREE, UNTURNED, Handle, compos
 
 @final
 class Scalars:
-    """Hinges and slides, in one call of the engine for each multibody."""
+    """The hinges and slides of a multibody, in one call of the engine."""
 
     def __init__(self, engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle]) -> None:
-        groups: dict[int, dict[int, int]] = {}
-        for joint, (multibody, link) in places.items():
-            groups.setdefault(multibody, {})[joint] = link
-        joints = [joint for group in groups.values() for joint in group]
-        self._places = [places[joint] for joint in joints]
-        self._links = [(multibody, list(group.values())) for multibody, group in groups.items()]
-        self._ask, self._tell = engine.getJointStates, engine.setJointMotorControlArray
-        self._put, self._mode = engine.resetJointState, engine.TORQUE_CONTROL
-        self._positions, self._velocities = (
-            _run(mj.jnt_qposadr[joints]),
-            _run(mj.jnt_dofadr[joints]),
+        joints, self._places = list(places), list(places.values())
+        multibody, links = self._places[0][0], [link for _, link in self._places]
+        self._ask = partial(engine.getJointStates, multibody, links)
+        self._tell = partial(
+            engine.setJointMotorControlArray, multibody, links, engine.TORQUE_CONTROL
         )
+        self._put = engine.resetJointState
+        self._positions = _run(mj.jnt_qposadr[joints])
+        self._velocities = _run(mj.jnt_dofadr[joints])
         self._references = mj.qpos0[self._positions]
         self._shifted = bool(self._references.any())
 
@@ -42,7 +40,7 @@ class Scalars:
 
     def take(self, data: mujoco.MjData) -> None:
         """Set the state of MuJoCo to that in the engine."""
-        rows = [row for body, links in self._links for row in self._ask(body, links)]
+        rows = self._ask()
         data.qpos[self._positions] = [row[0] for row in rows]
         if self._shifted:
             data.qpos[self._positions] += self._references
@@ -50,10 +48,7 @@ class Scalars:
 
     def drive(self, data: mujoco.MjData, forces: Floats) -> None:
         """Apply forces along the joints in the next step; MuJoCo has the positions before it."""
-        given = forces[self._velocities].tolist()
-        for multibody, links in self._links:
-            own, given = given[: len(links)], given[len(links) :]
-            self._tell(multibody, links, self._mode, forces=own)
+        self._tell(forces=forces[self._velocities].tolist())
 
 
 def _run(numbers: Integers) -> Any:
@@ -148,13 +143,14 @@ def parts(
 ) -> list[JointSet]:
     """List what can move in some kinematic trees, as few parts as there can be."""
     own = [j for j in sorted(places) if mj.body_treeid[mj.jnt_bodyid[j]] in trees]
-    together: dict[type[Scalars | Free], dict[int, Handle]] = {}
+    together: dict[int, dict[int, Handle]] = {}  # by multibody; free bodies by -1
     for joint in own:
         if mj.jnt_type[joint] != BALL:
-            kind = Free if mj.jnt_type[joint] == FREE else Scalars
-            together.setdefault(kind, {})[joint] = places[joint]
+            key = -1 if mj.jnt_type[joint] == FREE else places[joint][0]
+            together.setdefault(key, {})[joint] = places[joint]
     balls = [Ball(engine, mj, j, places[j]) for j in own if mj.jnt_type[j] == BALL]
-    return [*balls, *(kind(engine, mj, joints) for kind, joints in together.items())]
+    kinds = ((Free if key < 0 else Scalars, joints) for key, joints in together.items())
+    return [*balls, *(kind(engine, mj, joints) for kind, joints in kinds)]
 
 
 @njit(cache=True)

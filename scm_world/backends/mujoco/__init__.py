@@ -13,18 +13,13 @@ from importlib import metadata
 
 from scm_world.errors import MissingEngine
 
-OLDEST = (3, 17)
 REQUIREMENT = "mujoco>=3.17,<5"
 REPAIR = f"pip uninstall -y mujoco mujoco-core mujoco-studio && pip install '{REQUIREMENT}'"
 DISTRIBUTIONS = ("mujoco", "mujoco-core", "mujoco-studio")
 
 
 def check_installation() -> None:
-    """Compare the versions of the installed distributions, without importing MuJoCo.
-
-    Raises:
-        MissingEngine: It is not installed, or older than 3.17, or versions differ.
-    """
+    """Compare the versions of the installed distributions, without importing MuJoCo."""
     found = {}
     for name in DISTRIBUTIONS:
         with suppress(metadata.PackageNotFoundError):
@@ -33,9 +28,6 @@ def check_installation() -> None:
     if len(versions) > 1:
         mixed = ", ".join(f"{name} {version}" for name, version in found.items())
         raise MissingEngine("mujoco", REPAIR, f"versions are mixed: {mixed}")
-    if not versions or min(versions) < OLDEST:
-        old = f"{found.popitem()[1]} is too old" if found else ""
-        raise MissingEngine("mujoco", f"pip install '{REQUIREMENT}'", old)
 
 
 check_installation()

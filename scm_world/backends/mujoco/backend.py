@@ -8,24 +8,12 @@ from typing import Any, ClassVar, final
 import mujoco
 
 from scm_world._types import Floats
-from scm_world.backends.base import (
-    Backend,
-    Capabilities,
-    ContactPoint,
-    EngineBatch,
-    EngineSnapshot,
-)
+from scm_world.backends.base import Backend, Capabilities, ContactPoint, EngineBatch, EngineSnapshot
 from scm_world.backends.mujoco.batch import MujocoBatch, Slot
-from scm_world.backends.mujoco.contacts import Touches
+from scm_world.backends.mujoco.contacts import Touches, named
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.errors import EngineFailure
-from scm_world.models.scene import (
-    Difference,
-    ParameterKey,
-    Parameters,
-    Scene,
-    complete,
-)
+from scm_world.models.scene import Difference, ParameterKey, Parameters, Scene, complete
 
 
 @final
@@ -94,11 +82,7 @@ class MujocoBackend(Backend):
         return into
 
     def step(self, command: Floats, substeps: int) -> None:
-        """Hold a command for some physics steps.
-
-        Raises:
-            EngineFailure: Also where memory did not suffice.
-        """
+        """Hold a command for some physics steps."""
         if self.slot is not None:
             self._return()
         self._touches = None
@@ -106,11 +90,8 @@ class MujocoBackend(Backend):
             raise EngineFailure(problem, self.name)
 
     def contacts(self) -> tuple[ContactPoint, ...]:
-        """List the contact points of the last physics step.
-
-        Of a Runge-Kutta step MuJoCo keeps those of the last stage alone: ``Model.staged`` says so.
-        """
-        return self._last_touches().contacts()
+        """List the contact points of the last physics step; see ``Model.staged``."""
+        return named(self._last_touches())
 
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""

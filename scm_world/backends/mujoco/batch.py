@@ -31,13 +31,7 @@ _LEFT_BEHIND: list[Any] = []
 
 @final
 class Simulations:
-    """The simulations of all scenes of one structure.
-
-    Args:
-        scene: Any of them.
-        n: How many scenes there could be.
-        threads: That step them.
-    """
+    """The simulations of all scenes of one structure, of which there could be n."""
 
     def __init__(self, scene: Realization, n: int, threads: int) -> None:
         self.structure = scene.structure
@@ -97,11 +91,7 @@ class MujocoBatch(EngineBatch):
     """Scenes of MuJoCo, each with its own parameters, stepped by C threads.
 
     While a scene is stepped here, its state is in a slot. Any other call of its backend copies the
-    state back. Results are bit-identical to those of single scenes.
-
-    Args:
-        backends: Of the scenes.
-        threads: That step them; the results do not depend on how many.
+    state back. Results are bit-identical to those of single scenes, with any number of threads.
     """
 
     def __init__(self, backends: Sequence[MujocoBackend], threads: int = 1) -> None:

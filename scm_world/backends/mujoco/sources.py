@@ -62,10 +62,8 @@ def realized(source: Source) -> tuple[mujoco.MjModel, tuple[str, ...]]:
     The causes of leaks, as measured: one solve for all constraints instead of one for each island,
     a warm start that is chosen for all, sleep, the reset of everything after a number that is not
     finite, Euler's implicit damping, which begins for all trees with the first damped joint, and
-    the dense inverse inertia of all constraints, which PGS and the noslip solver work with.
-
-    Returns:
-        The model, and what is different from the file.
+    the dense inverse inertia of all constraints, which PGS and the noslip solver work with. What is
+    different from the file is returned, too.
     """
     mj, notes, off = source.compile(), list[str](), mujoco.mjtDisableBit
     options = mj.opt

@@ -50,11 +50,7 @@ def _visible(scene: Scene) -> VisibleModel:
 
 
 def shapes_of(scene: Scene, *, goals: bool = True) -> Shapes:
-    """Collect everything that is seen, goals last, whatever backend steps the scene.
-
-    Raises:
-        ModelError: The structure says nothing about shapes.
-    """
+    """Collect everything that is seen, goals last, whatever backend steps the scene."""
     shapes = _visible(scene).shapes()
     return shapes.joined(goal_shapes(scene.goals)) if goals and scene.goals else shapes
 
@@ -66,17 +62,12 @@ def background_of(scene: Scene, *, obstacles: bool = True) -> Shapes:
     """
     views = views_of(scene.structure)
     shown, hidden = (scene, None) if views is None else views.background(scene, obstacles)
-    shapes, names = shapes_of(shown), body_names(scene.structure)
+    shapes, names = shapes_of(shown), scene.structure.body_names
     gone = shapes.table.moves
     if hidden is not None:
         gone = np.isin(shapes.table.bodies, [names.index(name) for name in hidden])
     shapes.table.colors[gone, 3] = 0.0
     return shapes
-
-
-def body_names(structure: Any) -> tuple[str, ...]:
-    """Name what the numbers of a segmentation stand for."""
-    return _visible(structure.default_scene()).names
 
 
 USUAL_SIZE = 480, 640  # [pixels] height and width of a picture for people
@@ -109,11 +100,7 @@ class RenderedImage:
     names: tuple[str, ...]
 
     def shows(self, name: str) -> NDArray[np.bool_]:
-        """Tell which pixels show a body, shape (h, w).
-
-        Raises:
-            UnknownOption: There is no body of this name.
-        """
+        """Tell which pixels show a body, shape (h, w)."""
         if name not in self.names:
             raise UnknownOption("body", name, self.names)
         mask: NDArray[np.bool_] = self.segmentation == self.names.index(name)
@@ -162,7 +149,7 @@ def render(
         fine = draw_parts(parts, camera, scene.light, samples).rgb.transpose(1, 2, 0)
         blocks = fine.reshape(camera.height, samples, camera.width, samples, 3)
         rgb = np.rint(blocks.mean(axis=(1, 3), dtype=np.float64)).astype(np.uint8)
-    return RenderedImage(rgb, canvas.depth, canvas.owners, body_names(scene.structure))
+    return RenderedImage(rgb, canvas.depth, canvas.owners, scene.structure.body_names)
 
 
 def picture(
@@ -235,11 +222,7 @@ def automatic_camera(shapes: Shapes, size: tuple[int, int] = USUAL_SIZE) -> Came
     """Place a camera so that it sees everything that moves.
 
     It looks from the front, from the right and from above. Planes do not count; where nothing
-    moves, it sees all there is.
-
-    Args:
-        shapes: Those of one scene or, joined, of several; see ``shapes_of``.
-        size: Height and width of the picture [pixels].
+    moves, it sees all there is. The shapes are those of one scene or, joined, of several.
     """
     points = corners_of_what_moves(shapes)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
@@ -269,11 +252,7 @@ def following_camera(camera: Camera, shapes: Shapes) -> Camera:
     """Move a camera along with what moves, for the next picture of a film.
 
     It keeps its direction, and stays where it is as long as the middle of what moves is near the
-    middle of the picture.
-
-    Args:
-        camera: That of the last picture.
-        shapes: Those of the next one, without goals; see ``shapes_of``.
+    middle of the picture. The shapes are those of the next one, without goals.
     """
     points = corners_of_what_moves(shapes)
     eye, target = np.array(camera.eye), np.array(camera.target)
@@ -332,27 +311,9 @@ def camera_pixels(
             row first; its pictures of goals leave obstacles out. With the published cameras they
             are upright and mirrored.
 
-    Raises:
-        ValueError: ``out`` has another shape or another dtype.
-
     Source:
         CausalWorld 1.2, ``envs/causalworld.py``: its goal world.
-
-    Example:
-        >>> from scm_world.tasks.trifinger.system import trifinger
-        >>> from scm_world.tasks.trifinger.cameras import CAMERAS
-        >>> out = np.empty((3, 3, 128, 128), dtype=np.uint8)
-        >>> camera_pixels(trifinger(blocks=("tool_block",)).default_scene(), CAMERAS, out)
-        >>> out[0, :, 127, 64].tolist()  # the floor
-        [74, 65, 60]
     """
-    if out.dtype != np.uint8:
-        raise ValueError(f"out: expected dtype uint8, got {out.dtype}")
-    for shape in {shape_of_pixels(camera, published=published) for camera in cameras} or {
-        (0, 0, 0)
-    }:
-        if out.shape != (len(cameras), *shape):
-            raise ValueError(f"out: expected shape {(len(cameras), *shape)}, got {out.shape}")
     if goals:
         shapes = background_of(scene, obstacles=not published)
     else:

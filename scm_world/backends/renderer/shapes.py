@@ -160,11 +160,7 @@ def goal_shapes(goals: Sequence[GoalRegion]) -> Shapes:
 
 
 def lamp(light: Light) -> Floats:
-    """Return the unit vector towards the light, and the ambient brightness, shape (4,).
-
-    Raises:
-        ValueError: The light comes from nowhere.
-    """
+    """Return the unit vector towards the light, and the ambient brightness, shape (4,)."""
     length = math.hypot(*light.direction)
     if not (length > 0.0 and math.isfinite(length)):
         raise ValueError(f"light: the direction must have a length, got {light.direction}")

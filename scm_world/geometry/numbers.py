@@ -1,13 +1,33 @@
-"""Numbers brought into their range, in compiled loops."""
+"""Numbers in compiled code: read, brought into their range, gathered."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-from numba import njit
+from numba import njit, types
+from numba.extending import overload
 
 from scm_world._types import Floats, Integers
+
+
+def scalar(value: Any) -> float:
+    """Return a number as a float, also one that comes as an array of shape ().
+
+    Compiled code may call it, where ``float`` refuses arrays.
+    """
+    return float(value)
+
+
+@overload(scalar)
+def _scalar(value: Any) -> Any:
+    def of_array(value: Any) -> Any:
+        return float(value[()])
+
+    def of_number(value: Any) -> Any:
+        return float(value)
+
+    return of_array if isinstance(value, types.Array) else of_number
 
 
 @njit(cache=True)
