@@ -528,6 +528,7 @@ COLOR, LINK = r"tool_block\.color", "robot_finger_{}_link_{}"
 MASSES = tuple((LINK.format(60, k), "mass") for k in (1, 2, 3))
 
 
+WRITES = "both act on the same states; tests/physics/test_writes.py has that a write changes one"
 SHARED = "no edge changes; that streams of noise are independent is a test of the noise"
 
 
@@ -793,6 +794,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "pushing, mujoco",
         ("(floor|stage)_friction",),
         lambda: task("pushing", write=exchanged(("floor", "friction"), ("stage", "friction"))),
+        visible=False,
+        why=WRITES,
     ),
     Sabotage(
         "link masses permuted",
@@ -903,6 +906,8 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "pushing, bullet",
         ("floor_friction", "joint_.*"),
         lambda: task("pushing", "bullet", write=spill),
+        visible=False,
+        why=WRITES,
     ),
     # --- readouts and definitions -----------------
     Sabotage(

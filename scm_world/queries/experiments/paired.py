@@ -178,7 +178,7 @@ class Paired:
         the same has to come out.
         """
         others = [*instants, *self._kept]
-        bases = [instants[0], instants[2]]
+        bases = instants[:3]
         if self._world is None:  # experiments are counted, and every unit is another circumstance
             bases = [bases[setting.probe % 2]]
         done = set[tuple[str, int, int]]()
@@ -202,7 +202,8 @@ class Paired:
                 known = base._replace(values={**base.values, **others[-1].values, **held})
                 effects.see_unstable(child, gap(self._evaluated(child, known), solved[child]))
         effects.changed.update({cause for cause, *_ in done})
-        effects.rollouts += len(done) if self._world is None else 0
+        if self._world is None:  # without the graph, every variable would have to be moved
+            effects.rollouts += 1 + max(len(done), len(self.targets))
 
     def _evaluated(self, name: str, at: Instant) -> Value:
         solve = self._model.solve
