@@ -1,6 +1,11 @@
-"""Modules whose examples need an extra that is not installed are not collected."""
+"""Tests run with one thread each; modules whose extra is not installed are not collected."""
 
+import os
 from importlib.util import find_spec
+
+# Before numpy is imported: threads of its BLAS in several workers mostly wait for one another.
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
 
 NEEDS = {
     "stable_baselines3": ["scm_world/training/agents.py", "scm_world/training/sb3.py"],

@@ -8,7 +8,7 @@ without a backend 40 units.
 
 Criterion: a sabotage is *caught* if the report does not confirm the graph, and one of its
 complaints names what was sabotaged. A complaint is an undeclared effect, something that differs by
-itself, noise in common, or a declared edge that was never seen although the honest system shows it
+itself, or a declared edge that was never seen although the honest system shows it
 with the same seed and budget. It names a sabotage if each of the regular expressions in ``names``
 matches one of its variables. So a catch for another reason does not count. No honest system may be
 refuted with any seed that is used, or it is a false alarm. The mutation score is the share that is
@@ -528,6 +528,9 @@ COLOR, LINK = r"tool_block\.color", "robot_finger_{}_link_{}"
 MASSES = tuple((LINK.format(60, k), "mass") for k in (1, 2, 3))
 
 
+SHARED = "no edge changes; that streams of noise are independent is a test of the noise"
+
+
 def tank(name: str, names: tuple[str, ...], why: str = "", **changes: Any) -> Sabotage:
     """Sabotage the equations of the tanks."""
     return Sabotage(
@@ -1032,9 +1035,17 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "tanks, step",
         (r"rain|drops|.*\[.*",),
         lambda: with_commands(tanks(), one_stream),
+        visible=False,
+        why=SHARED,
     ),
     Sabotage(
-        "two variables are drawn from one stream", "time", "equations", ("a", "b"), shared_equations
+        "two variables are drawn from one stream",
+        "time",
+        "equations",
+        ("a", "b"),
+        shared_equations,
+        visible=False,
+        why=SHARED,
     ),
     Sabotage(
         "noise does not come back",
@@ -1128,8 +1139,7 @@ def complaints(report: Verification, honest: Verification | None = None) -> Iter
     if honest is not None:
         seen = {edge.key for edge in honest.fired}
         yield from ({cause, effect} for cause, effect, _ in seen.intersection(report.never_fired))
-    yield from ({one.variable, one.after} for one in report.unstable)
-    yield from ({*pair} for pair in report.shared_noise)
+    yield from ({name} for name in report.unstable)
 
 
 def caught(
@@ -1148,8 +1158,6 @@ def verified(
 ) -> Verification:
     """Verify a system with the budget of the study."""
     system = make()
-    if isinstance(system, SCM):
-        probes, held_out = probes + held_out, 0
     return verify(system, seed=seed, probes=probes, held_out=held_out)
 
 

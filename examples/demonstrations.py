@@ -1,7 +1,7 @@
 """Demonstrations that behavior cloning learns pushing from, in twenty lines of torch.
 
-Run it with ``python examples/demonstrations.py [EPISODES] [UPDATES] [SEED] [MINARI-ID]``; it needs
-torch and pyarrow, and minari for the last argument.
+Run it with ``python examples/demonstrations.py [EPISODES] [UPDATES] [SEED] [TRIALS]
+[MINARI-ID]``; it needs torch and pyarrow, and minari for the last argument.
 """
 
 import sys
@@ -15,7 +15,7 @@ from scm_world.evaluation import evaluate
 from scm_world.evaluation.recording import Recording, record
 
 ENV = {"action_mode": "delta_joint_positions", "delta_scale": 0.1, "delta_origin": "measured"}
-SCORE, TRIALS = "fractional_success", 25
+SCORE = "fractional_success"
 
 
 def demonstrations(episodes: int, seed: int) -> Recording:
@@ -50,8 +50,15 @@ def cloned(shown: Recording, updates: int, seed: int) -> nn.Module:
     return network
 
 
-def main(episodes: str = "240", updates: str = "16000", seed: str = "0", dataset: str = "") -> None:
+def main(
+    episodes: str = "240",
+    updates: str = "16000",
+    seed: str = "0",
+    trials: str = "25",
+    dataset: str = "",
+) -> None:
     """Record, learn, and evaluate on 25 episodes, without noise and with it."""
+    n = int(trials)
     shown = demonstrations(int(episodes), int(seed))
     print(f"{len(shown)} of {episodes} demonstrations solved the task")
     network = cloned(shown, int(updates), int(seed))
@@ -60,15 +67,15 @@ def main(episodes: str = "240", updates: str = "16000", seed: str = "0", dataset
         with torch.no_grad():
             return np.asarray(network(torch.from_numpy(observation)))
 
-    found = evaluate(policy, "P0", task="pushing", n=TRIALS, seeds=1_000, env=ENV)
+    found = evaluate(policy, "P0", task="pushing", n=n, seeds=1_000, env=ENV)
     print(f"success in P0, where all episodes begin alike: {found.score('P0', 'success')}")
     env = gymnasium.make("scm_world/Pushing-v0", **ENV)
     for name, one in (("clone", policy), ("teacher", "feedback")):
-        pushed = record(one, env, TRIALS, noise=0.02, seed=1_000)
+        pushed = record(one, env, n, noise=0.02, seed=1_000)
         solved = [episode.infos[SCORE][-1] > 0.9 for episode in pushed]
-        print(f"with noise in the actions of the {name}: {sum(solved)} of {TRIALS}")
+        print(f"with noise in the actions of the {name}: {sum(solved)} of {n}")
     if dataset:  # whose scores are 0 for a robot that keeps still, and 1 for the teacher
-        both = evaluate("still,feedback", "P0", task="pushing", n=TRIALS, seeds=1_000, env=ENV)
+        both = evaluate("still,feedback", "P0", task="pushing", n=n, seeds=1_000, env=ENV)
         low, high = (both.score("P0", "return", agent=name).value for name in both.agents)
         about = {"author": "scm_world", "author_email": "-", "code_permalink": "examples"}
         scores = {"ref_min_score": float(low), "ref_max_score": float(high)}

@@ -1,6 +1,6 @@
 """Learners on interventional data, scored against the true graph: a model, then physics.
 
-Run it with ``python examples/learners.py [mujoco|bullet|fake]``.
+Run it with ``python examples/learners.py [mujoco|bullet|fake [EPISODES]]``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def on_a_model(name: str = "er2:20", rows: int = 2000) -> None:
         shown(learner, learn(learner, given.simulator(0), budget=200), given)
 
 
-def on_a_task(backend: str, episodes: int = 400) -> None:
+def on_a_task(backend: str, episodes: int) -> None:
     """Learn what episodes of pushing end with from episodes, then by paired experiments."""
     view = TaskView(causes=CAUSES, options={"backend": backend})
     given = problem("pushing", view=view)
@@ -46,11 +46,11 @@ def on_a_task(backend: str, episodes: int = 400) -> None:
     given.close()
 
 
-def main(backend: str = "mujoco") -> None:
+def main(backend: str = "mujoco", episodes: str = "400") -> None:
     """Compare learners with and without pairing."""
     on_a_model()
-    on_a_task(backend)
+    on_a_task(backend, int(episodes))
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2])
+    main(*sys.argv[1:])

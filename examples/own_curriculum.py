@@ -1,7 +1,7 @@
 """A curriculum of one's own, from easy to hard: written to a file, tried out, and trained under.
 
-The training needs the extra ``train``; the rest does not. Run it with
-``python examples/own_curriculum.py [STEPS [FOLDER]]``; a million steps are a whole training.
+The training needs the extra ``train``. Run it with ``python examples/own_curriculum.py [STEPS
+[FOLDER [TRIALS]]]``; a million steps are a whole training.
 """
 
 import importlib.util
@@ -27,7 +27,7 @@ CURRICULUM = Curriculum(
 )
 
 
-def main(steps: str = "20480", out: str = "") -> None:
+def main(steps: str = "20480", out: str = "", trials: str = "20") -> None:
     """Save it, watch it go from stage to stage, and train under it."""
     folder = Path(out or tempfile.mkdtemp())
     folder.mkdir(parents=True, exist_ok=True)
@@ -50,7 +50,8 @@ def main(steps: str = "20480", out: str = "") -> None:
     from scm_world.training.loop import train
     from scm_world.training.recipe import recipe
 
-    made = recipe("pushing", curriculum=str(file), steps=int(steps))
+    few = {"episodes": int(trials)}
+    made = recipe("pushing", curriculum=str(file), steps=int(steps), trials=few)
     trained = train(made, out=folder / "run", tell=print)
     print(f"trained for {trained.steps} steps: {trained.best}, score {trained.score}")
 

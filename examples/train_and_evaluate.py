@@ -27,7 +27,8 @@ SEEN = [  # in protocols with obstacles the published vector is longer; a networ
 def main(steps: str = "100000", out: str = "", episodes: str = "20") -> None:
     """Train on goals from space A, and compare with doing nothing, protocol by protocol."""
     seen = {"observation_mode": "custom", "observe": SEEN}
-    made = recipe("reaching", steps=int(steps), curriculum=1, env=seen)
+    few = {"episodes": int(episodes)}  # of each trial meanwhile
+    made = recipe("reaching", steps=int(steps), curriculum=1, env=seen, trials=few)
     folder = Path(out or tempfile.mkdtemp())
     trained = train(made, out=folder / "run", seed=0, tell=print)
     print(f"{trained.steps} steps; the best policy: {trained.best}, score {trained.score}")

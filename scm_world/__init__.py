@@ -15,17 +15,12 @@ if TYPE_CHECKING:
     from scm_world.discovery import discover
     from scm_world.env import MovingAverageAction, ScmWorldEnv
     from scm_world.errors import ScmWorldError
-    from scm_world.geometry import load_hull
+    from scm_world.geometry.hulls import load_hull
     from scm_world.queries import (
         SCM,
-        At,
-        Clamp,
-        Contact,
         Laboratory,
-        On,
         Outcome,
         Plan,
-        Reaches,
         World,
         do,
     )
@@ -34,82 +29,47 @@ if TYPE_CHECKING:
     from scm_world.variables import (
         Action,
         Box,
+        Contact,
         Derived,
         Draw,
         Exogenous,
         Fixed,
+        Hard,
         Linear,
         Measured,
         Mechanism,
         Natural,
         Null,
         Parent,
+        Reaches,
         Scale,
         Shift,
     )
 
 __version__ = "0.2.0"
 
-_HOMES = {
-    "MovingAverageAction": "env",
-    "ScmWorldEnv": "env",
-    "ScmWorldError": "errors",
-    "ModelTask": "tasks",
-    "StepTask": "tasks",
-    "Task": "tasks",
-    "TriFingerTask": "tasks",
-    "discover": "discovery",
-    "load_hull": "geometry",
-    "make_task": "tasks",
-    **dict.fromkeys(
-        (
-            "Action",
-            "Box",
-            "Derived",
-            "Draw",
-            "Exogenous",
-            "Fixed",
-            "Linear",
-            "Measured",
-            "Mechanism",
-            "Natural",
-            "Null",
-            "Parent",
-            "Scale",
-            "Shift",
-        ),
-        "variables",
-    ),
-    **dict.fromkeys(
-        (
-            "SCM",
-            "At",
-            "Clamp",
-            "Contact",
-            "Laboratory",
-            "On",
-            "Outcome",
-            "Plan",
-            "Reaches",
-            "World",
-            "do",
-            "verify",
-        ),
-        "queries",
-    ),
+_NAMES = {
+    "discovery": "discover",
+    "env": "MovingAverageAction ScmWorldEnv",
+    "errors": "ScmWorldError",
+    "geometry.hulls": "load_hull",
+    "queries": "SCM Laboratory Outcome Plan World do verify",
+    "tasks": "ModelTask StepTask Task TriFingerTask make_task",
+    "variables": "Action Box Contact Derived Draw Exogenous Fixed Hard Linear Measured Mechanism "
+    "Natural Null Parent Reaches Scale Shift",
 }
+_HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = [
     "SCM",
     "Action",
-    "At",
     "Box",
-    "Clamp",
     "Contact",
     "Derived",
     "Draw",
     "Exogenous",
     "Fixed",
+    "Hard",
     "Laboratory",
     "Linear",
     "Measured",
@@ -118,7 +78,6 @@ __all__ = [
     "MovingAverageAction",
     "Natural",
     "Null",
-    "On",
     "Outcome",
     "Parent",
     "Plan",
@@ -165,7 +124,7 @@ for _task in (
         gymnasium.register(
             id=_id,
             entry_point="scm_world.env:ScmWorldEnv",
-            vector_entry_point="scm_world.env.batched:ScmWorldVectorEnv",
+            vector_entry_point="scm_world.env:vector_env",
             kwargs={"task": _task},
             order_enforce=False,  # it refuses steps before a reset itself
             disable_env_checker=True,  # tests check it; wrappers would hide compute_reward

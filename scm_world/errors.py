@@ -1,110 +1,24 @@
 """What can go wrong, and what to do about it.
 
-Every error of the package carries its data as attributes and says what was given, what is
-allowed and what to do::
-
-    ScmWorldError
-    ├── ModelError               a causal model that cannot be built (all its problems at once)
-    │   └── FunctionFailure      a function of a user that raised an error
-    ├── InterventionError        a do() that was refused; the world is as it was
-    │   ├── UnknownVariable      no such name; the nearest one is suggested
-    │   ├── NotIntervenable      the variable is measured, not set
-    │   ├── WrongType            not a number, or not of the declared dtype
-    │   ├── WrongShape
-    │   ├── NotFinite            NaN or infinity
-    │   ├── OutOfBounds          physically impossible
-    │   ├── OutOfSpace           possible, but outside the space that was asked for
-    │   ├── ConflictingTargets   two names of one quantity in the same do()
-    │   ├── ClosesCycle          a mechanism that makes variables cause one another at lag 0
-    │   ├── Infeasible           two bodies in one place, or a body outside the arena
-    │   └── SeveralProblems      more than one of the above
-    ├── ImpossibleObservation    values that a causal model cannot give (a ModelError)
-    ├── CyclicModel              a causal model with contemporaneous cycles (a ModelError)
-    ├── ActionError              an action the robot cannot take
-    ├── NotReset                 a world that was never reset
-    ├── UnknownOption            a task, backend, preset or mode that does not exist
-    ├── EngineError              the physics engine
-    │   ├── MissingEngine        it is not installed
-    │   ├── MixedInstallation    two versions of it in one folder
-    │   └── EngineFailure        it produced a state that is not finite
-    ├── SnapshotMismatch         a snapshot of another scene
-    ├── UnreadableFile           a file that is not what it should be
-    ├── UnwritableFolder         a folder without room or permission
-    ├── Forbidden                a question that a laboratory does not allow
-    ├── BudgetExhausted          an experiment that costs more than is left
-    ├── EvaluationError          an episode that could not be played, with its place
-    ├── Diverged                 a training whose weights are no finite numbers any more
-    └── MissingExtra             an optional package that is not installed
+Every error of the package is a ``ScmWorldError``, carries its data as attributes, and says what was
+given, what is allowed and what to do.
 """
 
 from __future__ import annotations
 
 import difflib
-import zipfile
-import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Self
-
-__all__ = [
-    "ActionError",
-    "BudgetExhausted",
-    "ClosesCycle",
-    "ConflictingTargets",
-    "CyclicModel",
-    "Diverged",
-    "EngineError",
-    "EngineFailure",
-    "EvaluationError",
-    "Forbidden",
-    "FunctionFailure",
-    "ImpossibleObservation",
-    "Infeasible",
-    "InterventionError",
-    "MissingEngine",
-    "MissingExtra",
-    "MixedInstallation",
-    "ModelError",
-    "NotFinite",
-    "NotIntervenable",
-    "NotReset",
-    "OutOfBounds",
-    "OutOfSpace",
-    "ScmWorldError",
-    "SeveralProblems",
-    "SnapshotMismatch",
-    "UnknownOption",
-    "UnknownVariable",
-    "UnreadableFile",
-    "UnwritableFolder",
-    "WrongShape",
-    "WrongType",
-    "blamed",
-    "in_one_line",
-    "nearest",
-    "raise_all",
-]
+from typing import TYPE_CHECKING, Any, Self
 
 SHOWN = 8
 """Near names that a message lists."""
 
-DAMAGED: tuple[type[Exception], ...] = (
-    OSError,
-    ValueError,
-    LookupError,
-    TypeError,
-    AttributeError,
-    ArithmeticError,
-    RuntimeError,
-    MemoryError,
-    EOFError,
-    zlib.error,
-    zipfile.BadZipFile,
-)
-"""What the standard library and NumPy raise where a file is not what it should be."""
+DAMAGED = Exception
+"""What the standard library and NumPy raise where a file is damaged: anything."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
-    """Find the known name that looks most like ``name``.
+    """Return the known name that looks most like ``name``.
 
     Example:
         >>> nearest("tool_blok.mass", ["tool_block.mass", "floor_friction"])
@@ -115,27 +29,12 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
 
 
 def suggested(suggestion: str | None) -> str:
-    """Say it as a question; nothing if there is none."""
+    """Return a suggestion as a question; nothing if there is none."""
     return f"; did you mean {suggestion!r}?" if suggestion else ""
 
 
-def _rebuild(kind: type[ScmWorldError], message: str, data: dict[str, Any]) -> ScmWorldError:
-    """Make an error from its message and attributes, without its constructor."""
-    error = kind.__new__(kind, message)
-    error.args = (message,)  # an OSError takes no message before its constructor
-    error.__dict__.update(data)
-    return error
-
-
-class ScmWorldError(Exception):
-    """Anything this package raises on purpose. It can be pickled, attributes included."""
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuild, (type(self), str(self), self.__dict__)
-
-
 def in_one_line(error: Exception) -> str:
-    """Write an error in one line; with its name, unless it is one of ours.
+    """Return an error in one line; with its name, unless it is one of ours.
 
     Example:
         >>> in_one_line(KeyError("mass")), in_one_line(ScmWorldError("too heavy"))
@@ -146,20 +45,43 @@ def in_one_line(error: Exception) -> str:
     return text if text and isinstance(error, ScmWorldError) else f"{name}: {text}".rstrip(": ")
 
 
+def _rebuild(kind: type[ScmWorldError], message: str, data: dict[str, Any]) -> ScmWorldError:
+    error = kind.__new__(kind, message)
+    error.args = (message,)  # an OSError takes no message before its constructor
+    error.__dict__.update(data)
+    return error
+
+
+class ScmWorldError(Exception):
+    """Anything this package raises on purpose. It can be pickled, attributes included.
+
+    Args:
+        message: What was given, what is allowed and what to do.
+        data: Its attributes.
+    """
+
+    def __init__(self, message: str = "", **data: Any) -> None:
+        self.__dict__.update(data)
+        super().__init__(message)
+
+    if TYPE_CHECKING:  # each class says what it carries
+
+        def __getattr__(self, name: str) -> Any: ...
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuild, (type(self), str(self), self.__dict__)
+
+
 # --- models and interventions -----------------------------------------------------------------
 
 
 class ModelError(ScmWorldError, ValueError):
-    """A causal model, a table or a graph that cannot be built or used.
+    """A causal model, a table or a graph that cannot be used; ``problems`` has all its faults."""
 
-    Attributes:
-        problems: One sentence for each fault.
-    """
-
-    def __init__(self, problems: Sequence[str]) -> None:
-        self.problems = tuple(problems)
-        several = [f"{len(self.problems)} problems:", *(f"  - {one}" for one in self.problems)]
-        super().__init__("\n".join(self.problems if len(self.problems) == 1 else several))
+    def __init__(self, problems: Sequence[str], **data: Any) -> None:
+        several = [f"{len(problems)} problems:", *(f"  - {one}" for one in problems)]
+        message = "\n".join(problems if len(problems) == 1 else several)
+        super().__init__(message, problems=tuple(problems), **data)
 
 
 class FunctionFailure(ModelError):
@@ -172,8 +94,7 @@ class FunctionFailure(ModelError):
     row: int | None = None
 
     def __init__(self, problem: str) -> None:
-        self.problems = (problem,)
-        Exception.__init__(self, problem)  # it is one sentence, and not about a declaration
+        super().__init__([problem])
 
     @classmethod
     def of(cls, name: str, error: Exception) -> Self:
@@ -202,207 +123,122 @@ class blamed:  # noqa: N801 # used like the functions of ``contextlib``
     def __init__(self, name: str | Callable[[], str]) -> None:
         self.name = name
 
-    def __enter__(self) -> None:
-        """Do nothing."""
+    def __enter__(self) -> None: ...
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        """Name it in an error."""
         if isinstance(error, Exception) and not isinstance(error, ScmWorldError):
             name = self.name() if callable(self.name) else self.name
             raise FunctionFailure.of(name, error) from error
 
 
 class ImpossibleObservation(ModelError):
-    """An observation that the model cannot give.
-
-    Attributes:
-        variable: The variable that was observed.
-    """
+    """An observation of a ``variable`` that the model cannot give."""
 
     def __init__(self, variable: str, reason: str) -> None:
-        self.variable = variable
-        super().__init__([f"{variable!r}: {reason}"])
+        super().__init__([f"{variable!r}: {reason}"], variable=variable)
 
 
 class CyclicModel(ModelError):
-    """A causal model whose contemporaneous edges form cycles.
-
-    Attributes:
-        cycles: The variables of one cycle for each knot.
-    """
+    """A causal model whose contemporaneous edges form ``cycles``, one for each knot."""
 
     def __init__(self, cycles: Iterable[Sequence[str]]) -> None:
-        self.cycles = tuple(tuple(cycle) for cycle in cycles)
-        paths = (" → ".join([*cycle, cycle[0]]) for cycle in self.cycles)
-        super().__init__([f"contemporaneous edges form a cycle: {path}" for path in paths])
+        found = tuple(tuple(cycle) for cycle in cycles)
+        paths = (" → ".join([*cycle, cycle[0]]) for cycle in found)
+        said = [f"contemporaneous edges form a cycle: {path}" for path in paths]
+        super().__init__(said, cycles=found)
 
 
 class InterventionError(ScmWorldError, ValueError):
-    """An intervention that was refused. Nothing has changed.
+    """An intervention of a ``value`` on a ``variable`` that was refused. Nothing has changed."""
 
-    Attributes:
-        variable: The name of the variable.
-        value: What was asked for.
-    """
-
-    def __init__(self, message: str, *, variable: str, value: Any = None) -> None:
-        self.variable = variable
-        self.value = value
-        super().__init__(message)
+    def __init__(self, message: str, *, variable: str, value: Any = None, **data: Any) -> None:
+        super().__init__(message, variable=variable, value=value, **data)
 
 
 class UnknownVariable(InterventionError):
     """No variable has this name, or fits this pattern.
 
-    Attributes:
-        near: Names of which this is the first or the last part, the shortest first.
-        suggestion: The nearest name there is, or None.
+    ``near`` are names of which it is the first or the last part, the shortest first; ``suggestion``
+    is the nearest name there is, or None.
     """
 
     def __init__(self, name: str, known: Iterable[str]) -> None:
         known = list(known)
         parts = (n for n in known if n.startswith(f"{name}.") or n.endswith(f".{name}"))
-        self.near = tuple(sorted(parts, key=len))
-        self.suggestion = self.near[0] if self.near else nearest(name, known)
-        hint = suggested(self.suggestion)
-        if self.near:
-            more = f" and {len(self.near) - SHOWN} more" if len(self.near) > SHOWN else ""
-            hint = f"; near it are: {', '.join(self.near[:SHOWN])}{more}"
-        said = f"is named {name!r}"
+        near = tuple(sorted(parts, key=len))
+        suggestion = near[0] if near else nearest(name, known)
+        hint, said = suggested(suggestion), f"is named {name!r}"
+        if near:
+            hint = f"; near it are: {', '.join(near[:SHOWN])}"
+            hint += f" and {len(near) - SHOWN} more" * (len(near) > SHOWN)
         if {*"*?"} & {*str(name)}:
             ends = (f"*.{one.rpartition('.')[2]}" for one in known if "." in one)
             patterns = [*dict.fromkeys(ends)] or known
-            self.suggestion = next(iter(difflib.get_close_matches(name, patterns, 1, 0.75)), None)
-            more = ", …" if len(patterns) > SHOWN else ""
-            shown = f"; there are: {', '.join(patterns[:SHOWN])}{more}"
-            hint, said = suggested(self.suggestion) or shown, f"fits the pattern {name!r}"
-        super().__init__(f"no variable {said}{hint}", variable=name)
+            suggestion = next(iter(difflib.get_close_matches(name, patterns, 1, 0.75)), None)
+            shown = f"; there are: {', '.join(patterns[:SHOWN])}" + ", …" * (len(patterns) > SHOWN)
+            hint, said = suggested(suggestion) or shown, f"fits the pattern {name!r}"
+        message = f"no variable {said}{hint}"
+        super().__init__(message, variable=name, near=near, suggestion=suggestion)
 
 
 class NotIntervenable(InterventionError):
-    """The variable cannot be set.
-
-    Attributes:
-        causes: Variables that can be set instead.
-    """
+    """The variable cannot be set; ``causes`` of it can."""
 
     def __init__(self, name: str, reason: str, causes: Iterable[str] = ()) -> None:
-        self.causes = tuple(causes)
-        instead = (
-            f"; intervene on a cause of it instead: {', '.join(self.causes)}" if self.causes else ""
-        )
-        super().__init__(f"{name!r} {reason}{instead}", variable=name)
+        causes = tuple(causes)
+        instead = f"; intervene on a cause of it instead: {', '.join(causes)}" if causes else ""
+        super().__init__(f"{name!r} {reason}{instead}", variable=name, causes=causes)
 
 
-class WrongType(InterventionError):
-    """The value is not a number of the declared dtype."""
+class WrongValue(InterventionError):
+    """The value is not of the ``expected`` dtype or shape, or not finite."""
 
-    def __init__(self, name: str, value: Any, expected: str) -> None:
-        self.expected = expected
-        super().__init__(
-            f"do({name}): expected {expected}, got {value!r} of type {type(value).__name__}",
-            variable=name,
-            value=value,
-        )
+    def __init__(self, name: str, value: Any, expected: Any = None, actual: Any = None) -> None:
+        said = f"expected {expected}, got {value!r} of type {type(value).__name__}"
+        if actual is not None:
+            said = f"expected shape {expected}, got {actual}"
+        elif expected is None:
+            said = f"every number must be finite, got {value!r}"
+        data = {"expected": expected, "actual": actual}
+        super().__init__(f"do({name}): {said}", variable=name, value=value, **data)
 
 
-class WrongShape(InterventionError):
-    """The value has another shape than the variable.
+class OutOfBounds(InterventionError):
+    """The value is physically impossible, or not in the space that was asked for.
 
     Attributes:
-        expected: The shape of the variable.
-        actual: The shape of the value.
+        allowed: The allowed values, in words.
+        nearest: The nearest of them.
+        space: ``"A"``, ``"B"`` or ``"A|B"``; empty if the value is impossible.
     """
 
     def __init__(
-        self, name: str, value: Any, expected: tuple[int, ...], actual: tuple[int, ...]
+        self, name: str, value: Any, *, allowed: str, nearest: Any, unit: str, space: str = ""
     ) -> None:
-        self.expected = expected
-        self.actual = actual
-        super().__init__(
-            f"do({name}): expected shape {expected}, got {actual}", variable=name, value=value
-        )
-
-
-class NotFinite(InterventionError):
-    """The value has a NaN or an infinity."""
-
-    def __init__(self, name: str, value: Any) -> None:
-        super().__init__(
-            f"do({name}): every number must be finite, got {value!r}", variable=name, value=value
-        )
-
-
-class _Outside(InterventionError):
-    """A value outside what is allowed.
-
-    Attributes:
-        allowed: What is allowed, in words.
-        nearest: The nearest value that is allowed.
-    """
-
-    def __init__(self, name: str, value: Any, *, allowed: str, nearest: Any, unit: str) -> None:
-        self.allowed = allowed
-        self.nearest = nearest
+        allowed = f"space {space} = {allowed}" if space else allowed
         unit = "" if unit in ("", "1") else f" [{unit}]"
-        super().__init__(
-            f"do({name}): {value!r} is outside {allowed}{unit}; the nearest allowed value is "
-            f"{nearest!r}",
-            variable=name,
-            value=value,
-        )
-
-
-class OutOfBounds(_Outside):
-    """The value is physically impossible."""
-
-
-class OutOfSpace(_Outside):
-    """The value is possible, but not in the space that was asked for.
-
-    Attributes:
-        space: ``"A"``, ``"B"`` or ``"A|B"``.
-    """
-
-    def __init__(
-        self, name: str, value: Any, *, space: str, allowed: str, nearest: Any, unit: str
-    ) -> None:
-        self.space = space
-        super().__init__(
-            name, value, allowed=f"space {space} = {allowed}", nearest=nearest, unit=unit
-        )
+        message = f"do({name}): {value!r} is outside {allowed}{unit}"
+        message += f"; the nearest allowed value is {nearest!r}"
+        data = {"allowed": allowed, "nearest": nearest, "space": space}
+        super().__init__(message, variable=name, value=value, **data)
 
 
 class ConflictingTargets(InterventionError):
-    """Two targets of one do() are coordinates of one and the same quantity.
-
-    Attributes:
-        names: The targets that exclude each other.
-    """
+    """Targets of one do(), their ``names``, are coordinates of one and the same quantity."""
 
     def __init__(self, names: Sequence[str], quantity: str) -> None:
-        self.names = tuple(names)
-        super().__init__(
-            f"{' and '.join(map(repr, self.names))} both set {quantity!r}; give one of them",
-            variable=self.names[0],
-        )
+        message = f"{' and '.join(map(repr, names))} both set {quantity!r}; give one of them"
+        super().__init__(message, variable=names[0], names=tuple(names))
 
 
 class ClosesCycle(InterventionError, ModelError):
-    """A mechanism, or a draw from a space that follows others, closes a cycle.
-
-    Attributes:
-        cycle: The variables that would drive one another within an instant.
-        problems: It as one sentence.
-    """
+    """A mechanism, or a draw from a space that follows others, closes a ``cycle``."""
 
     def __init__(self, name: str, value: Any, cycle: Sequence[str]) -> None:
-        self.cycle = tuple(cycle)
-        path = " → ".join([*self.cycle, self.cycle[0]])
-        self.variable, self.value = name, value
-        message = f"do({name}): contemporaneous edges would form a cycle: {path}"
-        self.problems = (message,)
-        Exception.__init__(self, message)  # that of a model counts its problems
+        said = f"do({name}): contemporaneous edges would form a cycle: "
+        said += " → ".join([*cycle, cycle[0]])
+        data = {"cycle": tuple(cycle), "problems": (said,)}
+        ScmWorldError.__init__(self, said, variable=name, value=value, **data)
 
 
 class Infeasible(InterventionError):
@@ -414,85 +250,44 @@ class Infeasible(InterventionError):
     """
 
     def __init__(self, name: str, value: Any, problems: Sequence[str], nearest: Any = None) -> None:
-        self.problems = tuple(problems)
-        self.nearest = nearest
         hint = f"; the nearest feasible value is {nearest!r}" if nearest is not None else ""
-        super().__init__(
-            f"do({name}): {value!r} is not feasible: {'; '.join(self.problems)}{hint}",
-            variable=name,
-            value=value,
-        )
+        message = f"do({name}): {value!r} is not feasible: {'; '.join(problems)}{hint}"
+        data = {"problems": tuple(problems), "nearest": nearest}
+        super().__init__(message, variable=name, value=value, **data)
 
 
 class SeveralProblems(InterventionError):
-    """More than one problem in one do().
-
-    Attributes:
-        problems: The errors, in the order of the request.
-    """
+    """More than one of the ``problems`` in one do(), in the order of the request."""
 
     def __init__(self, problems: Sequence[InterventionError]) -> None:
-        self.problems = tuple(problems)
-        lines = "\n".join(f"  - {problem}" for problem in self.problems)
-        super().__init__(
-            f"{len(self.problems)} problems, nothing was changed:\n{lines}",
-            variable=self.problems[0].variable,
-        )
+        lines = "\n".join(f"  - {problem}" for problem in problems)
+        message = f"{len(problems)} problems, nothing was changed:\n{lines}"
+        super().__init__(message, variable=problems[0].variable, problems=tuple(problems))
 
 
 def raise_all(problems: Sequence[InterventionError]) -> None:
     """Raise the one problem, or all of them together; nothing if there is none."""
-    if len(problems) == 1:
-        raise problems[0]
     if problems:
-        raise SeveralProblems(problems)
+        raise problems[0] if len(problems) == 1 else SeveralProblems(problems)
 
 
-# --- engines ----------------------------------------------------------------------------------
+# --- engines, options, files and extras ---------------------------------------------------------
 
 
 class EngineError(ScmWorldError, RuntimeError):
-    """The physics engine cannot do its work.
-
-    Attributes:
-        engine: The name of the backend.
-    """
+    """The physics ``engine`` cannot do its work."""
 
     def __init__(self, message: str, engine: str) -> None:
-        self.engine = engine
-        super().__init__(message)
+        super().__init__(message, engine=engine)
 
 
 class MissingEngine(EngineError, ImportError):
-    """The engine is not installed.
-
-    Attributes:
-        install: The command that installs it.
-    """
+    """The engine is not installed, or not rightly; ``install`` is the command that does it."""
 
     def __init__(self, engine: str, install: str, reason: str = "") -> None:
-        self.install = install
         because = f" ({reason})" if reason else ""
-        EngineError.__init__(
-            self, f"the {engine} engine is not installed{because}; try: {install}", engine
-        )
-
-
-class MixedInstallation(EngineError):
-    """Two versions of an engine lie in one folder.
-
-    Attributes:
-        versions: What was found, by distribution.
-        repair: The command that repairs it.
-    """
-
-    def __init__(self, engine: str, versions: dict[str, str], repair: str) -> None:
-        self.versions = dict(versions)
-        self.repair = repair
-        found = ", ".join(f"{name} {version}" for name, version in versions.items())
-        super().__init__(
-            f"the {engine} installation mixes versions ({found}); repair it with: {repair}", engine
-        )
+        super().__init__(f"the {engine} engine is not installed{because}; try: {install}", engine)
+        self.install = install
 
 
 class EngineFailure(EngineError):
@@ -509,29 +304,20 @@ class SnapshotMismatch(ScmWorldError, ValueError):
     """A snapshot of another scene cannot be restored here."""
 
 
-# --- wrong options, actions, files, budgets and extras ------------------------------------------
-
-
 class ActionError(ScmWorldError, ValueError):
-    """An action that the robot cannot take.
-
-    Attributes:
-        action: What was given.
-    """
+    """An ``action`` that the robot cannot take."""
 
     def __init__(self, message: str, action: Any) -> None:
-        self.action = action
-        super().__init__(message)
+        super().__init__(message, action=action)
 
 
 class NotReset(ScmWorldError, RuntimeError):
     """The world was never reset, or was ``closed``: nothing to step, ask or intervene on."""
 
     def __init__(self, *, closed: bool = False) -> None:
-        self.closed = closed
         why = "was closed, which ended its episode; call reset() to begin another one"
         why = why if closed else "has no episode yet; call reset() first"
-        super().__init__(f"the world {why}")
+        super().__init__(f"the world {why}", closed=closed)
 
 
 class UnknownOption(ScmWorldError, ValueError):
@@ -544,53 +330,39 @@ class UnknownOption(ScmWorldError, ValueError):
     """
 
     def __init__(self, option: str, value: Any, choices: Iterable[str]) -> None:
-        self.option = option
-        self.value = value
-        self.choices = tuple(choices)
-        what = f"{option} cannot be {value!r}; it can be"
-        if isinstance(value, str) and not any(" " in choice for choice in self.choices):
-            near = suggested(nearest(value, self.choices))
+        choices, what = tuple(choices), f"{option} cannot be {value!r}; it can be"
+        if isinstance(value, str) and not any(" " in choice for choice in choices):
+            near = suggested(nearest(value, choices))
             what = f"no {option} is named {value!r}{near}; there are"
-        super().__init__(f"{what}: {', '.join(self.choices)}")
+        message = f"{what}: {', '.join(choices)}"
+        super().__init__(message, option=option, value=value, choices=choices)
 
 
 class UnreadableFile(ScmWorldError, ValueError):
     """A file (``path``) that is not what it should be (``reason``)."""
 
     def __init__(self, path: str, reason: str, advice: str) -> None:
-        self.path, self.reason = path, reason
-        super().__init__(f"{path!r} cannot be read: {reason}; {advice}")
+        message = f"{path!r} cannot be read: {reason}; {advice}"
+        super().__init__(message, path=path, reason=reason)
 
 
 class UnwritableFolder(ScmWorldError, OSError):
     """A folder (``path``) that cannot be written to, or not any more (``reason``)."""
 
     def __init__(self, path: str, reason: str) -> None:
-        self.path, self.reason = path, reason
-        super().__init__(
-            f"{path!r} cannot be written to: {reason}; what is in it already is complete, and the "
-            "same call goes on there once there is room, or the permission"
-        )
+        message = f"{path!r} cannot be written to: {reason}; what is in it already is complete, and"
+        message += " the same call goes on there once there is room, or the permission"
+        super().__init__(message, path=path, reason=reason)
 
 
 class Forbidden(ScmWorldError, RuntimeError):
-    """A question that a laboratory does not allow; ``allowed`` says what it does."""
+    """Something that a laboratory does not let you do; ``allowed`` says what it does."""
 
     def __init__(self, what: str, allowed: Iterable[str]) -> None:
-        self.what, self.allowed = what, tuple(allowed)
-        shown = ", ".join(self.allowed[:20]) + (", …" if len(self.allowed) > 20 else "")
-        super().__init__(f"this laboratory does not let you {what}; allowed: {shown or 'nothing'}")
-
-
-class BudgetExhausted(ScmWorldError, RuntimeError):
-    """An experiment that costs more episodes (``asked``) than there are left (``left``)."""
-
-    def __init__(self, asked: int, left: int) -> None:
-        self.asked, self.left = asked, left
-        super().__init__(
-            f"the experiment takes {asked} episodes, but {left} are left of the budget; ask for "
-            "fewer, or open a laboratory with a larger budget on the same log"
-        )
+        allowed = tuple(allowed)
+        shown = ", ".join(allowed[:20]) + (", …" if len(allowed) > 20 else "")
+        message = f"this laboratory does not let you {what}; allowed: {shown or 'nothing'}"
+        super().__init__(message, what=what, allowed=allowed)
 
 
 class EvaluationError(ScmWorldError, RuntimeError):
@@ -602,35 +374,26 @@ class EvaluationError(ScmWorldError, RuntimeError):
     """
 
     def __init__(self, place: Mapping[str, Any], reason: str) -> None:
-        self.place = dict(place)
-        self.reason = reason
-        where = ", ".join(f"{name} {value}" for name, value in self.place.items())
-        super().__init__(f"{where}: {reason}")
+        where = ", ".join(f"{name} {value}" for name, value in place.items())
+        super().__init__(f"{where}: {reason}", place=dict(place), reason=reason)
 
 
 class Diverged(ScmWorldError, ArithmeticError):
     """A training whose weights are no finite numbers any more, after so many ``steps``."""
 
     def __init__(self, steps: int) -> None:
-        self.steps = steps
         super().__init__(
             f"the weights are no finite numbers any more after {steps:,} steps; the last "
             "checkpoint is from before; begin in another folder with a lower learning rate "
-            "(rate.initial) or smaller rewards"
+            "(rate.initial) or smaller rewards",
+            steps=steps,
         )
 
 
 class MissingExtra(ScmWorldError, ImportError):
-    """An optional package that is not installed.
-
-    Attributes:
-        package: Its name.
-        extra: The extra of this package that brings it; None if none does.
-    """
+    """An optional ``package`` that is not installed; ``extra`` brings it, if one does."""
 
     def __init__(self, package: str, extra: str | None = None) -> None:
-        self.package, self.extra = package, extra
         install = package if extra is None else f"'scm-world[{extra}]'"
-        super().__init__(
-            f"this needs the package {package!r}; install it with: pip install {install}"
-        )
+        message = f"this needs the package {package!r}; install it with: pip install {install}"
+        super().__init__(message, package=package, extra=extra)

@@ -60,7 +60,7 @@ def _mechanism(reference: str) -> dict[str, Any]:
 
 
 def _plan(reference: str) -> dict[str, Any]:
-    return {"format": "scm_world/plan/1", "do": {"stage_friction": [_mechanism(reference)]}}
+    return {"format": "scm_world/plan/2", "do": {"stage_friction": [_mechanism(reference)]}}
 
 
 def _read_plan(reference: str) -> None:

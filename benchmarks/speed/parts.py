@@ -88,15 +88,14 @@ def watched_batch(envs: Any, watch: Stopwatch) -> None:
     rewards, and what is known beside them.
     """
     inner = envs.unwrapped
-    executor = inner.executor
-    tables, readers = executor._batch._tables.values(), executor._readers.values()
+    tables, readers = inner._batch._tables.values(), inner._readers.values()
     places: list[tuple[str, Any, str]] = [
-        (PHYSICS, executor._batch._engine, "step"),
+        (PHYSICS, inner._batch._engine, "step"),
         *(("mechanisms", one, "evaluate") for one in {t.compiled.mechanisms for t in tables}),
         *(("observation", reader, "write") for reader in readers),
         ("observation", inner, "_observations"),
         ("info", inner, "_infos"),
-        ("command", executor, "_commanded"),
+        ("command", inner, "_commanded"),
         (REST, inner, "step"),
     ]
     for part, owner, name in places:

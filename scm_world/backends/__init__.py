@@ -15,7 +15,7 @@ from scm_world.backends.base import (
     ContactPoint,
     EngineSnapshot,
 )
-from scm_world.errors import MissingEngine, UnknownOption
+from scm_world.errors import MissingEngine, ModelError, UnknownOption
 from scm_world.models import Model
 
 _CLASSES = {
@@ -71,8 +71,8 @@ def make_backend(name: str) -> Backend:
 
     Raises:
         UnknownOption: There is no such backend.
-        MissingEngine: Its engine is not installed.
-        MixedInstallation: Two versions of its engine lie in one folder.
+        ModelError: What an installed package declares by this name is not a backend.
+        MissingEngine: Its engine is not installed, or two versions of it lie in one folder.
 
     Example:
         >>> make_backend("fake").name
@@ -80,16 +80,18 @@ def make_backend(name: str) -> Backend:
     """
     if name in tuple(_REGISTERED):
         return _REGISTERED[name]()
-    found: type[Backend]
     if name not in BACKENDS:
         if name not in backends():
             raise UnknownOption("backend", name, backends())
-        found = _declared()[name].load()
-        return found()
+        declared = _declared()[name].load()
+        made = declared() if callable(declared) else declared
+        if not isinstance(made, Backend):
+            raise ModelError([f"entry point {name!r}: {declared!r} does not make a Backend"])
+        return made
     class_name, requirement = _CLASSES[name]
     try:
         module = importlib.import_module(f"scm_world.backends.{name}")
-        found = getattr(module, class_name)
+        found: type[Backend] = getattr(module, class_name)
     except MissingEngine:
         raise
     except ImportError as error:

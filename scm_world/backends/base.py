@@ -14,7 +14,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from scm_world._types import Floats, Integers
-from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption, WrongShape
+from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption
 from scm_world.models.scene import (
     Difference,
     ParameterKey,
@@ -83,11 +83,7 @@ class EngineSnapshot:
         return cls(f"{backend.name} {backend.version}", payload)
 
     def opened(self, backend: Backend) -> Any:
-        """Return the payload for a backend.
-
-        Raises:
-            SnapshotMismatch: It was taken by another engine, or another version of it.
-        """
+        """Return the payload for a backend."""
         here = f"{backend.name} {backend.version}"
         if self.engine != here:
             raise SnapshotMismatch(f"a snapshot of {self.engine} cannot be restored by {here}")
@@ -175,7 +171,13 @@ class Backend(ABC):
     def apply(self, difference: Difference) -> None:
         """Change structure, parameters and state without advancing time.
 
-        What is not mentioned stays as it is, bit for bit.
+        What is not mentioned stays as it is, bit for bit; all of it where an error is raised.
+
+        Raises:
+            UnknownOption: There is no such parameter.
+            NotIntervenable: The engine does not have the parameter.
+            Infeasible: Nothing could move with the parameters.
+            ModelError: The engine cannot realise the structure.
         """
 
     @abstractmethod
@@ -312,10 +314,8 @@ class InMemory(Backend, ABC):
             self._state.carry(now.state)  # what is reported stays
             self._parameters = {}
         else:
-            for key, value in difference.parameters.items():
-                shape = self._known(key).shape
-                if np.shape(value) != shape:
-                    raise WrongShape(".".join(key).strip("."), value, shape, np.shape(value))
+            for key in difference.parameters:
+                self._known(key)
         self._keep(difference.parameters)
         if difference.state is not None:
             self._place(difference.state)

@@ -24,11 +24,7 @@ class FakeBackend(InMemory):
     capabilities: ClassVar[Capabilities] = Capabilities(physics=False)
 
     def step(self, command: Floats, substeps: int) -> None:
-        """Advance time.
-
-        Raises:
-            EngineFailure: A number is not finite afterwards.
-        """
+        """Advance time."""
         if hasattr(self.structure, "move"):
             self.structure.move(self._state, command, substeps * self.structure.timestep)
         if not np.isfinite(self._state.vector).all():

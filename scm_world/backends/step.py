@@ -130,15 +130,9 @@ class StepModel:
         return Scene(self, parameters, self.empty_state())
 
     def advance(self, parameters: Floats, states: Floats, commands: Floats) -> Floats:
-        """Take one step in several systems.
+        """Take one step in m systems; return the new states, shape (m, s), in a new array.
 
-        Args:
-            parameters: Flat, in the order of declaration, shape (m, p).
-            states: Shape (m, s).
-            commands: Shape (m, n_commands).
-
-        Returns:
-            The new states, shape (m, s), in an array of its own.
+        Parameters are flat, in the order of declaration, shape (m, p).
 
         Raises:
             EngineFailure: The function raised an error, changed what it was given, or gave
@@ -214,7 +208,10 @@ class StepModel:
                 for q in (self.states if not problems else ())
             ]
         for name, numbers, where, shape in given:
-            value = np.asarray(numbers)
+            try:
+                value = np.asarray(numbers)
+            except ValueError:  # a ragged list
+                value = np.asarray(None)
             if value.dtype.kind not in "biuf":
                 problems.append(f"{name} must be numbers, not {value.dtype}")
             elif value.shape != shape:
@@ -282,11 +279,7 @@ class StepBatch(EngineBatch):
     def _together(
         self, model: StepModel, members: list[StepFunction], commands: Floats, substeps: int
     ) -> EngineFailure | None:
-        """Step systems of one vectorised function; return why none was stepped.
-
-        Raises:
-            EngineFailure: The function fails for one of them; none was stepped.
-        """
+        """Step systems of one vectorised function; return or raise why none was stepped."""
         commands = commands[:, : model.n_commands]
         states = np.array([member._state.vector for member in members])
         parameters = np.array([member.numbers for member in members])
@@ -329,11 +322,7 @@ class StepFunction(InMemory):
         super().build(scene)
 
     def step(self, command: Floats, substeps: int) -> None:
-        """Hold a command, which is the action and the noise, for some steps.
-
-        Raises:
-            EngineFailure: See ``StepModel.advance``. The state is as before.
-        """
+        """Hold a command, the action and the noise, for some steps; see ``StepModel.advance``."""
         parameters, states, commands = self.numbers[None], self._state.vector[None], command[None]
         for _ in range(substeps):
             states = self.structure.advance(parameters, states, commands)

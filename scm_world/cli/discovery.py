@@ -29,7 +29,7 @@ from scm_world.output.remote import Location
 if TYPE_CHECKING:
     from scm_world.discovery import DiscoveryReport
     from scm_world.discovery.problems import TaskView
-    from scm_world.queries.agreement import Agreement
+    from scm_world.queries.comparison import Comparison
     from scm_world.queries.verification import Verification
 
 LONG = 80  # [characters] what is longer is not repeated
@@ -40,6 +40,7 @@ BRIEF = (
 )
 BRIEF_MARKS = ("shd", "f1", "seconds")
 """Beside scores of edge marks, so that the table fits a terminal."""
+BACKENDS = "mujoco", "bullet"
 SMALL: dict[str, tuple[str, ...]] = {
     "towers": ("number_of_blocks_in_tower=1,1,2", "tower_dims=0.035,0.035,0.07"),
     "stacked_blocks": ("num_of_levels=2", "max_level_width=0.04"),
@@ -219,7 +220,7 @@ def _numbers(report: DiscoveryReport) -> Iterator[tuple[str, str, bool | None]]:
         yield "options", ", ".join(report.arguments), None
     yield "probe states", states, None if complete else False
     yield "rollouts, at least needed", f"{report.rollouts}, {report.bound}", None
-    yield "noise floor (do and undo)", f"{report.floor:.3g}", None
+    yield "noise floor (run twice)", f"{report.floor:.3g}", None
     yield "threshold", f"{report.threshold:.3g}", None
     yield "largest effect without an edge", f"{report.inert:.3g}", None
     yield "precision", f"{score.precision:.4f}", None
@@ -348,12 +349,9 @@ def verify(
         held_out: Further ones, in which effects without an edge are looked for.
         strict: Exit 1 unless the graph is confirmed.
     """
-    from scm_world.discovery.plots import draw_verification
-    from scm_world.queries import SCM
-    from scm_world.queries.agreement import Agreement
+    from scm_world.queries import SCM, Comparison, World
+    from scm_world.queries import verify as verified
     from scm_world.queries.verification import failed
-    from scm_world.queries.verify import LEAST, verify_engines
-    from scm_world.queries.verify import verify as verified
     from scm_world.tasks import TASKS
 
     every = task == "all"
@@ -367,69 +365,71 @@ def verify(
     words = (*(option or ()), resolution or "")
     folder = console.results_folder(out, "verify", tag(task), used, f"seed{seed}", option=words)
     interrupted = False
-    found: list[tuple[Verification | Agreement, tuple[Verification, ...]]] = []
-    for name, given in systems.items():
+    found: list[Verification | Comparison] = []
+    for (name, given), engine in product(systems.items(), BACKENDS if both else (backend,)):
         system = loaded[name]
-        settings: dict[str, Any] = {"probes": probes, "least": min(LEAST, probes), "seed": seed}
-        settings["held_out"] = held_out
+        settings: dict[str, Any] = {}
         if isinstance(system, SCM):
+            if both and engine != BACKENDS[0]:
+                continue  # it has no backend
             refuse_settings(backend=backend, preset=preset, resolution=resolution)
         else:
-            settings |= {"preset": preset, "resolution": resolution}
-            settings |= {} if both else {"backend": backend}
-        one: Verification | Agreement
+            settings = {"preset": preset, "resolution": resolution, "backend": engine}
+        parts = [name] * every + [str(engine)] * (both and bool(settings))
+        about = f"{tag(name)}: "
         try:
-            with console.progress("probe states", lines=4, about=f"{tag(name)}: ") as tell:
-                if both and not isinstance(system, SCM):
-
-                    def progress_of(_: str, tell: Any = tell) -> Any:
-                        return tell
-
-                    one = verify_engines(system, progress=progress_of, **settings)
-                else:
-                    one = verified(system, progress=tell, **settings)
+            with console.progress("probe states", lines=4, about=about) as tell:
+                report = verified(
+                    system, probes=probes, held_out=held_out, seed=seed, progress=tell, **settings
+                )
+            report = report.model_copy(update={"arguments": tuple(given)})
+            _told(report, found, folder.joinpath(*parts))
+            interrupted = report.interrupted
+            last = both and engine == BACKENDS[1] and not interrupted
+            if last and not isinstance(system, SCM):
+                with (
+                    World(system, **{**settings, "backend": BACKENDS[0]}) as world,
+                    console.progress("states compared", lines=4, about=about) as tell,
+                ):
+                    compared = world.compare(BACKENDS[1], seed=seed, progress=tell)
+                _told(compared, found, folder.joinpath(*parts[:-1], "comparison"))
         except KeyboardInterrupt:
             if not found:
                 raise
             interrupted = True
-            break
-        about = {"arguments": tuple(given)}
-        reports = one.verifications if isinstance(one, Agreement) else (one,)
-        reports = tuple(report.model_copy(update=about) for report in reports)
-        for report in reports:
-            console.say(report.title)
-            console.facts(report.rows())
-            console.say("")
-        if isinstance(one, Agreement):
-            one = one.model_copy(update={"verifications": reports})
-            console.say(one.title)
-            console.facts(one.rows())
-        else:
-            one = reports[0]
-        found.append((one, reports))
-        with console.staged(folder / name if every else folder) as draft:
-            (draft / "report.json").write_text(one.to_json())
-            draw_verification(one, draft / "verify.png")
-        if one.interrupted:
-            interrupted = True
+        if interrupted:
             break
     if len(found) > 1:
-        rows: list[tuple[object, ...]] = []
         colors = {"confirmed": "green", "not refuted": "yellow", "refuted": "bold red"}
-        for one, reports in found:
-            for report in reports:
-                seen = f"{len(report.fired)} of {len(report.declared)}"
-                cells = (report.probes, seen, len(report.undeclared), f"{report.floor:g}")
-                time = f"{report.seconds:.1f}"
-                said = Text(report.outcome, colors[report.outcome])
-                rows.append((report.task, report.backend, *cells, time, said))
-            if isinstance(one, Agreement):
-                share = f"same sign: {100 * one.share:.1f} %"
-                time = f"{one.seconds:.1f}"
-                said = Text(one.outcome, colors[one.outcome])
-                rows.append((one.task, "both", "", share, "", "", time, said))
+        rows: list[tuple[object, ...]] = []
+        for one in found:
+            if isinstance(one, Comparison):
+                cells = ("both", one.probes, f"same sign: {100 * one.share:.1f} %", "", "")
+            else:
+                seen = f"{len(one.fired)} of {len(one.declared)}"
+                undeclared = str(len(one.undeclared))
+                cells = (one.backend, one.probes, seen, undeclared, f"{one.floor:g}")
+            said = Text(one.outcome, colors[one.outcome])
+            rows.append((one.task, *cells, f"{one.seconds:.1f}", said))
         heads = ("task", "backend", "probe states", "seen", "undeclared", "noise floor", "seconds")
         console.table((*heads, "outcome"), rows, title="All verifications")
     if interrupted:
         raise typer.Exit(console.INTERRUPTED)
-    raise typer.Exit(int(failed([one.outcome for one, _ in found], strict=strict)))
+    raise typer.Exit(int(failed([one.outcome for one in found], strict=strict)))
+
+
+def _told(
+    report: Verification | Comparison, found: list[Verification | Comparison], folder: Location
+) -> None:
+    """Print a report, write it, and add it to those that were found."""
+    from scm_world.discovery.plots import draw_verification
+    from scm_world.queries import Comparison
+
+    console.say(report.title)
+    console.facts(report.rows())
+    console.say("")
+    with console.staged(folder) as draft:
+        (draft / "report.json").write_text(report.to_json())
+        if not isinstance(report, Comparison):
+            draw_verification(report, draft / "verify.png")
+    found.append(report)

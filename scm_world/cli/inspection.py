@@ -20,10 +20,7 @@ if TYPE_CHECKING:
 
 KIND_STYLE = {"exogenous": "yellow", "derived": "green", "measured": "blue", "action": "magenta"}
 LONG = 80  # [characters] what is longer is written once
-Format = StrEnum(
-    "Format",
-    ["table", "dot", "json", "png", "html", "gml", "graphml", "node-link", "dagitty", "csv"],
-)
+Format = StrEnum("Format", ["table", "json", "png", "html", "graphml"])
 """How a graph is written down."""
 
 
@@ -60,7 +57,7 @@ def graph(
         action_mode: Of the TriFinger: joint_positions, joint_torques or end_effector_positions.
     """
     from scm_world.graph import to_json
-    from scm_world.graph.exchange import write_graph
+    from scm_world.graph.exchange import to_digraph
 
     if format_ is None:
         ending = "" if out is None else out.suffix.lower().removeprefix(".")
@@ -89,8 +86,10 @@ def graph(
             from scm_world.discovery.model_pictures import to_html
 
             page.write(to_html(model, title=title))
-        case other:
-            page.write(write_graph(model, format=other) + "\n")
+        case "graphml":
+            import networkx as nx
+
+            page.write("\n".join(nx.generate_graphml(to_digraph(model))) + "\n")
     if out is None:
         typer.echo(page.getvalue(), nl=False)
         return

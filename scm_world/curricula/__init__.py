@@ -1,4 +1,4 @@
-"""Who intervenes, and when: curricula as values, for environments and for protocols.
+"""Intervention curricula, for environments and protocols: each episode gets a plan.
 
 A curriculum is a sentence::
 
@@ -22,6 +22,7 @@ from scm_world.curricula.combinations import (
     stages,
     together,
     weighted,
+    when,
 )
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
 from scm_world.curricula.parts import (
@@ -82,4 +83,5 @@ __all__ = [
     "stages",
     "together",
     "weighted",
+    "when",
 ]

@@ -1,28 +1,26 @@
-"""What a curriculum is made of: values that say what is done in a situation."""
+"""The elements of curricula: values that return a plan for an episode that begins."""
 
 from __future__ import annotations
 
 import hashlib
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, TypeVar, final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, final
 
 import numpy as np
 from pydantic import PlainSerializer, PlainValidator, ValidationError
 
 from scm_world._arguments import one_of
 from scm_world._types import Value
-from scm_world.errors import ModelError, ScmWorldError, UnknownOption, UnreadableFile
-from scm_world.graph import flatten
-from scm_world.queries.timed import as_act
-from scm_world.variables import Draw, Function, Intervention, Noise
-from scm_world.variables.mechanisms import check_trusted
+from scm_world.errors import ScmWorldError, UnknownOption, UnreadableFile
+from scm_world.graph import SCM, NoiseKey, flatten
+from scm_world.queries.plans import Plan, as_act, targets
+from scm_world.variables import Draw, Function, Intervention, Noise, Time
 from scm_world.variables.spaces import Frozen, problems_of
-from scm_world.world import Simulation
-from scm_world.world.compiled_task import CompiledTask
+from scm_world.world.compiled_task import CompiledTask, beginning
 
 STREAM = "curriculum"
 """First word of the noise of curricula."""
@@ -75,13 +73,8 @@ class Memory:
 
     def as_dict(self) -> dict[str, Any]:
         """Write it as plain data."""
-        return {
-            "episode": self.episode,
-            "stages": {
-                key: {"level": kept.level, "recent": list(kept.recent)}
-                for key, kept in self.stages.items()
-            },
-        }
+        stages = {k: {"level": p.level, "recent": [*p.recent]} for k, p in self.stages.items()}
+        return {"episode": self.episode, "stages": stages}
 
     @classmethod
     def from_dict(cls, data: Any) -> Memory:
@@ -101,36 +94,36 @@ class Memory:
 @final
 @dataclass(frozen=True)
 class Situation:
-    """An instant at which a curriculum may intervene.
+    """The episode that begins, as a curriculum sees it.
 
     Attributes:
-        world: At this instant; a part looks at it and leaves it alone.
         episode: How many episodes the curriculum has seen begin before this one.
-        step: The control step within the episode; 0 is the reset.
-        memory: Of the curriculum.
-        due: Whether what has no time of its own acts now.
+        memory: Of the curriculum: how far the learner has come.
+        compiled: The structure of the episode.
+        noise: Of the episode.
+        number: Of the episode within that noise.
+        time: The time of what has none of its own; None is the reset.
         first: Where bodies come and go: what decides that, which is asked for before all else,
-            so that the rest finds the bodies that there are then; else None.
-        initial: Values at the beginning of the episode, before anything was done, of what parts
-            ask for.
+            so that the rest finds the bodies that there will be; else None.
     """
 
-    world: Simulation
     episode: int
-    step: int
     memory: Memory
-    due: bool
+    compiled: CompiledTask
+    noise: Noise
+    number: int
+    time: Time | None = None
     first: frozenset[str] | None = None
-    initial: Mapping[str, Value] = field(default_factory=dict)
 
     @property
-    def compiled(self) -> CompiledTask:
-        """The structure that there is."""
-        return self.world.compiled
+    def model(self) -> SCM:
+        """The variables that there are."""
+        return self.compiled.model
 
-    def values(self) -> Mapping[str, Value]:
-        """Give the present value of every variable."""
-        return self.world.values()
+    @property
+    def step(self) -> int:
+        """The control step for which it is asked; 0 is the reset."""
+        return (self.time and self.time.start) or 0
 
     def uniform(self, key: str) -> float:
         """Draw a number in [0, 1) from a noise of the curriculum's own.
@@ -138,24 +131,24 @@ class Situation:
         Args:
             key: Of the noise; one key gives one number at one instant.
         """
-        noise: Noise = self.world.noise
-        where: Any = {"episode": self.world.episode, "step": self.step}
-        return float(noise.uniforms(f"{STREAM}/{key}", n=1, **where)[0, 0])
+        where: Any = {"episode": self.number, "step": self.step}
+        return float(self.noise.uniforms(f"{STREAM}/{key}", n=1, **where)[0, 0])
 
     def generator(self, key: str) -> np.random.Generator:
-        """Give a generator of random numbers of the curriculum's own; see ``uniform``."""
-        noise: Noise = self.world.noise
-        where: Any = {"episode": self.world.episode, "step": self.step}
-        words = noise.uniforms(f"{STREAM}/{key}/generator", n=2, **where)[0] * 2.0**53
+        """Return a generator of random numbers of the curriculum's own; see ``uniform``."""
+        where: Any = {"episode": self.number, "step": self.step}
+        words = self.noise.uniforms(f"{STREAM}/{key}/generator", n=2, **where)[0] * 2.0**53
         return np.random.default_rng([int(word) for word in words])
 
-
-Acts = dict[str, Any]
-"""An intervention: acts by the name of the variable."""
+    def natural(self, name: str) -> Value | None:
+        """Return a variable at the beginning without interventions; None if it is computed."""
+        row = beginning(self.compiled, NoiseKey(self.noise, self.number, origin=0))
+        known = name in self.compiled.slices or name in self.compiled.static_names
+        return np.array(row[name]) if known else None
 
 
 class Part(Frozen):
-    """A rule that says what is done in a situation. It is a value, with JSON without loss.
+    """A rule that says what is done in an episode. It is a value, with JSON without loss.
 
     Attributes:
         kind: Its name in a file.
@@ -177,9 +170,18 @@ class Part(Frozen):
         if isinstance(default, str):
             Part.KINDS[default] = cls
 
-    def acts(self, situation: Situation) -> Acts:
-        """Return the interventions of now; none by default."""
+    def acts(self, situation: Situation) -> Mapping[str, Any]:
+        """Return the interventions of the episode, as ``Plan`` takes them; none by default."""
         return {}
+
+    @final
+    def plan(self, situation: Situation) -> Plan:
+        """Return the interventions of the episode; what has no time has that of the situation."""
+        plan, time = Plan(self.acts(situation)), situation.time
+        if time is None:
+            return plan
+        timed = {name: tuple(_at(act, time) for act in acts) for name, acts in plan.items()}
+        return Plan.of(timed)
 
     def parts(self) -> tuple[Part, ...]:
         """List its parts."""
@@ -197,17 +199,13 @@ class Part(Frozen):
         for part in self.parts():
             yield from part.live(memory, episode)
 
-    def declared(self, declaration: CompiledTask) -> None:
+    def check(self, compiled: CompiledTask) -> None:
         """Look for names that do not exist and values that are impossible, in a structure.
 
         Raises:
             UnknownVariable: A name stands for nothing.
             InterventionError: A region or a value is impossible.
         """
-
-    def names(self) -> Iterator[str]:
-        """List the names and patterns of what it sets, as far as they are known beforehand."""
-        yield from ()
 
     @cached_property
     def key(self) -> str:
@@ -220,6 +218,32 @@ class Part(Frozen):
         yield from ()
 
 
+def _at(act: Any, time: Time) -> Any:
+    return act if act.time is not None else act.model_copy(update={"time": time})
+
+
+def over(model: SCM, *plans: Plan) -> Plan:
+    """Put plans over one another: of two acts on one quantity at one time the later one counts."""
+    found = dict(plans[0])
+    for plan in plans[1:]:
+        mine: dict[Time | None, set[str]] = {}
+        for name, acts in plan.items():
+            for act in acts:
+                mine.setdefault(act.time, set()).update(targets(model, name))
+        for name, acts in [*found.items()]:
+            kept = tuple(
+                act
+                for act in acts
+                if not mine.get(act.time, set()).issuperset(targets(model, name))
+            )
+            if len(kept) < len(acts):
+                found.pop(name)
+            if kept:
+                found[name] = kept
+        found |= {name: (*found.get(name, ()), *acts) for name, acts in plan.items()}
+    return Plan.of(found)
+
+
 def as_part(given: Any) -> Part:
     """Take a part, the plain data of one, or an intervention that is always done.
 
@@ -228,15 +252,11 @@ def as_part(given: Any) -> Part:
     """
     if isinstance(given, Part):
         return given
-    if isinstance(given, Mapping):
-        kind = given.get("kind")
-        if isinstance(kind, str):
-            return _from_file(kind, given)
+    if not isinstance(given, Mapping):
+        raise UnknownOption("part of a curriculum", given, ("a part, such as resample('*.mass')",))
+    kind = given.get("kind")
+    if not isinstance(kind, str):
         return Do(given)
-    raise UnknownOption("part of a curriculum", given, ("a part, such as resample('*.mass')",))
-
-
-def _from_file(kind: str, given: Mapping[str, Any]) -> Part:
     one_of("part of a curriculum", kind, Part.KINDS)
     try:
         return Part.KINDS[kind].model_validate(dict(given))
@@ -268,33 +288,12 @@ def words(option: str, given: Any) -> tuple[str, ...]:
     return names
 
 
-def acts_of(request: Mapping[str, Any]) -> Acts:
-    """Read an intervention, as a user writes it or as a file has it.
-
-    Args:
-        request: Values and acts by name, dotted or nested; an act may be plain data.
-
-    Raises:
-        UnknownOption: It is no mapping, or something in it is no intervention.
-    """
-    if not isinstance(request, Mapping):
-        return flatten(request)  # which says what is wrong
-    data = {n: act for n, act in request.items() if _is_data(act)}
-    nested = flatten({n: act for n, act in request.items() if n not in data})
-    return {name: as_act(value) for name, value in {**nested, **data}.items()}
-
-
-def _is_data(act: Any) -> bool:
-    """Tell an act that was written down from the quantities of an entity."""
-    return isinstance(act, Mapping) and isinstance(act.get("kind"), str)
-
-
 @final
 class Do(Part):
     """Do always the same.
 
     Attributes:
-        request: Interventions, by the name of the variable.
+        request: Interventions, by the name of the variable; each may have a time.
 
     Example:
         >>> Do({"tool_block": {"mass": 0.08}}).request["tool_block.mass"].value
@@ -305,29 +304,26 @@ class Do(Part):
     request: dict[str, Intervention]
 
     def __init__(self, request: Mapping[str, Any], **fields: Any) -> None:
-        super().__init__(request=acts_of(request), **fields)
+        super().__init__(request=_acts_of(request), **fields)
 
-    def acts(self, situation: Situation) -> Acts:
-        """Give the intervention; its draws have noises of their own."""
-        return dict(self._acts) if situation.due else {}
+    def acts(self, situation: Situation) -> Mapping[str, Any]:
+        """Return the interventions; their draws have noises of their own."""
+        return self._acts
 
     @cached_property
-    def _acts(self) -> Acts:
-        own = {"stream": f"{STREAM}/{self.key}"}
-        return {
-            name: act.model_copy(update=own) if isinstance(act, Draw) and not act.stream else act
-            for name, act in self.request.items()
-        }
+    def _acts(self) -> Plan:
+        def own(act: Any) -> Any:
+            if not isinstance(act, Draw) or act.stream:
+                return act
+            return act.model_copy(update={"stream": f"{STREAM}/{self.key}"})
 
-    def names(self) -> Iterator[str]:
-        """List what it sets."""
-        yield from self.request
+        return Plan({name: own(act) for name, act in self.request.items()})
 
-    def declared(self, declaration: CompiledTask) -> None:
+    def check(self, compiled: CompiledTask) -> None:
         """Look for names that do not exist and values that are impossible."""
-        for name, act in self.request.items():
-            if name not in declaration.entity_names:
-                declaration.model.accept(name, act)
+        for name, act in self._acts.acts():
+            if name not in compiled.entity_names:
+                compiled.model.accept(name, act)
 
     def functions(self) -> Iterator[Function]:
         """List the functions of mechanisms."""
@@ -337,39 +333,19 @@ class Do(Part):
                 yield function
 
 
-class HasPart(Protocol):
-    """A value that is made of parts."""
+def _acts_of(request: Any) -> dict[str, Any]:
+    """Read an intervention, as a user writes it or as a file has it: acts may be plain data."""
+    if not isinstance(request, Mapping):
+        return flatten(request)  # which says what is wrong
+    data = {
+        name: act
+        for name, act in request.items()
+        if isinstance(act, Mapping) and isinstance(act.get("kind"), str)
+    }
+    nested = flatten({name: act for name, act in request.items() if name not in data})
+    return {name: as_act(value) for name, value in {**nested, **data}.items()}
 
-    @property
-    def part(self) -> Part:
-        """All that is done."""
 
-
-Made = TypeVar("Made", bound=HasPart)
-
-
-def read_from(kind: type[Made], data: Any, *, form: str, trusted: Sequence[str]) -> Made:
-    """Read a value that was written down as plain data.
-
-    Args:
-        kind: Of the value.
-        data: Plain data.
-        form: What its ``"format"`` has to be.
-        trusted: Packages other than this one whose functions may be called.
-
-    Raises:
-        ModelError: It is something else, or it calls a function outside of those packages.
-    """
-    what = kind.__name__.lower()
-    if not isinstance(data, Mapping) or data.get("format") != form:
-        raise ModelError([f"not a {what}: expected the format {form!r}"])
-    validate: Any = kind
-    try:
-        made: Made = validate.model_validate({k: v for k, v in data.items() if k != "format"})
-    except ValidationError as error:
-        raise ModelError([f"not a {what}: {said}" for said in problems_of(error)]) from None
-    except (TypeError, ValueError) as error:
-        said_ = error.problems if isinstance(error, ModelError) else (str(error),)
-        raise ModelError([f"not a {what}: {one}" for one in said_]) from None
-    check_trusted((f for part in made.part.walk() for f in part.functions()), trusted)
-    return made
+def in_time(situation: Situation, time: Time | None) -> Situation:
+    """Return a situation in which what has no time of its own has another one."""
+    return replace(situation, time=time)

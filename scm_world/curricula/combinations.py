@@ -1,118 +1,97 @@
-"""When parts of a curriculum act, and which of several: all, in turn, by lot, or as one learns."""
+"""When parts of a curriculum act, and which of several."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, final
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Literal, final
 
 import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world.curricula.base import Acts, AnyPart, Memory, Part, Progress, Situation, as_part
+from scm_world.curricula.base import (
+    AnyPart,
+    Memory,
+    Part,
+    Progress,
+    Situation,
+    as_part,
+    in_time,
+    over,
+)
 from scm_world.errors import UnknownOption
-from scm_world.world.plan import merged
+from scm_world.variables import Time
 
 # --- when -----------------------------------------------------------------------------------------
 
 
-class _Timed(Part):
-    """Something that acts at certain times only.
+@final
+class Timed(Part):
+    """Act at certain times of every episode; what has a time of its own keeps it.
 
     Attributes:
-        part: What acts.
+        time: Of what has none.
+        part: What acts: a part, or an intervention.
     """
 
+    kind: Literal["timed"] = "timed"
+    time: Time
     part: AnyPart
 
-    if TYPE_CHECKING:  # as in ``Frozen``
-
-        def __init__(self, **fields: Any) -> None: ...
+    def __init__(self, time: Any, part: Any, **fields: Any) -> None:
+        super().__init__(time=time, part=as_part(part), **fields)
 
     def parts(self) -> tuple[Part, ...]:
-        """Give what acts."""
+        """Return what acts."""
         return (self.part,)
 
-    def is_due(self, situation: Situation) -> bool:
-        """Tell whether what has no time of its own acts now."""
-        return situation.due
-
-    def acts(self, situation: Situation) -> Acts:
+    def acts(self, situation: Situation) -> Mapping[str, Any]:
         """Return the interventions of the part, at its time."""
-        return self.part.acts(replace(situation, due=self.is_due(situation)))
+        if situation.time is None and self.time == _RESET:
+            return self.part.plan(situation)
+        return self.part.plan(in_time(situation, self.time))
 
 
-@final
-class AtStep(_Timed):
-    """Act after so many control steps of every episode; ``at_step`` in a sentence.
-
-    Attributes:
-        step: How many; 0 is the reset.
-        part: What acts: a part, or an intervention. A part of it with a time of its own has that
-            one.
-
-    Raises:
-        UnknownOption: The number is none, or the part.
-    """
-
-    kind: Literal["at_step"] = "at_step"
-    step: int
-
-    def __init__(self, step: Any, part: Any, **fields: Any) -> None:
-        step = whole_number("step", step, least=0)
-        super().__init__(step=step, part=as_part(part), **fields)
-
-    def is_due(self, situation: Situation) -> bool:
-        """Tell whether this is the step."""
-        return situation.step == self.step
+_RESET = Time(at=0)
 
 
-def at_reset(part: Any) -> AtStep:
+def at_reset(part: Any) -> Timed:
     """Act at the beginning of every episode; so does what has no time of its own.
 
-    Args:
-        part: What acts: a part, or an intervention.
-
-    Raises:
-        UnknownOption: It is neither.
-
     Example:
-        >>> at_reset({"floor_friction": 0.4}).step
-        0
+        >>> at_reset({"floor_friction": 0.4}).time
+        Time(at=0)
     """
-    return AtStep(0, part)
+    return Timed(_RESET, part)
 
 
-@final
-class Every(_Timed):
-    """Act again and again within every episode; ``every`` in a sentence.
+def at_step(step: int, part: Any) -> Timed:
+    """Act after so many control steps of every episode; 0 is the reset."""
+    return Timed(Time(at=step), part)
 
-    Attributes:
+
+def every(steps: int, part: Any, *, first: int = 0) -> Timed:
+    """Act again and again within every episode.
+
+    Args:
         steps: Control steps from one time to the next.
         part: What acts: a part, or an intervention.
         first: The first control step at which it acts; 0 is the reset.
-
-    Raises:
-        UnknownOption: A number is none, or the part.
     """
+    return Timed(Time(every=steps, at=first), part)
 
-    kind: Literal["every"] = "every"
-    steps: int
-    first: int = 0
 
-    def __init__(self, steps: Any, part: Any, *, first: Any = 0, **fields: Any) -> None:
-        steps = whole_number("steps", steps, least=1)
-        first = whole_number("first", first, least=0)
-        super().__init__(steps=steps, part=as_part(part), first=first, **fields)
+def when(event: Any, part: Any) -> Timed:
+    """Act at the first control step of every episode at which an event is there.
 
-    def is_due(self, situation: Situation) -> bool:
-        """Tell whether this is one of the steps."""
-        since = situation.step - self.first
-        return since >= 0 and since % self.steps == 0
+    Args:
+        event: ``Contact(first, second)`` or ``Reaches(name, above=…)``.
+        part: What acts: a part, or an intervention.
+    """
+    return Timed(Time(when=event), part)
 
 
 @final
-class During(_Timed):
+class During(Part):
     """Act in some episodes only, which count from 0; ``during`` in a sentence.
 
     Its arguments are a range of episodes, whose step is the period, and what acts: a part, or an
@@ -132,6 +111,7 @@ class During(_Timed):
     """
 
     kind: Literal["during"] = "during"
+    part: AnyPart
     first: int = 0
     stop: int | None = None
     period: int = 1
@@ -149,9 +129,13 @@ class During(_Timed):
             fields["stop"] = whole_number("stop", fields["stop"], least=fields["first"] + 1)
         super().__init__(part=as_part(part), **fields)
 
-    def acts(self, situation: Situation) -> Acts:
+    def parts(self) -> tuple[Part, ...]:
+        """Return what acts."""
+        return (self.part,)
+
+    def acts(self, situation: Situation) -> Mapping[str, Any]:
         """Return the interventions of the part, in its episodes."""
-        return self.part.acts(situation) if self._includes(situation.episode) else {}
+        return self.part.plan(situation) if self._includes(situation.episode) else {}
 
     def _includes(self, episode: int) -> bool:
         since = episode - self.first
@@ -191,7 +175,7 @@ class _Several(Part):
 
 @final
 class Together(_Several):
-    """Do all together; of two on one quantity the later one counts; ``together`` in a sentence.
+    """Do all together; of two on one quantity at one time the later one counts; ``together``.
 
     Raises:
         UnknownOption: There is no part.
@@ -207,13 +191,33 @@ class Together(_Several):
     def __init__(self, *parts: Any, **fields: Any) -> None:
         super().__init__(*parts, **fields)
 
-    def acts(self, situation: Situation) -> Acts:
+    def acts(self, situation: Situation) -> Mapping[str, Any]:
         """Put them over one another."""
-        return merged(situation.compiled.model, *(part.acts(situation) for part in self.of))
+        return over(situation.model, *(part.plan(situation) for part in self.of))
+
+
+class _Chosen(_Several):
+    """Several parts of which the episode and the progress of the learner choose one."""
+
+    def __init__(self, *parts: Any, **fields: Any) -> None:
+        super().__init__(*parts, **fields)
+
+    def chosen(self, memory: Memory, episode: int) -> Part:
+        """Return the part that acts in an episode."""
+        raise NotImplementedError
+
+    def acts(self, situation: Situation) -> Mapping[str, Any]:
+        """Return the interventions of that part."""
+        return self.chosen(situation.memory, situation.episode).plan(situation)
+
+    def live(self, memory: Memory, episode: int) -> Iterator[Part]:
+        """List it and that part."""
+        yield self
+        yield from self.chosen(memory, episode).live(memory, episode)
 
 
 @final
-class InTurn(_Several):
+class InTurn(_Chosen):
     """Do one after another, and again from the first one; ``in_turn`` in a sentence.
 
     Attributes:
@@ -233,17 +237,9 @@ class InTurn(_Several):
     def __init__(self, *parts: Any, each: Any = 1, **fields: Any) -> None:
         super().__init__(*parts, each=whole_number("each", each, least=1), **fields)
 
-    def _present(self, episode: int) -> Part:
+    def chosen(self, memory: Memory, episode: int) -> Part:
+        """Return the part whose turn it is."""
         return self.of[episode // self.each % len(self.of)]
-
-    def acts(self, situation: Situation) -> Acts:
-        """Return the interventions of the part whose turn it is."""
-        return self._present(situation.episode).acts(situation)
-
-    def live(self, memory: Memory, episode: int) -> Iterator[Part]:
-        """List it and the one whose turn it is."""
-        yield self
-        yield from self._present(episode).live(memory, episode)
 
 
 @final
@@ -277,16 +273,16 @@ class Weighted(_Several):
                 raise UnknownOption("weight", weight, ("any positive number",))
         super().__init__(*(part for _, part in pairs), weights=tuple(map(float, weights)), **fields)
 
-    def acts(self, situation: Situation) -> Acts:
+    def acts(self, situation: Situation) -> Mapping[str, Any]:
         """Return the interventions of the part that was drawn for the episode."""
         ends = np.cumsum(self.weights)
-        drawn = replace(situation, step=0).uniform(self.key) * ends[-1]
-        chosen = int(np.searchsorted(ends, drawn, side="right"))
-        return self.of[min(chosen, len(self.of) - 1)].acts(situation)  # a product may round up
+        drawn = in_time(situation, None).uniform(self.key) * ends[-1]
+        place = int(np.searchsorted(ends, drawn, side="right"))
+        return self.of[min(place, len(self.of) - 1)].plan(situation)  # a product may round up
 
 
 @final
-class Stages(_Several):
+class Stages(_Chosen):
     """Do the first, and the next one once the learner succeeds; ``stages`` in a sentence.
 
     Attributes:
@@ -317,22 +313,13 @@ class Stages(_Several):
             raise UnknownOption("down", down, (f"a share from 0 up to less than {up:g}", "None"))
         super().__init__(*parts, up=up, down=down, window=window, **fields)
 
-    def acts(self, situation: Situation) -> Acts:
-        """Return the interventions of the present stage."""
-        return self.of[self.progress(situation.memory).level].acts(situation)
-
-    def live(self, memory: Memory, episode: int) -> Iterator[Part]:
-        """List it and the present stage."""
-        yield self
-        yield from self.of[self.progress(memory).level].live(memory, episode)
-
-    def progress(self, memory: Memory) -> Progress:
-        """Return the state of this part."""
-        return memory.stages.setdefault(self.key, Progress())
+    def chosen(self, memory: Memory, episode: int) -> Part:
+        """Return the part of the present stage."""
+        return self.of[memory.stages.setdefault(self.key, Progress()).level]
 
     def ended(self, memory: Memory, *, success: bool) -> None:
         """Take an episode into account."""
-        kept = self.progress(memory)
+        kept = memory.stages.setdefault(self.key, Progress())
         kept.recent.append(success)
         while len(kept.recent) > self.window:
             kept.recent.popleft()
@@ -359,5 +346,4 @@ def count(parts: Iterable[Part], memory: Memory, *, success: bool) -> None:
         part.ended(memory, success=success)
 
 
-at_step, every, during = AtStep, Every, During
-together, in_turn, weighted, stages = Together, InTurn, Weighted, Stages
+during, together, in_turn, weighted, stages = During, Together, InTurn, Weighted, Stages

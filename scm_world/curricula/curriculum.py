@@ -3,24 +3,63 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from fnmatch import fnmatchcase
-from functools import cached_property
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, final
+from typing import Any, TypeVar, final
 
-from scm_world.curricula.base import AnyPart, as_part, read_from
-from scm_world.curricula.combinations import AtStep, Every, Stages
-from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnknownVariable, UnreadableFile
+from pydantic import ValidationError
+
+from scm_world.curricula.base import AnyPart, Situation, as_part
+from scm_world.curricula.combinations import Stages
+from scm_world.errors import (
+    DAMAGED,
+    ModelError,
+    UnknownOption,
+    UnknownVariable,
+    UnreadableFile,
+    blamed,
+)
 from scm_world.output.reading import read_text
+from scm_world.queries.plans import Plan, targets
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import Subset
 from scm_world.variables.checks import check_subset
-from scm_world.variables.mechanisms import check_portable
-from scm_world.variables.spaces import Frozen
+from scm_world.variables.mechanisms import check_portable, check_trusted
+from scm_world.variables.spaces import Frozen, problems_of
 from scm_world.world import Simulation
 
 FORMAT = "scm_world/curriculum/1"
+
+
+Made = TypeVar("Made", bound=Frozen)
+
+
+def read_from(kind: type[Made], data: Any, *, form: str, trusted: Sequence[str]) -> Made:
+    """Read a value that was written down as plain data.
+
+    Args:
+        kind: Of the value.
+        data: Plain data.
+        form: What its ``"format"`` has to be.
+        trusted: Packages other than this one whose functions may be called.
+
+    Raises:
+        ModelError: It is something else, or it calls a function outside of those packages.
+    """
+    what = kind.__name__.lower()
+    if not isinstance(data, Mapping) or data.get("format") != form:
+        raise ModelError([f"not a {what}: expected the format {form!r}"])
+    validate: Any = kind
+    try:
+        made: Made = validate.model_validate({k: v for k, v in data.items() if k != "format"})
+    except ValidationError as error:
+        raise ModelError([f"not a {what}: {said}" for said in problems_of(error)]) from None
+    except (TypeError, ValueError) as error:
+        said_ = error.problems if isinstance(error, ModelError) else (str(error),)
+        raise ModelError([f"not a {what}: {one}" for one in said_]) from None
+    part: Any = getattr(made, "part")  # noqa: B009 # of a curriculum or a protocol
+    check_trusted((f for one in part.walk() for f in one.functions()), trusted)
+    return made
 
 
 @final
@@ -103,8 +142,8 @@ class Curriculum(Frozen):
     def check(self, world: Simulation) -> None:
         """Look for names that do not exist and regions that are impossible.
 
-        Where it decides which bodies there are, names are looked up when it acts: they may be
-        those of bodies that are not there yet.
+        Where variables decide which bodies there are, names are looked up at each reset: they may
+        be those of bodies that are not there yet.
 
         Args:
             world: Whose episodes begin with the structure that its declaration has.
@@ -117,41 +156,34 @@ class Curriculum(Frozen):
         if has_stages and SUCCESS not in world.model:
             allowed = (f"a task with {SUCCESS!r}, as success=(function, 'hinge.position', …)",)
             raise UnknownOption("task for a curriculum with stages", world.task.name, allowed)
-        may_come = self._may_restructure(world)
+        may_come = bool(len(world.structures.head))
         for part in self.part.walk():
             try:
-                part.declared(world.compiled)
+                part.check(world.compiled)
             except UnknownVariable:
                 if not may_come:
                     raise
         if self.space is not None:
             check_subset(self.space, world.model.variables, may_come=may_come)
 
-    def _may_restructure(self, world: Simulation) -> bool:
-        head = tuple(world.structures.head)
-        goals = world.task.goal.causes
-        return any(
-            any(fnmatchcase(name, pattern) for name in head)
-            or pattern in ("@everything", "@published")
-            or (pattern == "@goals" and not set(head).isdisjoint(goals))
-            for part in self.part.walk()
-            for pattern in part.names()
-        )
+    def plan(self, situation: Situation, besides: Iterable[str] = ()) -> Plan:
+        """Return what is done in an episode.
 
-    @cached_property
-    def _times(self) -> tuple[frozenset[int], tuple[tuple[int, int], ...]]:
-        """When parts act: at these steps, and from the one step on every so many."""
-        timed = [p for p in self.part.walk() if isinstance(p, AtStep | Every)]
-        steps = frozenset(p.step for p in timed if isinstance(p, AtStep))
-        return steps, tuple({(p.first, p.steps) for p in timed if isinstance(p, Every)})
-
-    def may_act(self, step: int) -> bool:
-        """Tell whether anything may be due after so many control steps, in some episode."""
-        steps, series = self._times
-        return (
-            step == 0
-            or step in steps
-            or any(step >= first and (step - first) % period == 0 for first, period in series)
+        Args:
+            situation: The episode that begins.
+            besides: Variables that are left as they are, in any coordinates.
+        """
+        model, first = situation.model, situation.first
+        with blamed(f"the curriculum, in episode {situation.episode},"):
+            plan = self.part.plan(situation)
+        taken = {target for name in besides for target in targets(model, name)}
+        return Plan.of(
+            {
+                name: acts
+                for name, acts in plan.items()
+                if not (taken and taken.intersection(targets(model, name)))
+                and (first is None or name in first)
+            }
         )
 
 

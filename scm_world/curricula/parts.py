@@ -1,4 +1,4 @@
-"""Parts of curricula that do something: draw, go from one setting to another, follow a function."""
+"""Parts of curricula that act: draws, interpolations between settings, functions."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from pydantic import Field
 
 from scm_world._arguments import one_of, whole_number
 from scm_world._types import Value
-from scm_world.curricula.base import STREAM, Acts, Part, Situation, acts_of, words
+from scm_world.curricula.base import STREAM, Part, Situation, words
 from scm_world.curricula.targets import matching
 from scm_world.errors import InterventionError, UnknownOption, UnknownVariable, blamed
 from scm_world.geometry.rotations import (
     from_rotation_vector,
-    quaternion_inverse,
     quaternion_product,
     to_rotation_vector,
 )
 from scm_world.graph import flatten
+from scm_world.queries.plans import Plan
 from scm_world.variables import (
     Box,
     Continuous,
@@ -77,36 +77,26 @@ class Resample(Part):
             raise UnknownOption("what", what, ("a name or a pattern", "several of them"))
         super().__init__(what=named, space=space, **fields)
 
-    def acts(self, situation: Situation) -> Acts:
-        """Draw, where it is due."""
-        if not situation.due:
-            return {}
-        drawn = self._draws(situation.compiled, situation.first)
-        if self.exclusive:
-            without = _SIZES if situation.uniform(self.key) < 0.5 else _POSITIONS
-            return {name: act for name, act in drawn.items() if not name.endswith(without)}
-        return dict(drawn)
-
-    def _draws(self, declaration: CompiledTask, first: frozenset[str] | None) -> Acts:
-        """Give the draws, which are the same whenever a structure comes again."""
-        kept = _DRAWS.setdefault(declaration, {})
-        word = (self.key, first is None)
+    def acts(self, situation: Situation) -> Mapping[str, Any]:
+        """Return the draws, which are the same whenever a structure comes again."""
+        kept = _DRAWS.setdefault(situation.compiled, {})
+        word = (self.key, situation.first is None)
         if word not in kept:
             stream = f"{STREAM}/{self.key}"
-            targets = self.targets(declaration, first).items()
-            kept[word] = {name: Draw(region, stream=stream) for name, region in targets}
-        return kept[word]
+            regions = self.targets(situation.compiled, situation.first).items()
+            draws = {name: (Draw(region, stream=stream),) for name, region in regions}
+            kept[word] = Plan.of(draws)
+        if not self.exclusive:
+            return kept[word]
+        without = _SIZES if situation.uniform(self.key) < 0.5 else _POSITIONS
+        return {name: acts for name, acts in kept[word].items() if not name.endswith(without)}
 
-    def names(self) -> Iterator[str]:
-        """List what it sets."""
-        yield from self.what
-
-    def declared(self, declaration: CompiledTask) -> None:
+    def check(self, compiled: CompiledTask) -> None:
         """Look for names that do not exist and regions that are impossible."""
-        self.targets(declaration)
+        self.targets(compiled)
 
     def targets(
-        self, declaration: CompiledTask, among: frozenset[str] | None = None
+        self, compiled: CompiledTask, among: frozenset[str] | None = None
     ) -> dict[str, SpaceName | Distribution]:
         """Name the variables, each with the region that it is drawn from.
 
@@ -114,18 +104,18 @@ class Resample(Part):
         that have none.
 
         Args:
-            declaration: Of the structure.
+            compiled: The structure.
             among: Look for these only, and do without patterns that name none; for all if None.
 
         Raises:
             UnknownVariable: A pattern names nothing.
             InterventionError: A variable does not have the space, or the region is impossible.
         """
-        left_out = set(self._matching(declaration, self.besides, among))
+        left_out = set(self._matching(compiled, self.besides, among))
         found: dict[str, SpaceName | Distribution] = {}
         for pattern in self.what:
-            for name in self._matching(declaration, (pattern,), among):
-                variable = declaration.model.declared(name)
+            for name in self._matching(compiled, (pattern,), among):
+                variable = compiled.model.declared(name)
                 region = self._region(name)
                 missing = isinstance(region, str) and variable.space(region) is None
                 if name in left_out or region is None or (missing and pattern.startswith("@")):
@@ -135,14 +125,14 @@ class Resample(Part):
         return found
 
     def _matching(
-        self, declaration: CompiledTask, patterns: tuple[str, ...], among: frozenset[str] | None
+        self, compiled: CompiledTask, patterns: tuple[str, ...], among: frozenset[str] | None
     ) -> tuple[str, ...]:
         if among is None:
-            return matching(declaration, patterns)
+            return matching(compiled, patterns)
         found: list[str] = []
         for pattern in patterns:
             try:
-                found += matching(declaration, (pattern,))
+                found += matching(compiled, (pattern,))
             except UnknownVariable:  # perhaps it names what is there afterwards
                 continue
         return tuple(name for name in found if name in among)
@@ -153,7 +143,7 @@ class Resample(Part):
 
 _SIZES = (".size", "block_size", "_dims")
 _POSITIONS = (".cylindrical_position",)
-_DRAWS: WeakKeyDictionary[CompiledTask, dict[tuple[str, bool], Acts]] = WeakKeyDictionary()
+_DRAWS: WeakKeyDictionary[CompiledTask, dict[tuple[str, bool], Plan]] = WeakKeyDictionary()
 
 
 def _check(variable: Variable, region: SpaceName | Distribution) -> None:
@@ -192,10 +182,8 @@ class NewGoal(Part):
         fields["besides"] = words("besides", fields.get("besides", ()))
         super().__init__(space=space, **fields)
 
-    def acts(self, situation: Situation) -> Acts:
-        """Draw, where it is due."""
-        if not situation.due:
-            return {}
+    def acts(self, situation: Situation) -> Mapping[str, Any]:
+        """Return the draws of the goal's causes."""
         stream = f"{STREAM}/{self.key}"
         drawn = situation.compiled.task.sample_goal(self.space)
         return {
@@ -204,20 +192,16 @@ class NewGoal(Part):
             if name not in self.besides
         }
 
-    def names(self) -> Iterator[str]:
-        """List what it sets."""
-        yield "@goals"
-
-    def declared(self, declaration: CompiledTask) -> None:
+    def check(self, compiled: CompiledTask) -> None:
         """Look for causes that the goal does not have.
 
         Raises:
             UnknownOption: The task has no goals.
         """
-        causes = declaration.task.sample_goal(self.space)
+        causes, task = compiled.task.sample_goal(self.space), compiled.task.name
         if not causes:
-            allowed = (f"a task with goals; draw variables of {declaration.task.name} by resample",)
-            raise UnknownOption("task for goals", declaration.task.name, allowed)
+            allowed = (f"a task with goals; draw variables of {task} by resample",)
+            raise UnknownOption("task for goals", task, allowed)
         for name in self.besides:
             if name not in causes:
                 raise UnknownVariable(name, causes)
@@ -232,7 +216,7 @@ class Interpolate(Part):
 
     Attributes:
         stop: Where it ends, by variable.
-        start: Where it begins; what the variable would be without it, if nothing is given.
+        start: Where it begins; its value in an episode without interventions if not given.
         episodes: After how many episodes it is there.
         first: In which episode it begins.
 
@@ -259,10 +243,8 @@ class Interpolate(Part):
         for name in self.start.keys() - self.stop.keys():
             raise UnknownOption("start", name, self.stop)
 
-    def acts(self, situation: Situation) -> Acts:
-        """Give the values between the two."""
-        if not situation.due:
-            return {}
+    def acts(self, situation: Situation) -> Mapping[str, Any]:
+        """Return the values between the two."""
         share = min(max((situation.episode - self.first) / self.episodes, 0.0), 1.0)
         names = [n for n in self.stop if situation.first is None or n in situation.first]
         return {name: self._between(situation, name, share) for name in names}
@@ -270,11 +252,10 @@ class Interpolate(Part):
     def _between(self, situation: Situation, name: str, share: float) -> Value:
         variable = situation.compiled.model.declared(name)
         begin = self.start.get(name)
-        if begin is None:
-            usual = situation.initial.get(name)
-            one = situation.world[name] if usual is None else usual
-        else:
-            one = variable.array(begin)
+        one = situation.natural(name) if begin is None else variable.array(begin)
+        if one is None:
+            allowed = (f"a value for {name!r}, which is computed from others",)
+            raise UnknownOption("start of an interpolation", None, allowed)
         other = variable.array(self.stop[name])
         if isinstance(variable.bounds, Rotations):
             return _turned(one, other, share)
@@ -285,13 +266,9 @@ class Interpolate(Part):
             np.rint(between).astype(np.int64) if variable.dtype != "real" else between
         )
 
-    def names(self) -> Iterator[str]:
-        """List what it sets."""
-        yield from self.stop
-
-    def declared(self, declaration: CompiledTask) -> None:
+    def check(self, compiled: CompiledTask) -> None:
         """Look for names that do not exist and ends that a variable cannot reach."""
-        model = declaration.model
+        model = compiled.model
         for name, stop in self.stop.items():
             for given in (self.start.get(name), stop):
                 if given is not None:
@@ -300,7 +277,8 @@ class Interpolate(Part):
 
 def _turned(one: Value, other: Value, share: float) -> Value:
     """Turn from one quaternion towards another, by a share of the angle between them."""
-    turn = to_rotation_vector(quaternion_product(other, quaternion_inverse(one)))
+    back = one * np.array([-1.0, -1.0, -1.0, 1.0]) / np.sum(one * one)  # the inverse of one
+    turn = to_rotation_vector(quaternion_product(other, back))
     between = quaternion_product(from_rotation_vector(share * turn), one)
     return np.asarray(Rotations().nearest(between))
 
@@ -324,12 +302,13 @@ def _plain(option: str, request: Mapping[str, Any]) -> dict[str, Any]:
 
 @final
 class Follow(Part):
-    """Do what a function says; ``follow`` in a sentence.
+    """Follow the plan that a function returns; ``follow`` in a sentence.
 
     Attributes:
-        function: Takes the ``Situation``, and gives an intervention: acts or values by name.
-            Random numbers come from ``situation.generator(key)``. Where bodies come and go it is
-            asked twice: first for what decides that, then for the rest.
+        function: Takes the ``Situation``, and returns a plan of the episode: values or
+            interventions by name, which may have times; None for nothing. Random numbers come from
+            ``situation.generator(key)``. Where bodies come and go it is asked twice: first for
+            what decides that, then for all.
 
     Raises:
         UnknownOption: It is no function.
@@ -347,15 +326,13 @@ class Follow(Part):
         if isinstance(self.function, Linear):
             raise UnknownOption("function of a curriculum", self.function, ("a Function",))
 
-    def acts(self, situation: Situation) -> Acts:
-        """Ask the function, where it is due.
+    def acts(self, situation: Situation) -> Mapping[str, Any]:
+        """Ask the function.
 
         Raises:
             UnknownOption: It gave no intervention.
             FunctionFailure: It raised an error.
         """
-        if not situation.due:
-            return {}
         function: Any = self.function
         with blamed(f"the function {function.reference!r} of a curriculum"):
             given = function.bind()(situation)
@@ -363,11 +340,7 @@ class Follow(Part):
             return {}
         if not isinstance(given, Mapping):
             raise UnknownOption("intervention of a function", given, ("values by name", "None"))
-        return acts_of(given)
-
-    def names(self) -> Iterator[str]:
-        """Say that it may set anything."""
-        yield "*"
+        return given
 
     def functions(self) -> Iterator[Function]:
         """Give the function."""

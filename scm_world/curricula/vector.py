@@ -12,15 +12,14 @@ from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import AutoresetMode, VectorWrapper
 from numpy.typing import NDArray
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import whole_number
 from scm_world.curricula.base import Memory, state_read
 from scm_world.curricula.combinations import count
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
 from scm_world.curricula.wrapper import CurriculumEnv, place
 from scm_world.env import ScmWorldEnv
 from scm_world.env.arguments import RESETS, reset_options
-from scm_world.env.batched.asking import MASK, masked
-from scm_world.env.batched.vector_env import EXECUTORS
+from scm_world.env.many import MASK, read_mask
 from scm_world.errors import UnknownOption
 
 SUCCESS = "is_success"
@@ -31,7 +30,6 @@ def make_vec(
     num_envs: int,
     curriculum: Any,
     *,
-    vectorization_mode: str | None = None,
     autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
     **options: Any,
 ) -> CurriculumVectorEnv:
@@ -41,15 +39,11 @@ def make_vec(
         env_id: Such as ``"scm_world/Pushing-v0"``.
         num_envs: How many.
         curriculum: What is done in each of them; see ``CurriculumEnv``.
-        vectorization_mode: ``"native"``: many in one call of the backend; ``"processes"``:
-            several in each of some processes; ``"loop"``: in this process, one after another;
-            None: the fastest that there is. What comes out does not depend on it.
         autoreset_mode: When a member that is done is reset, as in Gymnasium.
-        options: Of the environments; ``threads`` with ``"native"``, ``workers`` with
-            ``"processes"``.
+        options: Of the environments; ``threads`` and ``workers``, see ``vector_env``.
 
     Raises:
-        UnknownOption: There is no such mode or option, or the number is none.
+        UnknownOption: There is no such option, or the number is none.
 
     Example:
         >>> envs = make_vec("scm_world/Pushing-v0", 2, {"floor_friction": 0.4}, backend="fake")
@@ -57,7 +51,6 @@ def make_vec(
         (2, 56)
         >>> envs.close()
     """
-    one_of("vectorization_mode", vectorization_mode, (None, *EXECUTORS))
     options.pop("disable_env_checker", None)  # of single environments
     made = as_curriculum(curriculum)
     envs: Any = gymnasium.make_vec(
@@ -65,37 +58,14 @@ def make_vec(
         whole_number("num_envs", num_envs, least=1),
         vectorization_mode=VectorizeMode.VECTOR_ENTRY_POINT,
         autoreset_mode=autoreset_mode,
-        executor=vectorization_mode,
         member=partial(_member, made),
         **options,
     )
     return CurriculumVectorEnv(envs, made)
 
 
-def _member(curriculum: Curriculum, **options: Any) -> Member:
-    return Member(CurriculumEnv(ScmWorldEnv(**options), curriculum))
-
-
-@final
-class Member:
-    """Does what a ``ScmWorldEnv`` does, with the curriculum at its resets and steps.
-
-    Args:
-        env: Around the environment itself.
-    """
-
-    def __init__(self, env: CurriculumEnv) -> None:
-        self._env = env
-        self._inner: Any = env.unwrapped
-        self.reset, self.step, self.stepped, self.act = env.reset, env.step, env.stepped, env.act
-        self.get_wrapper_attr, self.set_wrapper_attr = env.get_wrapper_attr, env.set_wrapper_attr
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._inner, name)
-
-    def sibling(self) -> Member:
-        """Make another one like it; they share what is declared."""
-        return Member(CurriculumEnv(self._inner.sibling(), self._env.curriculum))
+def _member(curriculum: Curriculum, **options: Any) -> CurriculumEnv:
+    return CurriculumEnv(ScmWorldEnv(**options), curriculum)
 
 
 @final
@@ -189,7 +159,7 @@ class CurriculumVectorEnv(VectorWrapper):
         """Play episodes again up to where they were, bit for bit.
 
         Args:
-            running: What ``running`` gave, of as many environments in an executor.
+            running: What ``running`` gave, of as many environments.
             actions: Of each control step since their resets, shape (steps, n, n_actions).
             lengths: How many of them each member took, shape (n,).
 
@@ -209,10 +179,9 @@ class CurriculumVectorEnv(VectorWrapper):
         self.resume({name: running[name] for name in ("episode", "stages", "again", "noises")})
         self._members.set_attr("turn", [(memory.episode, memory) for memory in memories])
         self.env.reset()
-        executor: Any = self.unwrapped.executor  # type: ignore[attr-defined] # not of Gymnasium's kinds
-        for step, row in enumerate(np.asarray(actions, dtype=np.float64)):
-            if (which := np.asarray(lengths) > step).any():
-                executor.step(which, row)
+        given = np.asarray(actions, dtype=np.float64)
+        for index, length in enumerate(lengths):
+            self._members.call_in([index], "rerun", given[:length, index])
         self._members.set_attr("turn", turns)
         self._present, self._waiting, self._again = kept["present"], kept["waiting"], left
         self._stepped = np.array(kept["stepped"], bool)
@@ -223,7 +192,7 @@ class CurriculumVectorEnv(VectorWrapper):
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in all of them, or in those of ``options["reset_mask"]``."""
-        begun = masked(reset_options(options, (*RESETS, MASK)).get(MASK), self.num_envs)
+        begun = read_mask(reset_options(options, (*RESETS, MASK)).get(MASK), self.num_envs)
         for index in np.flatnonzero(begun):
             self._ended(index, counts=bool(self._stepped[index]))
         self._hand_out(begun)

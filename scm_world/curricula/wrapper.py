@@ -1,26 +1,26 @@
-"""The wrapper that runs a curriculum: it counts episodes and successes, and intervenes."""
+"""Curricula of environments: a plan for every reset, and what is due within the episode."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+import secrets
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, final
 
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
 from scm_world._arguments import whole_number
-from scm_world._types import Value
-from scm_world.curricula.base import Acts, Memory, Situation, state_read
+from scm_world.curricula.base import Memory, Situation, state_read
 from scm_world.curricula.combinations import count
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
-from scm_world.curricula.parts import Interpolate
 from scm_world.env import ScmWorldEnv
-from scm_world.env.arguments import RESETS, reset_options
+from scm_world.env.arguments import RESETS, reset_options, structure_after
 from scm_world.env.wrappers import unwrapped_env
-from scm_world.errors import ModelError, UnknownOption, UnknownVariable, blamed
-from scm_world.graph import flatten
-from scm_world.world import Simulation
+from scm_world.errors import ModelError, UnknownOption
+from scm_world.graph import NoiseKey, flatten
+from scm_world.queries.plans import Key, Plan, Schedule
+from scm_world.variables import Noise
+from scm_world.world.compiled_task import CompiledTask
 
 
 @final
@@ -39,119 +39,94 @@ class CurriculumRunner:
     def __init__(self, curriculum: Any, memory: Memory | None = None) -> None:
         self.curriculum: Curriculum = as_curriculum(curriculum)
         self.memory = Memory() if memory is None else memory
+        self._where = Noise(0), 0
         self._besides: frozenset[str] = frozenset()
-        self._initial: dict[str, Value] = {}
+        self._schedule = Schedule()
+        self._fired: dict[Key, int] = {}
+        self._due: list[int] = []
         self._last = 0
-        parts = self.curriculum.part.walk()
-        self._moved = [
-            name for part in parts if isinstance(part, Interpolate) for name in part.stop
-        ]
 
     def begin(
-        self, env: ScmWorldEnv, episode: int | None = None, *, besides: Iterable[str] = ()
-    ) -> bool:
-        """Do what is due at a reset, just after it.
+        self, env: ScmWorldEnv, seed: int, number: int, do: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
+        """Plan an episode, and return the options of its reset.
 
         Args:
-            env: At the beginning of an episode.
-            episode: Its number; as many as have ended if None.
-            besides: Variables that are left as they are in this episode, in any coordinates.
+            env: Before the reset.
+            seed: Of the noise.
+            number: Of the episode within the noise.
+            do: What the caller does at the reset: the curriculum leaves these variables alone, in
+                any coordinates.
 
-        Returns:
-            Whether anything was done.
+        Raises:
+            InterventionError: The curriculum names something that does not exist.
+        """
+        mine, world = flatten(do or {}), env.world
+        self._where, self._besides = (Noise(seed), number), frozenset(mine)
+        self._fired, self._due, self._last = {}, [], 0
+        compiled = world.structures.natural(None)
+        if len(world.structures.head):
+            key, held = NoiseKey(self._where[0], number, origin=0), world.structures.head
+            first = self._plan(compiled, frozenset(held)).at_start()
+            acts = env.beginning({**first, **mine})
+            compiled = structure_after(world.structures, acts, held, held.solve(), key) or compiled
+        plan = self._plan(compiled)
+        self._schedule = Schedule([(0, plan)])
+        options: dict[str, Any] = {"do": {**plan.at_start(), **mine}}
+        space = self.curriculum.space
+        return options if space is None else {**options, "space": space}
+
+    def _plan(self, compiled: CompiledTask, first: frozenset[str] | None = None) -> Plan:
+        memory, (noise, number) = self.memory, self._where
+        situation = Situation(memory.episode, memory, compiled, noise, number, first=first)
+        return self.curriculum.plan(situation, self._besides)
+
+    def stepped(self, env: ScmWorldEnv, step: int) -> bool:
+        """Note that so many control steps are over; tell whether anything may be due now.
+
+        Where several control steps have passed, what was due in between is due now.
+        """
+        steps = range(self._last + 1, step + 1) if step > self._last else (step,)
+        self._fired = {key: at for key, at in self._fired.items() if at < step}
+        self._due = [at for at in steps if self._schedule.concerns(env.world, at, self._fired)]
+        self._last = step
+        return bool(self._due)
+
+    def act(self, env: ScmWorldEnv) -> bool:
+        """Do what is due; tell whether that was anything.
 
         Raises:
             InterventionError: It was refused; nothing has changed.
         """
-        if episode is not None:
-            self.memory.episode = episode
-        self._besides, self._last = frozenset(besides), 0
-        world = env.world
-        self._initial = {name: world[name] for name in self._moved if name in world.model}
-        return self._act(env, 0)
-
-    def may_act(self, step: int) -> bool:
-        """Tell whether anything may be due after so many control steps of the episode."""
-        return self.curriculum.may_act(step)
-
-    def step(self, env: ScmWorldEnv) -> bool:
-        """Do what is due after a control step; tell whether that was anything.
-
-        Where several control steps have passed, what was due in between is done now.
-
-        Raises:
-            InterventionError: It was refused; nothing has changed.
-        """
-        now = env.world.index
-        steps = range(self._last + 1, now + 1) if now > self._last else (now,)
-        self._last = now
-        acted = [self.curriculum.may_act(step) and self._act(env, step) for step in steps]
-        return any(acted)
+        world, acted = env.world, False
+        for step in self._due:
+            due = self._schedule.due(world, step, self._fired)
+            if any(name in world.structures.head for name in due):  # names mean what there is then
+                now = world.current()[0], world.noise_key(world.index)
+                found = structure_after(world.structures, due, world.graph, *now)
+                self._schedule = Schedule([(0, self._plan(found or world.compiled))])
+                due = self._schedule.due(world, step, self._fired)
+            if due:
+                env.do(due, space=self.curriculum.space)
+                acted = True
+        return acted
 
     def ended(self, *, success: bool) -> None:
         """Take an episode into account that has ended, and count it."""
-        count(
-            self.curriculum.part.live(self.memory, self.memory.episode),
-            self.memory,
-            success=success,
-        )
+        parts = self.curriculum.part.live(self.memory, self.memory.episode)
+        count(parts, self.memory, success=success)
         self.memory.episode += 1
-
-    def _act(self, env: ScmWorldEnv, step: int) -> bool:
-        """Intervene; first on what decides which bodies there are, for others have their names."""
-        besides = self._besides
-        head = frozenset(env.world.structures.head)
-        space = self.curriculum.space
-        first = self._asked(env.world, step, besides, head) if head else {}
-        if not first:
-            acts = self._asked(env.world, step, besides)
-            if acts:
-                env.do(acts, space=space)
-            return bool(acts)
-        before = env.snapshot()
-        env.do(first, space=space)
-        try:
-            rest = self._asked(env.world, step, besides | head)
-            if rest:
-                env.do(rest, space=space)
-        except BaseException:
-            env.restore(before)
-            raise
-        return True
-
-    def _asked(
-        self,
-        world: Simulation,
-        step: int,
-        besides: frozenset[str],
-        first: frozenset[str] | None = None,
-    ) -> Acts:
-        memory, model = self.memory, world.model
-        situation = Situation(world, memory.episode, step, memory, due=step == 0, first=first)
-        situation = replace(situation, initial=self._initial)
-        with blamed(f"the curriculum, in control step {step} of episode {memory.episode},"):
-            acts = self.curriculum.part.acts(situation)
-        if first is not None:
-            acts = {name: act for name, act in acts.items() if name in first}
-
-        def targets(name: str) -> tuple[str, ...]:
-            return model.targets(name) if name in model else (name,)
-
-        taken = {target for name in besides for target in targets(name)}
-        return {
-            name: act for name, act in acts.items() if not taken or taken.isdisjoint(targets(name))
-        }
 
 
 @final
 class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Intervenes on an environment, at its resets and within its episodes.
 
-    What the caller of ``reset`` asks for in ``options["do"]`` counts more than the curriculum. All
-    draws come from noises of their own, so that another part of a curriculum changes none of them.
-    Observation and info are those after the interventions; an intervention is no progress, so it
-    gives no reward, and the terms of the reward are those of the step. A reset that is refused is
-    no episode: the next one has its number.
+    What the caller of ``reset`` asks for in ``options["do"]`` counts more than the curriculum; both
+    are one intervention. All draws come from noises of their own, so that another part of a
+    curriculum changes none of them. Observation and info are those after the interventions; an
+    intervention gives no reward, and the terms of the reward are those of the step. A reset that is
+    refused is no episode: the next one has its number.
 
     Args:
         env: Of this package, in any wrappers that do not change what ``do`` means. Of those that
@@ -180,7 +155,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         super().__init__(env)
         self._inner = unwrapped_env(env, "CurriculumEnv")
         _refuse_forgetful(self._layers())
-        self._checked = is_checked(made, self._inner.world)
+        made.check(self._inner.world)
         self._turn = CurriculumRunner(made)
         self._begun = self._running = self._stepped = self._success = False
         self._next: tuple[int, Memory] | None = None
@@ -243,7 +218,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
     @property
     def turn(self) -> tuple[int, Memory] | None:
-        """What number the next episode has, and what is remembered then, if somebody said so."""
+        """The number of the next episode, and the memory then, if a vector environment set them."""
         return self._next
 
     @turn.setter
@@ -266,22 +241,25 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         given = reset_options(options, RESETS)
         self._close()
         if self._next is not None:
-            episode, memory = self._next
-            self._turn.memory = Memory(episode, memory.stages)
+            self._turn.memory = Memory(self._next[0], self._next[1].stages)
         elif given.get("episode") is not None:
-            self._turn.memory.episode = whole_number("episode", given["episode"], least=0)
-        if self._place is not None and seed is None:
+            self.memory.episode = whole_number("episode", given["episode"], least=0)
+        world, number = self._inner.world, 0
+        if seed is None and self._place is not None:
             seed, number = self._place
             given = {"episode": number, **given}
-        observation, info = self.env.reset(seed=seed, options=given)
-        if not self._checked:
-            self.curriculum.check(self._inner.world)
-            self._checked = True
-        if self._turn.begin(self._inner, besides=flatten(given.get("do") or {})):
-            observation, info = self._seen(info)
+        elif seed is None and world.has_begun:
+            number = world.episode + 1
+        elif seed is None:
+            seed = secrets.randbits(63)
+        noise = world.noise.seed if seed is None else whole_number("seed", seed, least=0)
+        if given.get("episode") is not None:
+            number = given["episode"]
+        mine = self._turn.begin(self._inner, noise, number, given.get("do"))
+        found = self.env.reset(seed=seed, options={**given, **mine})
         self._next = self._place = None
         self._begun = self._running = True
-        return observation, info
+        return found
 
     def _close(self) -> None:
         """Count the episode that ends."""
@@ -299,46 +277,30 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
         over, success = terminated or truncated, bool(info.get("is_success"))
-        self.stepped(self._inner.world.index, over=over, success=success)
-        if not over and self.act():
+        if self.stepped(self._inner.world.index, over=over, success=success) and self.act():
             terms = info["reward_terms"]  # of the step: an intervention earns nothing
-            observation, info = self._seen(info)
-            info["reward_terms"] = terms
+            observation, known = self._inner.present()
+            for layer in reversed([*self._layers()]):
+                if isinstance(layer, gymnasium.ObservationWrapper):
+                    observation = layer.observation(observation)
+            info = {**info, **known, "reward_terms": terms}
         return observation, reward, terminated, truncated, info
+
+    def rerun(self, actions: Iterable[Any]) -> None:
+        """Take the steps of an episode again, from its reset on."""
+        for action in actions:
+            self.step(action)
 
     def stepped(self, step: int, *, over: bool, success: bool) -> bool:
         """Note a control step; tell whether the curriculum may act after it."""
         self._stepped, self._success = True, success
         if over:
             self._close()
-        return not over and self._turn.may_act(step)
+        return not over and self._turn.stepped(self._inner, step)
 
     def act(self) -> bool:
         """Do what is due; tell whether that was anything."""
-        return self._turn.step(self._inner)
-
-    def _seen(self, info: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Look again, through the wrappers inside of this one."""
-        seen, known = self._inner.present()
-        for layer in reversed([*self._layers()]):
-            if isinstance(layer, gymnasium.ObservationWrapper):
-                seen = layer.observation(seen)
-        return seen, {**info, **known}
-
-
-def is_checked(curriculum: Curriculum, world: Simulation) -> bool:
-    """Look for what is wrong; tell whether all names are known already.
-
-    Raises:
-        InterventionError: The curriculum names something that does not exist.
-    """
-    try:
-        curriculum.check(world)
-    except UnknownVariable:
-        if not len(world.structures.head):
-            raise
-        return False
-    return True
+        return self._turn.act(self._inner)
 
 
 def place(given: Any) -> tuple[int, int] | None:
@@ -354,7 +316,7 @@ def place(given: Any) -> tuple[int, int] | None:
 
 
 def _plain(curriculum: Curriculum) -> Any:
-    """Give plain data from which it can be made, so that a specification can be written down."""
+    """Return plain data from which it can be made, so that a specification can be written down."""
     try:
         data = curriculum.as_dict()
         Curriculum.from_dict(data)
@@ -367,7 +329,7 @@ REMEMBER = ("DelayObservation", "NormalizeObservation")
 """Wrappers of Gymnasium that count how often they are asked."""
 
 
-def _refuse_forgetful(layers: Iterator[gymnasium.Wrapper[Any, Any, Any, Any]]) -> None:
+def _refuse_forgetful(layers: Iterable[gymnasium.Wrapper[Any, Any, Any, Any]]) -> None:
     """Refuse wrappers inside whose observations cannot be made again after an intervention."""
     for layer in layers:
         name = type(layer).__name__

@@ -277,7 +277,7 @@ class ServoSimulator:
         while found.rollouts < budget:
             held = self.at_rest(unit, {}, found)
             again = self.at_rest(unit, {}, found)
-            found.floor = max(found.floor, float(np.abs(again - held).max()))
+            found.see_unstable("", float(np.abs(again - held).max()))
             elsewhere = np.random.default_rng([self._setting.seed, unit]).uniform(-1, 1, len(held))
             for effect in range(len(held)):
                 others = [i for i in range(len(held)) if i != effect]
@@ -286,7 +286,8 @@ class ServoSimulator:
                 for cause in others:
                     moved = {**do, self._servos[cause]: float(elsewhere[cause])}
                     after = self.at_rest(unit, moved, found)[effect]
-                    found.see(self.names[cause], self.names[effect], 0, after, before)
+                    key = self.names[cause], self.names[effect], 0
+                    found.see(key, float(np.abs(after - before)))
             unit += 1
         return found
 

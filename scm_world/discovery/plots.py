@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import networkx as nx
@@ -12,7 +12,6 @@ from scm_world.discovery.names import Families
 from scm_world.discovery.run import DiscoveryReport
 from scm_world.output.canvas import FAINT, INK, blank, save
 from scm_world.output.remote import Location
-from scm_world.queries.agreement import FACTORS, Agreement
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.verification import Verification, arrow
 
@@ -158,51 +157,40 @@ def _key(marker: str, label: str, color: str, *, hollow: bool = False, size: flo
 
 # --- verifications ------------------------------------------------------------------------------
 
-SHADES = ("#1f6fb4", "#f28e2b", "#4c9a6a", "#9a6fb0")
-GOOD, BAD = "#4c9a6a", "#d62728"
-OUTCOMES = {"confirmed": GOOD, "not refuted": SHADES[1], "refuted": BAD}
+OUTCOMES = {"confirmed": "#4c9a6a", "not refuted": EXTRA, "refuted": MISSING}
 LISTED = 26  # lines of names that fit
 
 
-def draw_verification(found: Verification | Agreement, path: Location | str) -> None:
-    """Draw how soon edges fired, what is wrong, and the signs on two engines.
+def draw_verification(found: Verification, path: Location | str) -> None:
+    """Draw how soon edges fired, and what is wrong.
 
     Args:
-        found: A verification, or that of two engines.
+        found: A verification.
         path: Of the PNG, 1600 x 900 pixels.
     """
-    both = isinstance(found, Agreement)
-    reports = found.verifications if isinstance(found, Agreement) else (found,)
     figure = blank()
     title: Any = {"fontsize": 18, "weight": "bold"}
-    figure.text(0.02, 0.945, f"Verification of {reports[0].task}", color=INK, **title)
+    figure.text(0.02, 0.945, f"Verification of {found.task}", color=INK, **title)
     figure.text(0.98, 0.945, found.outcome, ha="right", color=OUTCOMES[found.outcome], **title)
-    words = "     ".join(
-        f"{one.backend} {one.versions.get(one.backend, '')}: floor {one.floor:g}, "
-        f"{len(one.undeclared)} undeclared, {len(one.never_fired)} never seen, "
-        f"{one.rollouts:,} rollouts"
-        for one in reports
+    words = (
+        f"{found.backend} {found.versions.get(found.backend, '')}: {len(found.undeclared)} "
+        f"undeclared, {len(found.never_fired)} never seen, {found.rollouts:,} rollouts"
     )
     figure.text(0.02, 0.9, words, fontsize=11, color=INK)
-    _coverage(figure.add_axes((0.055, 0.09, 0.36, 0.72)), reports)
-    if isinstance(found, Agreement):
-        _signs(figure.add_axes((0.46, 0.09, 0.27, 0.72)), found)
-    _names(figure, 0.765 if both else 0.47, found)
+    _coverage(figure.add_axes((0.055, 0.09, 0.36, 0.72)), found)
+    _names(figure, 0.47, found)
     save(figure, path)
 
 
-def _coverage(ax: Axes, reports: Iterable[Verification]) -> None:
+def _coverage(ax: Axes, found: Verification) -> None:
     """Draw the share of the declared edges that had fired after each probe state."""
     from matplotlib.ticker import MaxNLocator
 
-    lowest = 1.0
-    for found, shade in zip(reports, SHADES, strict=False):
-        declared = len(found.declared)
-        share = [count / declared if declared else 1.0 for count in found.coverage]
-        label = f"{found.backend}: {len(found.fired)} of {declared}"
-        numbers = range(1, len(share) + 1)
-        ax.step(numbers, share, where="mid", color=shade, lw=2.2, label=label, alpha=0.85)
-        lowest = min(lowest, *share)
+    declared = len(found.declared)
+    share = [count / declared if declared else 1.0 for count in found.coverage]
+    label = f"{found.backend}: {len(found.fired)} of {declared}"
+    ax.step(range(1, len(share) + 1), share, where="mid", color=MATCHED, lw=2.2, label=label)
+    lowest = min(1.0, *share)
     ax.axhline(1.0, color=FAINT, lw=1.0, zorder=0)
     ax.set_ylim(lowest - 0.08 * (1.02 - lowest) - 0.002, 1.0 + 0.06 * (1.02 - lowest))
     ax.yaxis.set_major_formatter(lambda y, _: f"{round(100 * y, 3):g} %" if y <= 1.0 else "")
@@ -213,22 +201,6 @@ def _coverage(ax: Axes, reports: Iterable[Verification]) -> None:
     _plain(ax)
 
 
-def _signs(ax: Axes, found: Agreement) -> None:
-    """Draw bars of equal signs: the clearer the effects, the further to the right."""
-    shares = [found.at(factor) for factor in FACTORS]
-    for number, share in enumerate(shares):
-        part = share.edges_equal / share.edges if share.edges else 0.0
-        ax.bar(number, part, color=GOOD, alpha=0.35 + 0.2 * number, width=0.7)
-        label = f"{100 * part:.1f} %\n{share.edges_equal}/{share.edges}" if share.edges else "none"
-        ax.text(number, part + 0.015, label, ha="center", fontsize=9, color=INK)
-    ax.set_ylim(0.0, 1.12)
-    ax.set_xticks(range(len(shares)), [f"> {share.factor:g}" for share in shares])
-    ax.set_yticks([])
-    ax.set_title(f"same sign on {' and '.join(found.backends)}", loc="left", fontsize=13, color=INK)
-    ax.set_xlabel("effect / what the engines differ by anyway", fontsize=11, color=INK)
-    _plain(ax)
-
-
 def _plain(ax: Axes) -> None:
     ax.tick_params(colors=INK)
     for side, spine in ax.spines.items():
@@ -236,21 +208,11 @@ def _plain(ax: Axes) -> None:
         spine.set_color(FAINT)
 
 
-def _wrong(found: Verification | Agreement) -> Iterator[tuple[str, tuple[EdgeKey, ...]]]:
-    if isinstance(found, Agreement):
-        for report in found.verifications:
-            yield from _wrong(report)
-        yield "sign not the same", found.opposite
-        return
-    yield f"{found.backend}, never seen", found.never_fired
-    yield f"{found.backend}, undeclared", tuple(edge.key for edge in found.undeclared)
-    yield f"{found.backend}, color moves something", found.colors
-
-
-def _names(figure: Figure, left: float, found: Verification | Agreement) -> None:
+def _names(figure: Figure, left: float, found: Verification) -> None:
     """Name the edges with which something is wrong."""
     lines: list[tuple[str, str]] = []
-    for title, edges in _wrong(found):
+    undeclared = tuple(edge.key for edge in found.undeclared)
+    for title, edges in (("never seen", found.never_fired), ("undeclared", undeclared)):
         if edges:
             lines.append((f"{title}: {len(edges)}", "bold"))
             for edge in edges:

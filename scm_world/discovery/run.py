@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, final
 
@@ -16,9 +16,8 @@ from scm_world.graph import SCM
 from scm_world.output.durable import made, removed, write_durably, write_whole
 from scm_world.output.reading import read_text
 from scm_world.output.remote import Location, located
-from scm_world.queries.experiments.effects import EdgeKey, Effects, Series
-from scm_world.queries.experiments.models import PairedEquations
-from scm_world.queries.experiments.paired import Paired
+from scm_world.queries.experiments.effects import EdgeKey, Effects, series
+from scm_world.queries.experiments.paired import REMEMBERED, Paired
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
@@ -26,7 +25,7 @@ from scm_world.queries.verification import Outcome, by_provenance, counted, outc
 from scm_world.world import Simulation
 
 REPORT = "scm_world/discovery/1"
-CHECKPOINT = "scm_world/discovery-progress/3"
+CHECKPOINT = "scm_world/discovery-progress/4"
 
 
 @final
@@ -44,7 +43,7 @@ class DiscoveryReport:
         rollouts: Control steps simulated in an experiment of their own.
         bound: Fewest of them that find a graph without prior knowledge: one for each variable that
             can be set, in each probe state.
-        floor: Largest difference after something was done and undone.
+        floor: Largest difference between two runs without a change.
         threshold: An effect must exceed it.
         inert: Largest effect among the pairs that are no edge in the estimated graph.
         score: The comparison.
@@ -148,8 +147,8 @@ def discover(
 ) -> DiscoveryReport:
     """Recover a causal graph by paired single-target interventions, and score it.
 
-    The threshold follows from the measured floor: the largest difference that is left after
-    something was done and undone. It may be interrupted (Ctrl-C); the report then covers the
+    The threshold follows from the measured floor: the largest difference between two runs without
+    a change. It may be interrupted (Ctrl-C); the report then covers the
     probe states that were finished. A world that was given is afterwards as it was.
 
     Args:
@@ -178,60 +177,78 @@ def discover(
     whole_number("number of probes", probes, least=1)
     started = time.perf_counter()
     if isinstance(system, SCM):
-        series = Series(PairedEquations(system, seed), probes, progress)
-        series.run(range(probes), _shown(system, found))
-        return _report(system, series, seed, ("model", "none", "none", ""), started)
+        return _discovered(system, probes, seed, progress, found, checkpoint, started)
     world = Simulation(system, **options) if isinstance(system, str) else system
     try:
         with world.unchanged():
-            series = _experiments(world, probes, seed, progress, found, checkpoint)
-        backend = world.backend
-        about = (world.task.name, backend.name, world.options.preset)
-        engine = f"{backend.name} {backend.version}"
-        return _report(world.model, series, seed, (*about, engine), started)
+            return _discovered(world, probes, seed, progress, found, checkpoint, started)
     finally:
         if isinstance(system, str):
             world.close()
 
 
-def _experiments(
-    world: Simulation,
+def _discovered(
+    system: Simulation | SCM,
     probes: int,
     seed: int,
     progress: Progress | None,
     found: Callable[[set[EdgeKey]], object] | None,
     path: Location | str | None,
-) -> Series:
-    paired = Paired(world, seed)
-    saved = None if path is None else Checkpoint(path, _terms(world, seed))
-    first = 0 if saved is None else min(saved.read(paired), probes)
-    series = Series(paired, probes, progress, done=first)
-    show = _shown(world.model, found)
-
-    def written(effects: Effects, done: int) -> bool:
-        show(effects, done)
-        if saved is not None:
-            saved.write(effects, done, paired)
-        return False
-
-    series.run(probe_states(world, probes, seed, first=first), written)
-    if saved is not None and series.done == probes:
-        saved.end()
-    return series
-
-
-def _shown(
-    model: SCM, found: Callable[[set[EdgeKey]], object] | None
-) -> Callable[[Effects, int], bool]:
-    """Return what passes the edges on that have been found; it ends no series."""
+    started: float,
+) -> DiscoveryReport:
+    model = system if isinstance(system, SCM) else system.model
     declared = {edge.key for edge in model.edges}
+    paired = Paired(system, seed)
+    effects, first, saved = Effects(exact=paired.exact), 0, None
+    if path is not None and isinstance(system, Simulation):
+        saved = Checkpoint(path, _terms(system, seed))
+        first = min(saved.read(effects), probes)
+    states = probe_states(system, probes, seed, first=max(0, first - REMEMBERED))
 
-    def show(effects: Effects, done: int) -> bool:
+    def experiments() -> Iterator[Effects]:
+        for number, probe in enumerate(states, max(0, first - REMEMBERED)):
+            if number < first:  # what it lends to later ones is not in the file
+                paired.look(number, probe)
+            else:
+                yield paired.run(number, probe)
+
+    def finished(done: int) -> bool:
         if found is not None:
             found(effects.edges(declared))
+        if saved is not None:
+            saved.write(effects, done)
         return False
 
-    return show
+    done, _ = series(experiments(), effects, probes, finished, progress, done=first)
+    if saved is not None and done == probes:
+        saved.end()
+    edges = effects.edges(declared)
+    inert = [size for key, size in effects.largest.items() if key not in edges]
+    task, backend, preset, engine = "model", "none", "none", ""
+    if isinstance(system, Simulation):
+        task, backend, engine = system.task.name, system.backend.name, system.engine
+        preset = system.options.preset
+    return DiscoveryReport(
+        task=task,
+        backend=backend,
+        preset=preset,
+        seed=seed,
+        probes=done,
+        planned=probes,
+        rollouts=effects.rollouts,
+        bound=done * sum(effects.changed[name] > 0 for name in paired.targets),
+        floor=effects.floor,
+        threshold=effects.threshold,
+        inert=max(inert, default=0.0),
+        score=score(edges, declared),
+        provenance=by_provenance(model, declared, edges, edges - declared),
+        found=tuple(sorted(edges)),
+        declared=tuple(sorted(declared)),
+        effects={key: effects.largest[key] for key in edges},
+        refused=dict(effects.refused),
+        seconds=time.perf_counter() - started,
+        versions=versions(engine),
+    )
 
 
 def _terms(world: Simulation, seed: int) -> dict[str, Any]:
@@ -247,36 +264,6 @@ def _terms(world: Simulation, seed: int) -> dict[str, Any]:
     }
 
 
-def _report(
-    model: SCM, series: Series, seed: int, about: tuple[str, str, str, str], started: float
-) -> DiscoveryReport:
-    effects, declared = series.effects, {edge.key for edge in model.edges}
-    found = effects.edges(declared)
-    inert = [size for key, size in effects.largest.items() if key not in found]
-    task, backend, preset, engine = about
-    return DiscoveryReport(
-        task=task,
-        backend=backend,
-        preset=preset,
-        seed=seed,
-        probes=series.done,
-        planned=series.planned,
-        rollouts=effects.rollouts,
-        bound=series.done * sum(effects.changed[name] > 0 for name in series.targets),
-        floor=effects.floor,
-        threshold=effects.threshold,
-        inert=max(inert, default=0.0),
-        score=score(found, declared),
-        provenance=by_provenance(model, declared, found, found - declared),
-        found=tuple(sorted(found)),
-        declared=tuple(sorted(declared)),
-        effects={key: effects.largest[key] for key in found},
-        refused=effects.refused,
-        seconds=time.perf_counter() - started,
-        versions=versions(engine),
-    )
-
-
 @final
 class Checkpoint:
     """A file that is written after each probe state, whole or not at all.
@@ -290,8 +277,8 @@ class Checkpoint:
         self._path = located(path)
         self._terms = json.loads(json.dumps(terms))
 
-    def read(self, paired: Paired) -> int:
-        """Resume from the file, and return how many probe states are finished.
+    def read(self, effects: Effects) -> int:
+        """Add what the file has to the effects, and return how many probe states are finished.
 
         Raises:
             UnreadableFile: It is damaged, or of another discovery.
@@ -303,16 +290,14 @@ class Checkpoint:
             if data["terms"] != self._terms:
                 other = [key for key, value in self._terms.items() if data["terms"][key] != value]
                 raise ValueError(f"it is of another discovery: {', '.join(other)} differ")
-            effects = Effects(
+            kept = Effects(
                 largest={(str(c), str(e), int(lag)): float(x) for c, e, lag, x in data["largest"]},
-                states={(str(c), str(e), int(lag)): int(n) for c, e, lag, n in data["states"]},
-                floor=float(data["floor"]),
-                exact=paired.effects.exact,
+                unstable={str(name): float(size) for name, size in data["unstable"].items()},
                 changed=Counter({str(name): int(n) for name, n in data["changed"].items()}),
                 rollouts=int(data["rollouts"]),
-                refused={str(name): int(n) for name, n in data["refused"].items()},
+                refused=Counter({str(name): int(n) for name, n in data["refused"].items()}),
             )
-            paired.remember(effects, data["memory"])
+            effects.add(kept)
             return int(data["done"])
         except FileNotFoundError:
             return 0
@@ -320,19 +305,17 @@ class Checkpoint:
             advice = "delete it to begin anew, or give another folder"
             raise UnreadableFile(str(self._path), str(error), advice) from None
 
-    def write(self, effects: Effects, done: int, paired: Paired) -> None:
+    def write(self, effects: Effects, done: int) -> None:
         """Write the results of the probe states that are finished."""
         data = {
             "format": CHECKPOINT,
             "terms": self._terms,
             "done": done,
             "largest": [[*key, size] for key, size in effects.largest.items()],
-            "states": [[*key, count] for key, count in effects.states.items()],
-            "floor": effects.floor,
+            "unstable": effects.unstable,
             "changed": effects.changed,
             "rollouts": effects.rollouts,
             "refused": effects.refused,
-            "memory": paired.memory(),
         }
         made(self._path.parent)
         write_durably(self._path, json.dumps(data).encode())

@@ -2,9 +2,9 @@
 
 import gymnasium
 
-from scm_world.env.batched import ScmWorldVectorEnv
 from scm_world.env.environment import ScmWorldEnv
-from scm_world.env.models import MODEL_ID, model_env, model_vector_env
+from scm_world.env.many import ScmWorldVectorEnv
+from scm_world.env.models import MODEL_ID, model_env, model_vector_env, vector_env
 from scm_world.env.observer import CONTEXTS, MODES, Observation
 from scm_world.env.wrappers import MovingAverageAction
 
@@ -26,4 +26,5 @@ __all__ = [
     "ScmWorldVectorEnv",
     "model_env",
     "model_vector_env",
+    "vector_env",
 ]

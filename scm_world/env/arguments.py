@@ -13,28 +13,25 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from scm_world._arguments import one_of, real_numbers
-from scm_world._types import Floats
+from scm_world._types import Floats, Values
 from scm_world.errors import ActionError, Infeasible, InterventionError, UnknownOption
-from scm_world.graph import flatten
+from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.tasks import Task, make_task
 from scm_world.variables import Draw, Null
 from scm_world.variables.kinds import SPACES, SpaceName
+from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.structures import StructureCache
 
 Init = TypeVar("Init", bound=Callable[..., None])
 
-RESETS = ("do", "episode")
+RESETS = ("do", "episode", "space")
 """Options of a reset."""
 
 
 def refuse_unknown(given: Iterable[str], *known: Callable[..., Any]) -> None:
-    """Refuse keywords that none of some functions takes, with the nearest one that there is.
-
-    Raises:
-        UnknownOption: There is one.
-    """
+    """Refuse keywords that none of some functions takes, with the nearest one that there is."""
     names = dict.fromkeys(name for one in known for name in signature(one).parameters)
     choices = [name for name in names if name not in ("self", "options", "member")]
     for name in given:
@@ -54,11 +51,7 @@ def known_options(init: Init) -> Init:
 
 
 def reset_options(options: Any, known: Iterable[str]) -> dict[str, Any]:
-    """Read the options of a reset, by name.
-
-    Raises:
-        UnknownOption: They are no dictionary, or there is no such option.
-    """
+    """Read the options of a reset, by name."""
     given = {} if options is None else options
     if not isinstance(given, Mapping):
         raise UnknownOption("options of a reset", options, ("a dictionary", *known))
@@ -80,15 +73,7 @@ def finite(size: int) -> str:
 
 
 def doubles(action: Any, size: int) -> Floats:
-    """Read an action, or several.
-
-    Args:
-        action: What was given.
-        size: How many numbers it should be, for the message.
-
-    Raises:
-        ActionError: It is no real numbers.
-    """
+    """Read an action, or several."""
     try:
         return real_numbers(action)
     except (TypeError, ValueError):
@@ -107,11 +92,7 @@ def action_scale(world: Simulation) -> tuple[Floats, Floats]:
 
 
 def names_of(option: str, given: Sequence[str]) -> tuple[str, ...]:
-    """Read a list of names.
-
-    Raises:
-        UnknownOption: It is one text.
-    """
+    """Read a list of names."""
     if isinstance(given, str):
         raise UnknownOption(option, given, (f"a list of names, such as [{given!r}]",))
     return tuple(given)
@@ -120,11 +101,7 @@ def names_of(option: str, given: Sequence[str]) -> tuple[str, ...]:
 def made_task(
     task: Task | StructureCache | str, options: Mapping[str, Any] | None
 ) -> Task | StructureCache:
-    """Make a task of a name, with its options; or take one, or its structures.
-
-    Raises:
-        UnknownOption: There are options for a task that is made.
-    """
+    """Make a task of a name, with its options; or take one, or its structures."""
     if isinstance(task, str):
         return make_task(task, **(options or {}))
     if options:
@@ -160,25 +137,14 @@ def begin(
     acts: Mapping[str, Any],
     attempts: int,
     episode: int | None = None,
+    space: AnyRegion | None = None,
 ) -> None:
-    """Reset a world, with an intervention that may draw something impossible.
-
-    Args:
-        world: To reset.
-        seed: Of the noise.
-        acts: What is done at the reset.
-        attempts: How often bodies may be drawn into one place until that is an error. Every
-            attempt is the beginning of the next episode, so it draws again.
-        episode: Number of the first one within the noise.
-
-    Raises:
-        InterventionError: The intervention was refused, at the last attempt.
-    """
+    """Reset a world, with an intervention that may draw something impossible."""
     if episode is not None and seed is None:
         seed = world.noise.seed
     for left in reversed(range(attempts)):
         try:
-            world.reset(seed=seed, episode=episode or 0, do=acts)
+            world.reset(seed=seed, episode=episode or 0, do=acts, space=space)
         except Infeasible:
             if not left:
                 raise
@@ -190,13 +156,7 @@ def begin(
 def warn_of_changes(
     structure: CompiledTask, start: Mapping[str, Any], goals: SpaceName | None
 ) -> None:
-    """Warn where episodes draw which bodies there are: what is observed has several shapes then.
-
-    Args:
-        structure: Of the first episode.
-        start: What is done at every reset.
-        goals: The space of random goals, if there are some.
-    """
+    """Warn where episodes draw which bodies there are: what is observed has several shapes then."""
     goal = {} if goals is None else structure.task.sample_goal(goals)
     deciding = structure.task.decided_by
     drawn = [name for name in deciding if isinstance({**goal, **start}.get(name), Draw)]
@@ -209,13 +169,21 @@ def warn_of_changes(
 
 def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledTask:
     """Give the structure in which an episode begins after an intervention at its reset."""
-    family = world.structures
+    family, key = world.structures, world.noise_key(0)
+    found = structure_after(family, acts, family.head, family.head.solve(), key)
+    return found or family.natural(None)
+
+
+def structure_after(
+    structures: StructureCache, acts: Mapping[str, Any], held: SCM, static: Values, key: NoiseKey
+) -> CompiledTask | None:
+    """Return the structure after an intervention; None where it decides nothing of that."""
     mine: dict[str, Any] = {}
     for name, value in acts.items():
-        if name in family.head:
+        if name in structures.head:
             try:
-                mine[name] = family.head.accept(name, value)
-            except InterventionError:  # the reset will say so
+                mine[name] = structures.head.accept(name, value)
+            except InterventionError:  # the intervention will be refused
                 continue
-    found = family.after(mine, family.head, family.head.solve(), world.noise_key(0))
-    return family.natural(None) if found is None else family.compiled(found)
+    found = structures.after(mine, held, static, key)
+    return None if found is None else structures.compiled(found)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Self, final
+from typing import Any, final
 
 from gymnasium.utils import EzPickle
 
@@ -19,10 +19,12 @@ class EnvSnapshot:
     Attributes:
         world: Of its world.
         interventions: What was done so far.
+        ended: Whether the episode is over and the next one begins with the next step of a batch.
     """
 
     world: WorldSnapshot
     interventions: tuple[tuple[int, dict[str, Any]], ...]
+    ended: bool = False
 
 
 class Copied(EzPickle):
@@ -58,13 +60,6 @@ class Copied(EzPickle):
             raise SnapshotMismatch(f"{snapshot!r} is no snapshot; give what snapshot() returned")
         self.world.restore(snapshot.world)
         self._done = list(snapshot.interventions)
-
-    def sibling(self) -> Self:
-        """Make another environment with the same arguments; they share what is declared."""
-        given = self._ezpickle_kwargs
-        made = type(self)(**{**given, "task": self.world.structures, "task_options": None})
-        made._ezpickle_kwargs = given
-        return made
 
     def __getstate__(self) -> dict[str, Any]:
         """Give the arguments, a snapshot of the world, and Gymnasium's generator."""

@@ -25,11 +25,7 @@ ORIGINS = (COMMAND, MEASURED)
 
 
 def checked_mode(mode: Any, task: Task | StructureCache) -> str:
-    """Check what actions should mean; None stands for the first mode of the task.
-
-    Raises:
-        UnknownOption: The task has no such mode, neither by itself nor after ``"delta_"``.
-    """
+    """Check what actions should mean; None stands for the first mode of the task."""
     given = task.task if isinstance(task, StructureCache) else task
     modes: tuple[str, ...] = given.choices["action_mode"]
     allowed = (*modes, *(PREFIX + one for one in modes))
@@ -58,10 +54,6 @@ class Delta:
 
     Attributes:
         reads: The variable that actions are relative to; None if that is the last command.
-
-    Raises:
-        UnknownOption: The scale is not in (0, 1], there is no such origin, or torques should be
-            relative to what is measured.
     """
 
     def __init__(

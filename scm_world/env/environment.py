@@ -31,7 +31,6 @@ from scm_world.env.arguments import (
 from scm_world.env.copies import Copied
 from scm_world.env.delta import COMMAND, PREFIX, Delta, checked_mode
 from scm_world.env.observer import (
-    STACKS,
     Goals,
     Observation,
     Observer,
@@ -43,7 +42,7 @@ from scm_world.env.observer import (
 from scm_world.env.rendering import Looks, Window
 from scm_world.env.vector import Vector, box
 from scm_world.errors import ActionError, ModelError, UnknownOption
-from scm_world.geometry.clipping import scaled_clip_kernel
+from scm_world.geometry.numbers import scaled_clip_kernel
 from scm_world.graph import flatten
 from scm_world.models.camera import Camera
 from scm_world.tasks import Task
@@ -52,7 +51,7 @@ from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Simulation
 from scm_world.world.compiled_task import CompiledTask
-from scm_world.world.plan import merged
+from scm_world.world.interventions import merged
 
 RENDER_MODES = ("rgb_array", "human")
 SINGLE = np.dtype(np.float32)
@@ -108,8 +107,6 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         cameras: Names (``"60"``, ``"120"``, ``"300"``, ``"overview"``) or cameras, for
             ``"pixel"``; the three of the robot if None.
         image_size: Height and width of pictures, or both in one [pixels].
-        stack: Of the pictures of ``"pixel"``: ``"cameras"``: one after another, shape
-            (2 n, 3, h, w); ``"channels"``: as convolutional networks take them, (6 n, h, w).
         normalize_observations: Give numbers in [-1, 1] instead of SI units.
         goal_env: Give a dictionary with ``observation``, ``achieved_goal``, ``desired_goal``, and
             have a method ``compute_reward``: see ``GoalReward``.
@@ -171,7 +168,6 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         pad: Mapping[str, Any] | None = None,
         cameras: Sequence[str | Camera] | None = None,
         image_size: int | tuple[int, int] | None = None,
-        stack: str = STACKS[0],
         normalize_observations: bool = True,
         goal_env: bool = False,
         start: Mapping[str, Any] | None = None,
@@ -194,7 +190,6 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             keypoints=keypoints,
             cameras=cameras,
             image_size=image_size,
-            stack=stack,
             normalize=normalize_observations,
             goals=goal_env,
             pad=pad,
@@ -306,11 +301,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         return self._delta.toward(self._read(command))
 
     def _read(self, action: ArrayLike) -> Any:
-        """Read an action or a command, shape (n,); 32-bit numbers stay what they are.
-
-        Raises:
-            ActionError: It has another shape, or is no real numbers.
-        """
+        """Read an action or a command, shape (n,); 32-bit numbers stay what they are."""
         given: Any = action
         if getattr(action, "dtype", None) is not SINGLE:
             given = doubles(action, self._given.size)
@@ -360,6 +351,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             options: ``{"do": {…}}``: an intervention that holds for the whole episode. Where it
                 sets what ``start`` or a random goal sets too, it counts. ``{"episode": n}``: the
                 number of the episode within the noise; the next one if not given, 0 with a seed.
+                ``{"space": …}``: the space in which every target must lie.
 
         Raises:
             UnknownOption: Another key.
@@ -368,9 +360,9 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         """
         super().reset(seed=None if seed is None else whole_number("seed", seed, least=0))
         asked_for = reset_options(options, RESETS)
-        request = self._acts(asked_for.get("do"))
-        number = asked_for.get("episode")
-        begin(self.world, seed, request, self._attempts, number)
+        request = self.beginning(asked_for.get("do"))
+        number, space = asked_for.get("episode"), asked_for.get("space")
+        begin(self.world, seed, request, self._attempts, number, space)
         self._done = [(0, request)] if request else []
         now = self._look()
         for name in self._terms:
@@ -379,8 +371,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             self._window.show(self.world.scene())
         return self._observer.observe(now), self._info(now)
 
-    def _acts(self, do: Mapping[str, Any] | None) -> dict[str, Any]:
-        """Put together what is done at a reset."""
+    def beginning(self, do: Mapping[str, Any] | None) -> dict[str, Any]:
+        """Return all that is done at a reset: goal, ``start``, and what the caller asks for."""
         mine = asked(do)
         if not (self._start or self._random_goal):
             return mine
@@ -476,6 +468,16 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         for name in self._terms:
             terms[name] = float(now[name])
         return info
+
+    @property
+    def info_shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shape of each entry of ``info``, without ``reward_terms``, which is a dictionary."""
+        goals = () if self._goals is None else self._goals.spaces.items()
+        return {
+            **({"is_success": (), "success": ()} if SUCCESS in self._counted else {}),
+            **({"fractional_success": ()} if FRACTION in self._counted else {}),
+            **{name: space.shape or () for name, space in goals},
+        }
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene, shape (h, w, 3); None without ``render_mode="rgb_array"``.

@@ -1,15 +1,21 @@
-"""``scm_world/Model-v0``: an environment of any model, from a file or a custom task."""
+"""What Gymnasium's registry makes: many environments, and those of any model or custom task."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import multiprocessing
+from collections.abc import Callable, Mapping, Sequence
 from inspect import signature
 from typing import Any
 
-from scm_world.env.batched import ScmWorldVectorEnv
+from scm_world._arguments import whole_number
+from scm_world.env.arguments import refuse_unknown
 from scm_world.env.environment import ScmWorldEnv
+from scm_world.env.many import ScmWorldVectorEnv
+from scm_world.env.native import NativeVectorEnv
+from scm_world.env.processes import ProcessVectorEnv
 from scm_world.errors import UnknownOption
 from scm_world.tasks import ModelTask, Task
+from scm_world.work.processes import cores
 from scm_world.world.structures import as_task
 
 MODEL_ID = "scm_world/Model-v0"
@@ -19,9 +25,53 @@ OF_TASK = ModelTask.options()
 
 OF_ENV = tuple(name for name in signature(ScmWorldEnv).parameters if name != "task")
 
-OF_VECTOR = tuple(
-    name for name in signature(ScmWorldVectorEnv).parameters if name not in ("num_envs", "options")
-)
+OF_VECTOR = ("workers", *(n for n in signature(NativeVectorEnv).parameters if n != "num_envs"))
+
+
+def vector_env(
+    num_envs: int = 1,
+    *,
+    workers: int | None = None,
+    threads: int | None = None,
+    member: Callable[..., Any] = ScmWorldEnv,
+    **options: Any,
+) -> ScmWorldVectorEnv:
+    """Make many environments, the fastest way that there is.
+
+    Args:
+        num_envs: How many.
+        workers: How many are simulated at the same time, each in a process of its own; 1: all in
+            this process. As many as there are cores for Bullet if None, else 1; a process of a
+            pool starts none.
+        threads: Of a backend that steps many worlds in one call; as many as there are cores if
+            None.
+        member: Makes one of them from the options.
+        options: Of ``ScmWorldVectorEnv`` and ``ScmWorldEnv``.
+
+    Raises:
+        UnknownOption: An option does not exist, or does not go with the others.
+
+    Example:
+        >>> envs = vector_env(3, task="pushing", backend="fake")
+        >>> observations, infos = envs.reset(seed=0)
+        >>> print(envs.do({1: {"floor_friction": 0.4}})[1])
+        floor_friction = 0.4, engine reports 0.4
+        >>> envs.step(envs.action_space.sample())[0].shape
+        (3, 56)
+        >>> envs.close()
+    """
+    if member is ScmWorldEnv:
+        refuse_unknown(options, ScmWorldEnv, NativeVectorEnv, vector_env)
+    count = whole_number("num_envs", num_envs, least=1)
+    backend = options.get("backend") or getattr(options.get("task"), "backend", Task.backend)
+    if workers is None:
+        is_single = backend != "bullet" or multiprocessing.current_process().daemon
+        workers = 1 if is_single or threads is not None else cores()
+    if min(whole_number("workers", workers, least=1), count) == 1:
+        return NativeVectorEnv(count, threads=threads, member=member, **options)
+    if threads is not None:
+        raise UnknownOption("threads", threads, ("None with workers", "any with workers=1"))
+    return ProcessVectorEnv(count, workers=workers, member=member, **options)
 
 
 def model_env(model: Any = None, **options: Any) -> ScmWorldEnv:
@@ -61,7 +111,7 @@ def model_vector_env(num_envs: int = 1, model: Any = None, **options: Any) -> Sc
     Args:
         num_envs: How many.
         model: As in ``model_env``.
-        options: As in ``model_env``, and those of ``ScmWorldVectorEnv``.
+        options: As in ``model_env``, and those of ``vector_env``.
 
     Raises:
         UnknownOption: As in ``model_env``.
@@ -69,7 +119,7 @@ def model_vector_env(num_envs: int = 1, model: Any = None, **options: Any) -> Sc
     """
     of_vector = {name: options.pop(name) for name in OF_VECTOR if name in options}
     task, of_env = _split(model, options, OF_VECTOR)
-    return ScmWorldVectorEnv(num_envs, task=task, **of_vector, **of_env)
+    return vector_env(num_envs, task=task, **of_vector, **of_env)
 
 
 def _split(

@@ -36,9 +36,6 @@ from scm_world.world.mechanisms import places
 BOUND = 10.0
 """Goals that saturate are positions [m], sizes [m] and unit quaternions; beyond they saturate."""
 
-STACKS = ("cameras", "channels")
-"""How the pictures of several cameras are put together."""
-
 
 @final
 class Goals:
@@ -85,12 +82,6 @@ def goal_reward(world: Simulation) -> Callable[[ArrayLike, ArrayLike, Any], Any]
 
     With ``weights="sparse"``, or where only ``fractional_success`` and ``success`` have weights,
     it is the reward of the step. Else the first call warns: goals do not decide dense terms.
-
-    Args:
-        world: Whose task, weights and conventions hold.
-
-    Raises:
-        UnknownOption: The reward is no weighted sum of terms.
     """
     reward: Any = world.model.declared("reward")
     if not isinstance(reward.mechanism, Linear):
@@ -109,9 +100,6 @@ def goal_reward(world: Simulation) -> Callable[[ArrayLike, ArrayLike, Any], Any]
         Returns:
             The weighted sum of the terms that goals alone decide, shape (...); times the control
             period under the conventions that say so.
-
-        Raises:
-            UnknownOption: They are no finite numbers, or have other shapes.
         """
         nonlocal warned
         size = Goals(world.compiled).size
@@ -177,11 +165,7 @@ class Observer(Protocol):
 @final
 @dataclass(frozen=True)
 class Observing:
-    """How a world is observed; see ``ScmWorldEnv`` for the fields.
-
-    Raises:
-        UnknownOption: Something does not exist, or does not go together.
-    """
+    """How a world is observed; see ``ScmWorldEnv`` for the fields."""
 
     mode: str = "structured"
     names: Sequence[str] = ()
@@ -190,7 +174,6 @@ class Observing:
     keypoints: bool | str = False
     cameras: Sequence[str | Camera] | None = None
     image_size: int | tuple[int, int] | None = None
-    stack: str = STACKS[0]
     normalize: bool = True
     goals: bool = False
     pad: Mapping[str, Any] | None = None
@@ -205,15 +188,14 @@ class Observing:
         appended = self.include or self.keypoints or self.context == "observation"
         if pictures and appended:
             raise UnknownOption("appendix of a picture", "numbers", ("context='privileged'",))
-        one_of("stack", self.stack, STACKS)
         if self.keypoints not in (False, True, "view"):
             raise UnknownOption("keypoints", self.keypoints, ("False", "True", "view"))
         if self.pad is not None and (pictures or self.keypoints):
             raise UnknownOption("pad", self.pad, ("None with pictures and keypoints",))
-        for option, usual in (("cameras", None), ("image_size", None), ("stack", STACKS[0])):
+        for option in ("cameras", "image_size"):
             value = getattr(self, option)
-            if value != usual and not pictures:
-                allowed = ("any with observation_mode='pixel'", f"{usual} in the other modes")
+            if value is not None and not pictures:
+                allowed = ("any with observation_mode='pixel'", "None in the other modes")
                 raise UnknownOption(option, value, allowed)
 
 
@@ -251,20 +233,7 @@ def observer(
     goals: Goals | None,
     largest: CompiledTask,
 ) -> Observer:
-    """Put together what is asked for.
-
-    Args:
-        world: That is observed.
-        declaration: Of the structure; the observer holds for that one only.
-        how: What is asked for.
-        goals: Of the structure, if it has some.
-        largest: The structure whose layout the vectors have; the same one without padding.
-
-    Raises:
-        UnknownOption: The task has no boxes or no goals, or there is no such camera.
-        InterventionError: The structure has bodies that the largest one does not have.
-        UnknownVariable: There is no such variable.
-    """
+    """Put together what is asked for."""
     main: Observer
     if how.goals and goals is None:
         raise UnknownOption("goal_env", True, (f"False: {declaration.task.name} has no goals",))
@@ -274,7 +243,7 @@ def observer(
     if how.mode == "pixel":
         from scm_world.env.pixels import Pixels
 
-        main = Pixels(world, how.cameras, how.image_size, how.stack)
+        main = Pixels(world, how.cameras, how.image_size)
     else:
         main = _vector(world, declaration, how, largest)
     parts: dict[str, Observer] = {"observation": main}

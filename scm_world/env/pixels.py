@@ -12,15 +12,13 @@ from numpy.typing import NDArray
 
 from scm_world._types import Values
 from scm_world.backends.renderer import (
-    ORIGINAL,
-    PLAIN,
     camera_pixels,
     following_camera,
     scene_camera,
+    shape_of_pixels,
     shapes_of,
     views_of,
 )
-from scm_world.env.observer import STACKS
 from scm_world.env.vector import Layouts
 from scm_world.errors import UnknownOption
 from scm_world.models import Scene
@@ -68,11 +66,7 @@ def read_camera(camera: Any, known: Mapping[str, Camera] | None) -> Any:
 
 
 def height_and_width(option: str, size: Any) -> tuple[int, int]:
-    """Read the size of pictures: height and width, or both in one [pixels].
-
-    Raises:
-        UnknownOption: It is something else.
-    """
+    """Read the size of pictures: height and width, or both in one [pixels]."""
     numbers = np.asarray(size)
     if numbers.shape not in ((), (2,)) or not np.issubdtype(numbers.dtype, np.integer):
         raise UnknownOption(option, size, ("a whole number", "(height, width)"))
@@ -91,19 +85,12 @@ class Pixels:
             where they stand now.
         size: Height and width of the pictures, or both in one [pixels]; if None those of the
             cameras, or of a model 128.
-        stack: ``"cameras"``: pictures one after another; ``"channels"``: their channels, as
-            convolutional networks take them.
 
     Attributes:
         names: The variables that have to be computed: none.
         layouts: Where variables stand in vectors: there are none.
         space: uint8, shape (n, 3, h, w), with goals (2 n, 3, h, w); under the predecessor's
-            conventions (2 n, h, w, 3). With ``stack="channels"`` all channels of the first
-            picture, then those of the next ones: (6 n, h, w), or (h, w, 6 n).
-
-    Raises:
-        UnknownOption: There is no such camera, or the sizes are none or differ.
-        ModelError: The world has no shapes.
+            conventions (2 n, h, w, 3).
     """
 
     names: tuple[str, ...] = ()
@@ -113,7 +100,6 @@ class Pixels:
         world: Simulation,
         cameras: Sequence[str | Camera] | None,
         size: Size | None,
-        stack: str = STACKS[0],
     ) -> None:
         views, published = views_of(world.structure), world.conventions.published
         self._world, self._shows_goals = world, views is not None
@@ -138,35 +124,25 @@ class Pixels:
         self._follows = [not published and isinstance(c, str) and c in usual for c in given]
         self._cameras = _sized(found, size)
         self.layouts: Layouts = {}
-        self._convention = ORIGINAL if published else PLAIN
-        one, n = self._convention.shape(self._cameras[0]), len(given)
+        self._published = published
+        one, n = shape_of_pixels(self._cameras[0], published=published), len(given)
         self._goals: NDArray[np.uint8] = np.empty((n, *one), dtype=np.uint8)
         self._shape = (2 * n if self._shows_goals else n, *one)
-        self._stacks = stack == "channels"
-        shown = self._stacked(np.empty(self._shape, dtype=np.uint8)).shape
         self.space: gymnasium.Space[NDArray[np.uint8]] = gymnasium.spaces.Box(
-            0, 255, shown, np.uint8
+            0, 255, self._shape, np.uint8
         )
         self._version = -1
-
-    def _stacked(self, pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Put the channels of all pictures together, if that is asked for."""
-        if not self._stacks:
-            return pictures
-        if self._convention.channels_last:
-            return np.concatenate(pictures, axis=-1)
-        return pictures.reshape(-1, *self._shape[2:])
 
     def observe(self, now: Values) -> NDArray[np.uint8]:
         """Draw; pictures of the goals are kept until someone intervenes."""
         scene = self._world.describe(*self._world.current())  # drawn immediately: no copies
-        layout, n = self._convention, len(self._cameras)
+        published, n = self._published, len(self._cameras)
         pictures: NDArray[np.uint8] = np.empty(self._shape, dtype=np.uint8)
         if not self._shows_goals:
             pairs = zip(self._given, self._cameras, strict=True)
             cameras = [placed(scene, given, camera) for given, camera in pairs]
-            camera_pixels(scene, cameras, pictures, convention=layout)
-            return self._stacked(pictures)
+            camera_pixels(scene, cameras, pictures, published=published)
+            return pictures
         if self._version != self._world.version:
             self._version = self._world.version
             present = {camera.name: camera for camera in self._world.cameras()}
@@ -176,20 +152,14 @@ class Pixels:
                 else camera
                 for camera, follows in zip(self._cameras, self._follows, strict=True)
             )
-            camera_pixels(scene, self._cameras, self._goals, goals=True, convention=layout)
-        camera_pixels(scene, self._cameras, pictures[:n], convention=layout)
+            camera_pixels(scene, self._cameras, self._goals, goals=True, published=published)
+        camera_pixels(scene, self._cameras, pictures[:n], published=published)
         pictures[n:] = self._goals
-        return self._stacked(pictures)
+        return pictures
 
 
 def placed(scene: Scene, given: str | Camera, camera: Camera) -> Camera:
-    """Put a camera of a model where it is now.
-
-    Args:
-        scene: Of the present.
-        given: What was asked for.
-        camera: The same, as it is in the default scene.
-    """
+    """Put a camera of a model where it is now."""
     if given == AUTOMATIC:
         return following_camera(camera, shapes_of(scene, goals=False))
     if isinstance(given, str):

@@ -22,11 +22,7 @@ if TYPE_CHECKING:
 
 @final
 class Window:
-    """A window in which MuJoCo draws scenes of any engine.
-
-    Raises:
-        EngineError: There is no screen.
-    """
+    """A window in which MuJoCo draws scenes of any engine."""
 
     def __init__(self) -> None:
         if not self.is_possible():
@@ -93,12 +89,7 @@ class Looks:
         return dict(self._observer.layouts.get("context", {}))
 
     def _choose_view(self, camera: Any, size: Any) -> None:
-        """Choose camera and size of the pictures for people.
-
-        Raises:
-            UnknownOption: There is no such camera, or the size is none.
-            ModelError: There is nothing to draw.
-        """
+        """Choose camera and size of the pictures for people."""
         from scm_world.env.pixels import height_and_width, read_camera
 
         if camera is not None:

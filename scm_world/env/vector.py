@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers, Value, Values
-from scm_world.geometry import rotation_matrix
-from scm_world.geometry.clipping import scale_rows
+from scm_world.geometry.numbers import scale_rows
+from scm_world.geometry.rotations import rotation_matrix
 from scm_world.graph import SCM
 from scm_world.tasks import TIME
 from scm_world.variables import Box, Categories, Normal, Rotations
@@ -41,15 +41,8 @@ def bounds(model: SCM, name: str) -> tuple[Floats, Floats]:
 
     A declared bound that follows another variable is taken where that one makes it widest.
 
-    Args:
-        model: Where the variable is declared.
-        name: Of the variable.
-
     Returns:
         Lower and upper bound, shape (n,) each; ``∓WIDE`` where none is declared.
-
-    Raises:
-        UnknownVariable: No variable has this name.
     """
     variable = model.declared(name)
     extent = _extent(model, variable.bounds, name.rpartition(".")[2])

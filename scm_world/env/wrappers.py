@@ -19,15 +19,7 @@ Actions = NDArray[Any]
 
 
 def unwrapped_env(env: gymnasium.Env[Any, Any], wrapper: str) -> ScmWorldEnv:
-    """Return the environment of this package inside of wrappers.
-
-    Args:
-        env: In any wrappers.
-        wrapper: Who asks, for the error.
-
-    Raises:
-        UnknownOption: There is another one.
-    """
+    """Return the environment of this package inside of wrappers."""
     inner = env.unwrapped
     if not isinstance(inner, ScmWorldEnv):
         raise UnknownOption(f"environment for {wrapper}", type(inner).__name__, ("ScmWorldEnv",))

@@ -183,7 +183,7 @@ class EpisodeRunner:
                 steps += 1
                 if info.get(FRACTION) is not None:
                     fractions.append(info[FRACTION])
-                if not over and turn.step(env):
+                if not over and turn.stepped(env, env.world.index) and turn.act(env):
                     drawn |= _drawn(env, env.world.index)
                     observation = env.observe()
                 mark.look()
@@ -223,10 +223,9 @@ class EpisodeRunner:
             InterventionError: What it does was refused.
         """
         turn = self._turn(protocol)
-        observation, _ = self.env.reset(seed=seed, options={"episode": episode})
-        if turn.begin(self.env, episode):
-            observation = self.env.observe()
-        return turn, observation
+        turn.memory.episode = episode
+        options = {"episode": episode, **turn.begin(self.env, seed, episode)}
+        return turn, self.env.reset(seed=seed, options=options)[0]
 
     def _turn(self, protocol: Protocol) -> CurriculumRunner:
         kept, found = self._turns.get(protocol.name, (None, None))

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from scm_world._arguments import one_of
-from scm_world.curricula.base import Acts, AnyPart, Part, Situation
+from scm_world.curricula.base import AnyPart, Part, Situation
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.checking import shard_runner_of
@@ -53,18 +53,17 @@ class Instead(Part):
         """Give the part."""
         return (self.of,)
 
-    def acts(self, situation: Situation) -> Acts:
+    def acts(self, situation: Situation) -> Mapping[str, Any]:
         """Replace what is done to the variable, or leave it out."""
-        acts = self.of.acts(situation)
-        if self.name not in acts:
-            return acts
+        plan = self.of.plan(situation)
+        if self.name not in plan:
+            return plan
         self._found.add(self.name)
-        act = acts[self.name]
-        rest = {name: act for name, act in acts.items() if name != self.name}
+        rest = {name: acts for name, acts in plan.items() if name != self.name}
         if self.versus == "default":
             return rest
-        stream = act.stream if isinstance(act, Draw) else None
-        return {**rest, self.name: Draw("A", stream=stream)}
+        streams = ((act.time, getattr(act, "stream", None)) for act in plan[self.name])
+        return {**rest, self.name: [Draw("A", stream=one, time=time) for time, one in streams]}
 
 
 @final

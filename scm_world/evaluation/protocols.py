@@ -18,7 +18,8 @@ from typing import Any, final
 
 from scm_world._arguments import whole_number
 from scm_world.curricula import Curriculum, as_curriculum, at_step, together
-from scm_world.curricula.base import AnyPart, Part, as_part, read_from, words
+from scm_world.curricula.base import AnyPart, Part, as_part, words
+from scm_world.curricula.curriculum import read_from
 from scm_world.curricula.parts import NewGoal, Resample
 from scm_world.errors import UnknownOption
 from scm_world.tasks import Task, tasks

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, final
 
 import numpy as np
@@ -46,14 +45,10 @@ class Chain:
         padded = [(*step, *(0.0,) * (WIDTH - len(step))) for step in steps]
         return cls((float(turn), *(float(number) for step in padded for number in step)))
 
-    @cached_property
-    def _links(self) -> Floats:
-        return np.array(self.links)
-
     def __call__(self, *values: Any) -> Floats:
         """Compute it from the positions of the joints, in the order of the steps' numbers."""
         numbers = np.concatenate([np.ravel(value) for value in values]).astype(np.float64)
-        found: Floats = end_of_chain(numbers, self._links)
+        found: Floats = end_of_chain(numbers, np.array(self.links))
         return found
 
 

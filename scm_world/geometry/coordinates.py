@@ -8,18 +8,7 @@ from scm_world._types import ArrayLike, Floats
 
 
 def to_cylindrical(position: ArrayLike) -> Floats:
-    """Give radius, azimuth and height of points.
-
-    Args:
-        position: Shape (..., 3) [m].
-
-    Returns:
-        Radius [m], azimuth [rad] in (-pi, pi], zero on the axis, and height [m]; shape (..., 3).
-
-    Example:
-        >>> to_cylindrical([0.0, 2.0, 1.0])
-        array([2.        , 1.57079633, 1.        ])
-    """
+    """Return radius [m], azimuth [rad] in (-pi, pi], zero on the axis, and height [m] of points."""
     point = np.asarray(position, dtype=np.float64)
     x, y = point[..., 0], point[..., 1]
     cylindrical = point.copy()
@@ -31,18 +20,7 @@ def to_cylindrical(position: ArrayLike) -> Floats:
 
 
 def from_cylindrical(cylindrical: ArrayLike) -> Floats:
-    """Give the cartesian coordinates of points.
-
-    Args:
-        cylindrical: Radius [m], azimuth [rad] and height [m], shape (..., 3).
-
-    Returns:
-        Shape (..., 3) [m].
-
-    Example:
-        >>> from_cylindrical([2.0, 0.0, 1.0])
-        array([2., 0., 1.])
-    """
+    """Return the cartesian coordinates [m] of radius [m], azimuth [rad] and height [m]."""
     given = np.asarray(cylindrical, dtype=np.float64)
     radius, azimuth = given[..., 0], given[..., 1]
     position = given.copy()

@@ -67,7 +67,7 @@ def hull_of(points: ArrayLike) -> Hull:
         >>> plate = hull_of([(x, y, z) for x in (0, 2) for y in (0, 4) for z in (0, 1)])
         >>> round(plate.volume, 9), len(plate.vertices), len(plate.planes)
         (8.0, 8, 6)
-        >>> extents(plate).round(9).tolist()
+        >>> np.ptp(plate.vertices, axis=0).round(9).tolist()
         [2.0, 4.0, 1.0]
     """
     cloud = np.asarray(points, dtype=np.float64)
@@ -120,18 +120,9 @@ def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
             raise FileNotFoundError("it is no regular file, or not there")
         with file.open("rb") as stream:
             mesh: Any = trimesh.load(stream, file_type=kind, force="mesh", process=False)
-    except (OSError, ValueError, IndexError, KeyError, MemoryError) as error:
-        raise ModelError([f"{file} cannot be read as a mesh: {error}"]) from error
-    try:
         return hull_of(scale * np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3))
-    except ModelError as error:
-        raise ModelError([f"{file}: {problem}" for problem in error.problems]) from error
-
-
-def extents(hull: Hull) -> Floats:
-    """Measure the box around a polyhedron in its own frame, shape (3,) [m]."""
-    size: Floats = np.ptp(np.array(hull.vertices), axis=0)
-    return size
+    except (OSError, ValueError, IndexError, KeyError, MemoryError, ModelError) as error:
+        raise ModelError([f"{file} cannot be read as a mesh: {error}"]) from error
 
 
 def hull_overlap(
@@ -142,18 +133,10 @@ def hull_overlap(
     position_b: ArrayLike,
     orientation_b: ArrayLike,
 ) -> float:
-    """Compute the volume that two convex polyhedra share, exact to rounding.
+    """Compute the volume that two convex polyhedra share [m³], exact to rounding.
 
     Positions are centers of mass, shape (3,) [m], and orientations quaternions (x, y, z, w) of any
     length.
-
-    Returns:
-        The volume [m³], at least zero and at most that of the smaller one.
-
-    Example:
-        >>> cube, upright = hull_of(np.indices((2, 2, 2)).reshape(3, 8).T), [0.0, 0.0, 0.0, 1.0]
-        >>> round(hull_overlap(cube, [0.0, 0.0, 0.0], upright, cube, [0.5, 0.0, 0.0], upright), 9)
-        0.5
     """
     world = np.array(hull_a.vertices) @ rotation_matrix(orientation_a).T + np.asarray(position_a)
     corners = (world - np.asarray(position_b)) @ rotation_matrix(orientation_b)

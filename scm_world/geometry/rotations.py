@@ -1,6 +1,7 @@
 """Rotations as quaternions (x, y, z, w), in numpy on any leading axes and as scalar kernels.
 
-A quaternion need not have unit length: only its direction counts. The product is Hamilton's, so
+Arrays of quaternions have shape (..., 4). A quaternion need not have unit length: only its
+direction counts, and what needs one refuses zero (ValueError). The product is Hamilton's, so
 ``quaternion_product(p, q)`` rotates by q first and by p afterwards, as matrices do.
 
 Source:
@@ -34,23 +35,10 @@ def _squared_norm(quaternion: Floats) -> Floats:
 
 
 def canonical(quaternion: ArrayLike) -> Floats:
-    """Give the one unit quaternion with w >= 0 that names the same rotation.
+    """Return the one unit quaternion with w >= 0 that names the same rotation.
 
     Half turns have w = 0; of their two names the one is taken whose first component that is not
     zero is positive. Applying the function twice changes no bit.
-
-    Args:
-        quaternion: Shape (..., 4).
-
-    Returns:
-        Shape (..., 4).
-
-    Raises:
-        ValueError: A quaternion is zero, or the last axis is not four long.
-
-    Example:
-        >>> canonical([0.0, 0.0, 0.0, -2.0])
-        array([0., 0., 0., 1.])
     """
     given = np.asarray(quaternion, dtype=np.float64)
     x, y, z, w = _components(given)
@@ -62,20 +50,7 @@ def canonical(quaternion: ArrayLike) -> Floats:
 
 
 def quaternion_product(p: ArrayLike, q: ArrayLike) -> Floats:
-    """Compose two rotations: first q, then p.
-
-    Args:
-        p: Shape (..., 4).
-        q: Shape (..., 4), broadcast against ``p``.
-
-    Returns:
-        Hamilton's product, shape (..., 4), of any sign and length.
-
-    Example:
-        >>> quarter = from_rotation_vector([0.0, 0.0, np.pi / 2])
-        >>> quaternion_product(quarter, quarter).round(12)
-        array([0., 0., 1., 0.])
-    """
+    """Compose two rotations, first q, then p: a quaternion of any sign and length."""
     a, b, c, d = _components(p)
     x, y, z, w = _components(q)
     return np.stack(
@@ -89,40 +64,8 @@ def quaternion_product(p: ArrayLike, q: ArrayLike) -> Floats:
     )
 
 
-def quaternion_inverse(quaternion: ArrayLike) -> Floats:
-    """Give the quaternion whose product with this one is (0, 0, 0, 1).
-
-    Args:
-        quaternion: Shape (..., 4).
-
-    Returns:
-        Shape (..., 4).
-
-    Raises:
-        ValueError: A quaternion is zero, or the last axis is not four long.
-    """
-    given = np.asarray(quaternion, dtype=np.float64)
-    x, y, z, w = _components(given)
-    inverse: Floats = np.stack((-x, -y, -z, w), axis=-1) / _squared_norm(given)
-    return inverse
-
-
 def rotation_matrix(quaternion: ArrayLike) -> Floats:
-    """Give the matrix that turns coordinates of the body into those of the world.
-
-    Args:
-        quaternion: Shape (..., 4).
-
-    Returns:
-        Shape (..., 3, 3).
-
-    Raises:
-        ValueError: A quaternion is zero, or the last axis is not four long.
-
-    Example:
-        >>> rotation_matrix([0.0, 0.0, 1.0, 0.0]) @ [1.0, 0.0, 0.0]
-        array([-1.,  0.,  0.])
-    """
+    """Compute the matrix (..., 3, 3) that turns coordinates of the body into those of the world."""
     given = np.array(quaternion, dtype=np.float64, order="C")
     _components(given)
     _squared_norm(given)
@@ -132,18 +75,7 @@ def rotation_matrix(quaternion: ArrayLike) -> Floats:
 
 
 def from_rotation_vector(vector: ArrayLike) -> Floats:
-    """Give the quaternion of a rotation vector.
-
-    Args:
-        vector: Axis times angle, shape (..., 3) [rad]. The angle may be of any size.
-
-    Returns:
-        Unit quaternions with w >= 0, shape (..., 4).
-
-    Example:
-        >>> from_rotation_vector([0.0, 0.0, 0.0])
-        array([0., 0., 0., 1.])
-    """
+    """Return the unit quaternion with w >= 0 of axis times angle, shape (..., 3) [rad]."""
     given = np.asarray(vector, dtype=np.float64)
     angle = np.sqrt(np.sum(given * given, axis=-1, keepdims=True))
     imaginary = 0.5 * np.sinc(angle / (2.0 * np.pi)) * given
@@ -151,21 +83,9 @@ def from_rotation_vector(vector: ArrayLike) -> Floats:
 
 
 def to_rotation_vector(quaternion: ArrayLike) -> Floats:
-    """Give the rotation vector of a quaternion.
+    """Return axis times angle, shape (..., 3) [rad], with an angle in [0, pi].
 
-    Args:
-        quaternion: Shape (..., 4).
-
-    Returns:
-        Axis times angle, shape (..., 3) [rad], with an angle in [0, pi]. Accurate to rounding
-        near both ends.
-
-    Raises:
-        ValueError: A quaternion is zero, or the last axis is not four long.
-
-    Example:
-        >>> to_rotation_vector([0.0, 0.0, 1.0, 0.0])
-        array([0.        , 0.        , 3.14159265])
+    It is accurate to rounding near both ends.
     """
     unit = canonical(quaternion)
     imaginary, real = unit[..., :3], unit[..., 3:]
@@ -178,15 +98,7 @@ def to_rotation_vector(quaternion: ArrayLike) -> Floats:
 
 @njit(cache=True)
 def angle_between(p: Floats, q: Floats) -> float:
-    """Measure the angle of the rotation that leads from one orientation to the other.
-
-    Args:
-        p: Quaternion of any length and sign, shape (4,).
-        q: The same.
-
-    Returns:
-        The angle [rad], in [0, pi].
-    """
+    """Measure the angle between two orientations of any length and sign, [rad] in [0, pi]."""
     x = p[3] * q[0] - p[0] * q[3] - p[1] * q[2] + p[2] * q[1]
     y = p[3] * q[1] - p[1] * q[3] - p[2] * q[0] + p[0] * q[2]
     z = p[3] * q[2] - p[2] * q[3] - p[0] * q[1] + p[1] * q[0]
@@ -196,12 +108,7 @@ def angle_between(p: Floats, q: Floats) -> float:
 
 @njit(cache=True)
 def rotation_kernel(quaternion: Floats, matrix: Floats) -> None:
-    """Write the rotation matrix of a quaternion.
-
-    Args:
-        quaternion: Shape (4,). Zero counts as no rotation, so that no kernel makes a NaN.
-        matrix: Where to write, shape (3, 3).
-    """
+    """Write the rotation matrix of a quaternion; zero counts as no rotation and makes no NaN."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     squared = x * x + y * y + z * z + w * w
     scale = 2.0 / squared if squared > 0.0 else 0.0

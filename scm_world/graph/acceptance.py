@@ -25,12 +25,28 @@ from scm_world.variables import (
 from scm_world.variables.checks import check_bounds, check_draw, coerce
 
 
+def refuse_time(name: str, act: Any) -> None:
+    """Refuse an intervention with a time, where there is no episode for it.
+
+    Raises:
+        InterventionError: It has one.
+    """
+    if getattr(act, "time", None) is not None:
+        raise InterventionError(
+            f"do({name}): a time ({act.time}) counts in the plan of an episode: give it to "
+            "rollout, sample, effect, counterfactual, given, or reset(do=…) of a World",
+            variable=name,
+            value=act,
+        )
+
+
 def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -> Intervention:
     """Return a checked intervention: type, shape, finite, fixed bounds, known parents.
 
     Raises:
         InterventionError: What is wrong with it.
     """
+    refuse_time(variable.name, value)
     match value:
         case Draw():
             check_draw(variable, value)
@@ -67,8 +83,9 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
             by = value.by if np.ndim(value.by) else np.full(variable.shape, value.by)
             coerce(variable, by)
             return value
-    number = coerce(variable, _plain(variable, value))
-    if variable.bounds is not None and not variable.bounds.parents():
+    number = coerce(variable, _plain(variable, value) if isinstance(value, Hard) else value)
+    bounds = variable.bounds
+    if bounds is not None and not bounds.parents() and not bounds.contains(number, {}):
         check_bounds(variable, number, {})
     return Hard(number.tolist())
 
@@ -83,7 +100,9 @@ def _complete(variable: Variable, value: Mechanism) -> Mechanism:
     if value.function is None and (own is None or own.noise is None):
         said = "it has no noise that could be another one"
     elif value.function is None and own is not None:
-        return value.model_copy(update={"function": own.mechanism, "parents": own.parents})
+        fields = ("parents", "inverse_noise")
+        kept = {"function": own.mechanism, **{name: getattr(own, name) for name in fields}}
+        return value.model_copy(update=kept)
     elif value.noise is not None and not value.equation.takes_noise:
         said = "its function does not take noise; give it an argument `noise`"
     elif isinstance(value.function, Function) and value.equation.takes_noise:
@@ -101,9 +120,7 @@ def _known(declared: Mapping[str, Variable], names: Any) -> None:
             raise UnknownVariable(name, declared)
 
 
-def _plain(variable: Variable, value: Any) -> Any:
-    if not isinstance(value, Hard):
-        return value
+def _plain(variable: Variable, value: Hard) -> Any:
     matrix = len(variable.shape) > 1 and np.size(value.value) == np.prod(variable.shape)
     return np.reshape(value.value, variable.shape) if matrix else value.value
 

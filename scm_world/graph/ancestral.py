@@ -199,7 +199,8 @@ def window(edges: Bools, confounded: Bools, lags: int) -> tuple[Bools, Bools]:
         reached.append(ends)
         ways = [meets(paths, acts[lag]) for lag, paths in enumerate(recent, 1)]
         within.append(meets(np.any(ways, axis=0), instant))
-    flat = np.concatenate(reached).reshape(-1, width * p)
+    stacked = np.concatenate(reached)
+    flat = stacked.reshape(len(stacked), width * p)
     confounding = meets(flat.T, flat) | shared.reshape(width * p, width * p)
     np.fill_diagonal(confounding, False)
     return directed.reshape(width * p, width * p), confounding

@@ -36,32 +36,20 @@ def as_graph(matrix: NDArray[np.generic]) -> Bools:
 
 def is_acyclic(graph: Bools) -> bool:
     """Return whether no node acts on itself, even through others; no undirected edge either."""
-    return len(_order(graph)) == len(graph)
+    return not meets(reaches(graph), graph).diagonal().any()
 
 
 def topological_order(dag: Bools) -> tuple[int, ...]:
-    """Return all nodes, causes before their effects.
+    """Return all nodes, causes before their effects: an effect has more ancestors.
 
     Raises:
         ModelError: The graph has a cycle.
     """
-    order = _order(dag)
-    if len(order) < len(dag):
-        rest = sorted(set(range(len(dag))) - set(order))
-        raise ModelError([f"nodes {rest} cannot be put in order: there is a cycle among them"])
-    return order
-
-
-def _order(graph: Bools) -> tuple[int, ...]:
-    waits = graph.sum(axis=0)
-    order: list[int] = []
-    ready = np.flatnonzero(waits == 0)
-    while len(ready):
-        order += ready.tolist()
-        waits = waits - graph[ready].sum(axis=0)
-        waits[order] = -1
-        ready = np.flatnonzero(waits == 0)
-    return tuple(order)
+    above = reaches(dag)
+    knots = np.flatnonzero(meets(above, dag).diagonal()).tolist()
+    if knots:
+        raise ModelError([f"nodes {knots} cannot be put in order: there is a cycle among them"])
+    return tuple(np.argsort(above.sum(axis=0), kind="stable").tolist())
 
 
 def skeleton(graph: Bools) -> Bools:

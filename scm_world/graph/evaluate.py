@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.errors import FunctionFailure, ModelError, ScmWorldError, WrongShape, WrongType
+from scm_world.errors import FunctionFailure, ModelError, ScmWorldError, WrongValue
 from scm_world.variables import (
     SOFT,
     Categories,
@@ -265,12 +265,12 @@ class Evaluator:
         found = given.equation.bind()(*arguments, **noise)
         value = np.asarray(found)
         if value.dtype.kind not in ("iuf" if requested.dtype == "real" else "biuf"):
-            raise WrongType(requested.name, found, f"numbers of shape {requested.shape}")
+            raise WrongValue(requested.name, found, f"numbers of shape {requested.shape}")
         if value.shape[value.ndim - len(requested.shape) :] != requested.shape:
             try:
                 value = requested.array(value)
             except (TypeError, ValueError):
-                raise WrongShape(requested.name, given, requested.shape, value.shape) from None
+                raise WrongValue(requested.name, given, requested.shape, value.shape) from None
         if requested.dtype != "real":
             value = np.rint(value).astype(np.int64)
         _check_kind(requested, value)
@@ -318,11 +318,7 @@ class Evaluator:
         return value
 
     def _called(self, variable: Any, arguments: list[Value], given: Mapping[str, Any]) -> Value:
-        """Call the function of a variable.
-
-        Raises:
-            FunctionFailure: It raised an error.
-        """
+        """Call the function of a variable."""
         function = self._bound(variable)
         try:
             return np.asarray(function(*arguments, **given))

@@ -37,7 +37,8 @@ def _plain(data: Any) -> Any:
 def _functions(
     variables: Iterable[Variable], held: Mapping[str, Intervention]
 ) -> Iterator[Function]:
-    named: list[Any] = [act.function for act in held.values() if isinstance(act, Mechanism)]
+    mechanisms = [act for act in held.values() if isinstance(act, Mechanism)]
+    named: list[Any] = [f for act in mechanisms for f in (act.function, act.inverse_noise)]
     for field in ("mechanism", "inverse", "inverse_noise", "start", "carry"):
         named += [getattr(variable, field, None) for variable in variables]
     yield from (function for function in named if isinstance(function, Function))

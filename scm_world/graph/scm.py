@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import replace
-from itertools import chain
 from typing import Any, Self
 
 import numpy as np
@@ -74,7 +73,7 @@ def flatten(
     flat: dict[str, Any] = {}
     problems: list[InterventionError] = []
     for name, value in request.items():
-        if isinstance(value, Frozen):  # an intervention
+        if isinstance(value, Frozen | float):  # an intervention
             parts = {name: value}
         elif isinstance(value, Mapping):
             if not value:
@@ -130,10 +129,12 @@ class SCM:
     __slots__ = (
         "_acts",
         "_declared",
+        "_drawable",
         "_evaluator",
         "_interventions",
         "_order",
         "_structure",
+        "_targets",
         "_temporal",
     )
 
@@ -142,6 +143,8 @@ class SCM:
         self._structure: EdgeIndex | None = edges
         self._order: tuple[str, ...] = edges.order
         self._evaluator = Evaluator(self._declared)
+        self._targets: dict[str, tuple[str, ...]] = {}  # looked up once
+        self._drawable: set[tuple[str, str]] = set()  # variables and spaces that they have
         self._temporal: frozenset[str] | None = None
         self._interventions: dict[str, Intervention] = {}
         self._acts: dict[str, AppliedIntervention] = {}
@@ -202,11 +205,13 @@ class SCM:
             noise = given.noise
             if isinstance(variable, Derived) and given.equation.takes_noise:
                 noise = noise or variable.noise
+            back = None if noise is None else given.inverse_noise
             return Derived(
                 name=name,
                 parents=given.parents,
                 mechanism=given.equation,
                 noise=noise,
+                inverse_noise=back,
                 **common,
                 **spaces,
             )
@@ -297,10 +302,14 @@ class SCM:
 
     def targets(self, name: str) -> tuple[str, ...]:
         """Return the variables that an intervention acts on: the quantity itself, or all parts."""
-        variable = self.declared(name)
-        if isinstance(variable, Derived) and variable.inverse is not None:
-            return (variable.parents[0].name,)
-        return variable.parts or (name,)
+        found = self._targets.get(name) if isinstance(name, str) else None
+        if found is None:
+            variable = self.declared(name)
+            found = variable.parts or (name,)
+            if isinstance(variable, Derived) and variable.inverse is not None:
+                found = (variable.parents[0].name,)
+            self._targets[name] = found
+        return found
 
     def target(self, name: str) -> str:
         """Return the variable that an intervention acts on; the first one of a bundle."""
@@ -355,21 +364,28 @@ class SCM:
         """
         model = object.__new__(type(self))
         model._copy(self)
-        parts = (divided(self.declared(name), act).items() for name, act in acts.items())
-        for name, intervention in chain.from_iterable(parts):
-            target = self.target(name)
+        parts: list[tuple[str, Intervention]] = []
+        for name, act in acts.items():
+            whole = self.declared(name)
+            parts += divided(whole, act).items() if whole.parts else [(name, act)]
+        for name, intervention in parts:
+            target = self.targets(name)[0]
             replaced = model._acts.pop(target, None)
             if replaced is not None:
-                whole = replaced.requested.parts
-                model._interventions.pop(target if whole else replaced.requested.name, None)
+                asked = replaced.requested
+                model._interventions.pop(target if asked.parts else asked.name, None)
             if isinstance(intervention, Natural):
                 continue
-            requested = self._declared[whole_of(intervention, name)]
+            drawn = isinstance(intervention, Draw | Mechanism)
+            requested = self._declared[whole_of(intervention, name) if drawn else name]
             model._acts[target] = AppliedIntervention(intervention, requested)
             model._interventions[name] = intervention
         model._structure = None if acts else self._structure
         # Cutting edges keeps every causal order valid.
-        adds = any(adds_edges(act) for act in model._acts.values())
+        adds = any(
+            isinstance(act.intervention, Draw | Mechanism) and adds_edges(act)
+            for act in model._acts.values()
+        )
         model._order = model.structure.order if adds else self._order
         return model
 
@@ -388,6 +404,7 @@ class SCM:
 
     def _copy(self, other: SCM) -> None:
         self._declared, self._temporal = other._declared, other._temporal
+        self._targets, self._drawable = other._targets, other._drawable
         self._evaluator, self._order = other._evaluator, other._order
         self._interventions, self._acts = {**other._interventions}, {**other._acts}
         self._structure = other._structure
@@ -398,11 +415,11 @@ class SCM:
         Raises:
             InterventionError: What is wrong with it.
         """
-        if name not in self:
+        if not isinstance(name, str) or name not in self._declared:
             settable = (n for n, v in self._declared.items() if v.settable or any_variable)
             raise UnknownVariable(name, settable)
-        target = self.declared(self.target(name))
-        whole = whole_of(value, name)
+        target = self._declared[self.targets(name)[0]]
+        whole = whole_of(value, name) if isinstance(value, Frozen) else name
         if whole != name and name not in self.declared(whole).parts:
             raise InterventionError(
                 f"do({name}): it is no part of the bundle {whole!r}", variable=name, value=value
@@ -410,7 +427,12 @@ class SCM:
         if not any_variable and not target.settable:
             reason = "is a constant" if isinstance(target, Fixed) else "is measured, not set"
             raise NotIntervenable(name, reason, settable_causes(self._declared, target.name))
-        return accepted(self._declared, self._declared[whole], value)
+        if not (isinstance(value, Draw) and isinstance(value.source, str)):
+            return accepted(self._declared, self._declared[whole], value)
+        if (whole, value.source) not in self._drawable:
+            accepted(self._declared, self._declared[whole], value)
+            self._drawable.add((whole, value.source))
+        return value
 
     # --- solving ------------------------------------------------------------------------------
 

@@ -118,7 +118,7 @@ class EdgeIndex:
 
 
 def _own(causes: tuple[Parent, ...]) -> tuple[Parent, ...]:
-    """Give the edges into a variable that may have lag 0: not those that many states share."""
+    """Return the edges into a variable that may have lag 0: not those that many states share."""
     return causes.own if isinstance(causes, Coupled) else causes
 
 

@@ -6,10 +6,12 @@ from collections.abc import Iterable
 from typing import Any
 
 import networkx as nx
+import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world.errors import UnknownOption, UnknownVariable
-from scm_world.graph.exchange import slices_of, to_digraph, window_of
+from scm_world.errors import ModelError, UnknownOption, UnknownVariable
+from scm_world.graph.ancestral import window
+from scm_world.graph.exchange import to_digraph
 from scm_world.graph.scm import SCM
 
 Node = str | tuple[str, int]
@@ -22,6 +24,100 @@ def unrolled(model: SCM, steps: int) -> nx.DiGraph:
     A parameter keeps its value from one step to the next: an edge with ``persists=True``.
     """
     return slices_of(to_digraph(model), whole_number("steps", steps, least=1))
+
+
+def _past_of(graph: nx.MultiDiGraph) -> int:
+    """Return the longest lag [control steps]."""
+    return max((lag for *_, lag in graph.edges(keys=True)), default=0)
+
+
+def slices_of(graph: nx.MultiDiGraph, steps: int) -> nx.DiGraph:
+    """Unroll a graph of ``to_digraph``; nodes are ``(name, -steps + 1)`` to ``(name, 0)``."""
+    made = nx.DiGraph()
+    for slice_ in range(1 - steps, 1):
+        made.add_nodes_from(
+            ((name, slice_), {**data, "variable": name, "slice": slice_})
+            for name, data in graph.nodes(data=True)
+        )
+        for cause, effect, lag, data in graph.edges(keys=True, data=True):
+            if slice_ - lag > -steps:
+                made.add_edge((cause, slice_ - lag), (effect, slice_), **data)
+        for name in _held(graph) if slice_ > 1 - steps else ():
+            made.add_edge((name, slice_ - 1), (name, slice_), lag=1, persists=True)
+    return made
+
+
+def _held(graph: nx.MultiDiGraph) -> list[str]:
+    """List the parameters without causes: they keep their value from one step to the next."""
+    return [
+        name
+        for name, data in graph.nodes(data=True)
+        if data.get("role") == "parameter"
+        and data.get("per") != "step"
+        and not graph.in_degree(name)
+    ]
+
+
+def window_of(graph: nx.MultiDiGraph) -> nx.DiGraph:
+    """Return the present and as many slices before it as the longest lag, with their common past.
+
+    Two nodes are d-separated exactly where they are in a graph unrolled without end: this is its
+    latent projection. Nodes are those of ``slices_of``; ``("past", 1)``, … are unobserved.
+
+    Source:
+        Verma and Pearl, *Equivalence and synthesis of causal models*, UAI 1990, for projections;
+        a clique of bidirected edges separates as one common cause does.
+    """
+    past, place = _past_of(graph), {name: number for number, name in enumerate(graph)}
+    edges = np.zeros((past + 1, len(place), len(place)), dtype=bool)  # lag, cause, effect
+    for cause, effect, lag in graph.edges(keys=True):
+        edges[lag, place[cause], place[effect]] = True
+    for name in _held(graph) if past else ():
+        edges[1, place[name], place[name]] = True
+    _, shared = window(edges, np.zeros_like(edges), past)
+    nodes = [(name, slice_) for slice_ in range(-past, 1) for name in graph]
+    pairs = nx.Graph((nodes[i], nodes[j]) for i, j in np.argwhere(np.triu(shared)).tolist())
+    made = slices_of(graph, past + 1)
+    for number, effects in enumerate(sorted(map(sorted, nx.find_cliques(pairs))), start=1):
+        made.add_node(("past", number), observed="no")
+        made.add_edges_from((("past", number), effect) for effect in effects)
+    return made
+
+
+def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
+    """Return the acyclic graph of a model that ``identify`` and DoWhy take.
+
+    Without lags it has the names of the variables. With lags there are as many slices as the
+    longest lag reaches: ``name`` is now, ``name@-1`` one step ago. A parameter keeps its value, so
+    its past is called ``name@=-1`` and has an edge to ``name``. Causes before the first slice that
+    several nodes have in common are nodes ``past_1@-2``, … with ``observed="no"``, as DoWhy marks
+    what is not observed.
+
+    Args:
+        source: A model, or any directed networkx graph; the attribute ``lag`` of an edge counts.
+
+    Raises:
+        ModelError: Edges of lag 0 form a cycle.
+        UnknownOption: The source is no graph.
+    """
+    graph, made = to_digraph(source), nx.DiGraph()
+    held, past, slices = _held(graph), _past_of(graph), window_of(graph)
+
+    def named(node: tuple[str, int]) -> str:
+        name, slice_ = node
+        if slice_ > 0:
+            return f"past_{slice_}@-{past + 1}"
+        return f"{name}@{'=' if name in held else ''}{slice_}" if slice_ else name
+
+    for node in sorted(slices, key=lambda node: (node[1] > 0, abs(node[1]))):  # the present first
+        data = graph.nodes.get(node[0], {}) if node[1] <= 0 else slices.nodes[node]
+        made.add_node(named(node), **{k: v for k, v in data.items() if k == "observed"})
+    made.add_edges_from((named(cause), named(effect)) for cause, effect in slices.edges)
+    if not nx.is_directed_acyclic_graph(made):
+        cycle = [cause for cause, _ in nx.find_cycle(made)]
+        path = " → ".join([*cycle, cycle[0]])
+        raise ModelError([f"edges of lag 0 form a cycle: {path}; give edges their lag"])
+    return made
 
 
 def episode_outcome(

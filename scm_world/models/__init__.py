@@ -1,6 +1,6 @@
 """A backend-free description of any system: what moves, what can be set, what can be commanded."""
 
-from scm_world.models.model import Model, Parameter, Readout, Row, StateRow
+from scm_world.models.model import Model, Parameter, Readout, Row
 from scm_world.models.scene import (
     Difference,
     GoalRegion,
@@ -9,9 +9,7 @@ from scm_world.models.scene import (
     Parameters,
     Scene,
     State,
-    StateLayout,
     Structure,
-    complete,
 )
 
 __all__ = [
@@ -26,8 +24,5 @@ __all__ = [
     "Row",
     "Scene",
     "State",
-    "StateLayout",
-    "StateRow",
     "Structure",
-    "complete",
 ]

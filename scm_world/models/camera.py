@@ -43,14 +43,7 @@ class Camera:
     far: float = 100.0
 
     def axes(self) -> Floats:
-        """Compute the directions right, up and back of the camera in the world.
-
-        Returns:
-            A rotation from the world to the camera, shape (3, 3): one direction per row.
-
-        Raises:
-            ValueError: The camera has no optical axis, or ``up`` is parallel to it.
-        """
+        """Compute the directions right, up and back of the camera in the world, one in each row."""
         back = np.subtract(self.eye, self.target)
         right = np.cross(self.up, back)
         axes = np.stack([right, np.cross(back, right), back])  # (3, 3)
@@ -66,18 +59,10 @@ class Camera:
     def project(self, points: ArrayLike) -> Floats:
         """Find where points appear in the picture.
 
-        Args:
-            points: In the world, shape (..., 3) [m].
-
         Returns:
             Column, row and depth, shape (..., 3) [pixels, pixels, m]. The pixel is
             ``(floor(row), floor(column))``, row 0 at the top. What has no positive depth lies
             behind the camera and is not seen.
-
-        Example:
-            >>> camera = Camera("top", (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
-            >>> camera.project([0.0, 0.0, 0.25]).tolist()
-            [64.0, 64.0, 0.75]
         """
         seen = (np.asarray(points, dtype=np.float64) - self.eye) @ self.axes().T  # (..., 3)
         focal = self.height / (2.0 * math.tan(math.radians(self.field_of_view) / 2.0))
@@ -115,26 +100,13 @@ def camera_from(
     width: int = 128,
     height: int = 128,
 ) -> Camera:
-    """Make a camera from plain numbers.
+    """Make a camera from plain numbers, with a quaternion (x, y, z, w) of any length.
 
     The first axis of the camera points to the right of the picture, the second one down and the
     third one forward.
 
-    Args:
-        name: What the camera is called.
-        position: Where it stands, z from the table top, shape (3,) [m].
-        orientation: Quaternion (x, y, z, w) of any length, shape (4,).
-        field_of_view: Vertical opening angle [deg].
-        width: Of the picture [pixels].
-        height: Of the picture [pixels].
-
     Raises:
         ValueError: The quaternion is zero or not finite, or a shape is wrong.
-
-    Example:
-        >>> down = camera_from("top", [0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0])
-        >>> down.target, down.up
-        ((0.0, 0.0, 0.0), (-0.0, 1.0, -0.0))
     """
     x, y, z = np.asarray(position, dtype=np.float64).tolist()
     down, forward = down_and_forward(orientation)

@@ -15,12 +15,7 @@ from typing import Any, Literal, final
 import numpy as np
 
 from scm_world._types import Integers
-from scm_world.models.scene import (
-    ParameterKey,
-    Scene,
-    State,
-    StateLayout,
-)
+from scm_world.models.scene import ParameterKey, Scene, State, StateLayout
 
 Numbers = float | tuple[float, ...]
 """One number, or one for each component."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol, Self, final
+from typing import Any, Self, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,26 +131,12 @@ def reversed_ranges(parameters: Mapping[ParameterKey, Any]) -> list[ParameterKey
     return [key for key, ends in parameters.items() if key[1] in RANGES and ends[0] > ends[1]]
 
 
-class Structure(Protocol):
-    """What has to be compiled: it changes only when bodies come or go. Hashable, picklable."""
+Structure = Any
+"""What has to be compiled: it changes only when bodies come or go. Hashable, picklable.
 
-    @property
-    def timestep(self) -> float:
-        """Physics step [s]."""
-
-    @property
-    def n_commands(self) -> int:
-        """How many numbers a command has."""
-
-    @property
-    def layout(self) -> Any:
-        """Layout of the state; a ``StateLayout``."""
-
-    def empty_state(self) -> Any:
-        """Return a state to read into; a ``State``."""
-
-    def default_scene(self) -> Scene:
-        """Return the scene in which every parameter and every state has its default."""
+It has the ``timestep`` [s], ``n_commands`` and ``layout`` of a ``Model``, ``empty_state()`` and
+``default_scene()``.
+"""
 
 
 @final
@@ -257,17 +243,9 @@ class Difference:
 
 
 def complete(now: Scene, structure: Structure, difference: Difference) -> Difference:
-    """Fill in what a change of structure leaves unsaid.
+    """Fill in the parameters and the state that a change to another structure leaves unsaid.
 
     Bodies that stay keep their parameters and their state, new ones get the defaults.
-
-    Args:
-        now: The scene before.
-        structure: The structure after.
-        difference: A change to that structure, with only some parameters, or without a state.
-
-    Returns:
-        The same change with all parameters and a state.
     """
     default = structure.default_scene()
     stays = {key: value for key, value in now.parameters.items() if key in default.parameters}

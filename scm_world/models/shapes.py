@@ -131,17 +131,7 @@ class Shapes(NamedTuple):
 
 
 def mesh_of(vertices: ArrayLike, faces: ArrayLike, normals: ArrayLike | None = None) -> Mesh:
-    """Make a mesh.
-
-    Args:
-        vertices: Shape (n, 3) [m].
-        faces: Counterclockwise seen from outside, shape (m, 3).
-        normals: See ``Mesh``; those of the triangles if not given.
-
-    Example:
-        >>> mesh_of(np.eye(3), [[0, 1, 2]]).normals[0, 0].round(3).tolist()
-        [0.577, 0.577, 0.577]
-    """
+    """Make a mesh; its normals are those of the triangles if not given."""
     vertices = np.array(vertices, dtype=np.float64)
     faces = np.array(faces, dtype=np.int64)
     if normals is None:

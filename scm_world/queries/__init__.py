@@ -2,33 +2,29 @@
 
 from scm_world.policies.scripted import Random
 from scm_world.queries.abduction import Counterfactuals
-from scm_world.queries.agreement import Agreement
+from scm_world.queries.comparison import Comparison
 from scm_world.queries.consequences import Consequence, Consequences, consequences
 from scm_world.queries.differences import ButFor, Divergence, EpisodeDifference, but_for, compare
 from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.estimates import Effect
-from scm_world.queries.identification import Identification, identify, nature_graph
+from scm_world.queries.identification import Identification, estimate, identify, nature_graph
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.live import LiveEpisode
 from scm_world.queries.outcomes import Outcome
 from scm_world.queries.plans import Plan, do
 from scm_world.queries.questions import SCM
 from scm_world.queries.samples import Samples, Setting
-from scm_world.queries.timed import At, Clamp, Contact, On, Reaches
 from scm_world.queries.verification import Verification
-from scm_world.queries.verify import verify, verify_engines
+from scm_world.queries.verify import verify
 from scm_world.queries.world import World
 
 __all__ = [
     "SCM",
-    "Agreement",
-    "At",
     "ButFor",
-    "Clamp",
+    "Comparison",
     "Consequence",
     "Consequences",
-    "Contact",
     "Counterfactuals",
     "Divergence",
     "Effect",
@@ -37,11 +33,9 @@ __all__ = [
     "Identification",
     "Laboratory",
     "LiveEpisode",
-    "On",
     "Outcome",
     "Plan",
     "Random",
-    "Reaches",
     "Samples",
     "Setting",
     "Verification",
@@ -50,10 +44,10 @@ __all__ = [
     "compare",
     "consequences",
     "do",
+    "estimate",
     "identify",
     "load_episode",
     "nature_graph",
     "save_episode",
     "verify",
-    "verify_engines",
 ]

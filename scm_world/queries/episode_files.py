@@ -27,34 +27,23 @@ from scm_world.output.reading import read_arrays
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.episodes import Episode
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.plans import Plan
+from scm_world.queries.plans import Plan, Schedule
 from scm_world.queries.rollouts import Trace, Unit
 from scm_world.queries.twins import AnyTwins, EquationTwins, Twins, twins_of
 from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.variables import Subset
 from scm_world.world import Simulation
 
-FORMAT = "scm_world/episode/2"
+FORMAT = "scm_world/episode/3"
 _ADVICE = "give a file that save_episode wrote"
-KEYS = {
-    "fingerprint",
-    "task",
-    "arguments",
-    "options",
-    "seed",
-    "number",
-    "steps",
-    "layers",
-    "versions",
-    "parameters",
-}
 
 
 def save_episode(episode: Episode, path: Path | str) -> Path:
     """Write an episode to one file: a zip archive of numpy arrays and a JSON text.
 
     It holds task and options, or a causal model without a backend as JSON; seed, plans, actions,
-    versions; and all states, with which a rerun is compared on reading. Nothing in it is a pickle.
+    versions; and a hash of each instant, with which a rerun is compared on reading. Nothing in it
+    is a pickle.
 
     Args:
         episode: What happened.
@@ -66,17 +55,11 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
             to ``load_episode``.
         UnwritableFolder: There is no such folder, no room, or no permission.
     """
-    trace, target = episode.trace, Path(path)
+    target = Path(path)
     if target.suffix != ".npz":
         target = target.with_name(target.name + ".npz")
     made = io.BytesIO()
-    np.savez_compressed(
-        made,
-        about=np.array(json.dumps(_about(episode))),
-        actions=episode.actions,
-        states=np.concatenate(trace.vectors),
-        lengths=np.array([len(vector) for vector in trace.vectors]),
-    )
+    np.savez_compressed(made, about=np.array(json.dumps(_about(episode))), actions=episode.actions)
     write_durably(target, made.getvalue())
     return target
 
@@ -87,9 +70,8 @@ def _about(episode: Episode) -> dict[str, Any]:
         **(_equations if isinstance(episode.twins, EquationTwins) else _world)(episode.twins),
         "seed": episode.seed,
         "number": episode.number,
-        "steps": episode.steps,
         "layers": [[start, plan.as_dict()] for start, plan in episode.layers],
-        "parameters": _digest(episode.trace),
+        "instants": _hashes(episode.trace),
     }
 
 
@@ -147,18 +129,18 @@ def _arguments(task: Task) -> dict[str, Any] | None:
     return None
 
 
-def _digest(trace: Trace) -> str:
-    """Sum up all values of parameters, at all times."""
-    found = hashlib.sha256()
-    last: dict[str, Any] = {}
-    for step, values in trace.statics:
-        if last.keys() == values.keys() and all(np.array_equal(last[n], values[n]) for n in last):
-            continue
-        last = values
-        found.update(str(step).encode())
-        for name in sorted(values):
-            found.update(name.encode() + np.asarray(values[name]).tobytes())
-    return found.hexdigest()
+def _hashes(trace: Trace) -> list[str]:
+    """Sum up the state of each instant, and the parameters that are others than before."""
+    statics, last, found = dict(trace.statics), dict[str, Any](), list[str]()
+    for step, vector in enumerate(trace.vectors):
+        mark = hashlib.blake2b(vector.tobytes(), digest_size=8)
+        now = statics.get(step, last)
+        for name in sorted(now):
+            if name not in last or not np.array_equal(last[name], now[name]):
+                mark.update(name.encode() + np.asarray(now[name]).tobytes())
+        last = now
+        found.append(mark.hexdigest())
+    return found
 
 
 def _plain(value: Any) -> Any:
@@ -189,44 +171,30 @@ def load_episode(
         SnapshotMismatch: The rerun is not bit-identical: another version or model, say.
     """
     file = Path(path)
-    about, actions, states, lengths = _read(file)
     try:
+        arrays = read_arrays(file)
+        about, actions = json.loads(str(arrays["about"])), arrays["actions"]
+        if about["format"] != FORMAT:
+            raise UnreadableFile(str(file), f"its format is {about['format']!r}", _ADVICE)
         twins = _twins(about, world, file, trusted)
-        layers = tuple(
+        schedule = Schedule(
             (int(start), Plan.from_dict(plan, trusted=trusted)) for start, plan in about["layers"]
         )
-        unit = Unit(about["seed"], about["number"], layers, Given(list(actions)), about["steps"])
+        given = Given(list(actions))
+        unit = Unit(about["seed"], about["number"], schedule, given, len(actions))
         with twins.twin() as twin:
             trace = unit.run(twin)
+        pairs = enumerate(zip(_hashes(trace), about["instants"], strict=True))
+        other = next((step for step, (now, then) in pairs if now != then), None)
+        made = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
     except DAMAGED as error:
         if isinstance(error, ScmWorldError):
             raise
         raise UnreadableFile(str(file), in_one_line(error), _ADVICE) from error
-    if _digest(trace) != about["parameters"]:
-        raise SnapshotMismatch(f"{file} happens with other parameters than it did")
-    _compare(trace, np.split(states, np.cumsum(lengths)[:-1]), file, about["versions"])
+    if other is not None:
+        said = f"{file} happens otherwise from control step {other} on; it was made with {made}"
+        raise SnapshotMismatch(said)
     return Episode(twins, unit, trace)
-
-
-def _read(file: Path) -> tuple[dict[str, Any], Any, Any, Any]:
-    try:
-        arrays = read_arrays(file)
-        about = json.loads(str(arrays["about"]))
-        found = arrays["actions"], arrays["states"], arrays["lengths"]
-    except DAMAGED as error:
-        raise UnreadableFile(str(file), str(error), _ADVICE) from None
-    if not isinstance(about, dict) or about.get("format") != FORMAT or not about.keys() >= KEYS:
-        raise UnreadableFile(str(file), "it is no episode", _ADVICE)
-    actions, states, lengths = found
-    steps = about["steps"]
-    whole = isinstance(steps, int) and not isinstance(steps, bool) and steps >= 0
-    if not (whole and lengths.shape == (steps + 1,) and states.shape == (int(lengths.sum()),)):
-        reason = f"it says {steps!r} control steps, and holds states of {len(lengths) - 1}"
-        raise UnreadableFile(str(file), reason, _ADVICE)
-    if actions.ndim != 2 or len(actions) != steps:
-        reason = f"it says {steps} control steps, and holds actions of shape {actions.shape}"
-        raise UnreadableFile(str(file), reason, _ADVICE)
-    return about, *found
 
 
 def _twins(
@@ -266,12 +234,3 @@ def _made(about: dict[str, Any]) -> Simulation:
     else:
         raise UnknownOption("task", about["task"], (*tasks(), "any, with world=World(your task)"))
     return Simulation(task, **about["options"])
-
-
-def _compare(trace: Trace, states: list[Any], file: Path, made: dict[str, str]) -> None:
-    for step, (now, then) in enumerate(zip(trace.vectors, states, strict=True)):
-        if now.tobytes() != then.tobytes():
-            raise SnapshotMismatch(
-                f"{file} happens otherwise from control step {step} on; it was made with "
-                + ", ".join(f"{name} {version}" for name, version in made.items())
-            )

@@ -16,7 +16,7 @@ from scm_world.models.scene import Scene
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.equations import System
 from scm_world.queries.parallel import Result, run_units
-from scm_world.queries.plans import Layer, Plan
+from scm_world.queries.plans import Layer, Plan, Schedule
 from scm_world.queries.rollouts import (
     ALL,
     EVERY,
@@ -44,19 +44,24 @@ class Episode:
     Attributes:
         seed: Of the noise.
         number: Of the episode within that noise.
-        layers: Plans, each with the control step from which it counts.
+        schedule: Plans, each with the control step from which it counts.
         steps: How many control steps it has.
     """
 
     def __init__(self, twins: AnyTwins, unit: Unit, trace: Trace) -> None:
         self.twins: Any = twins
         self.seed, self.number = unit.seed, unit.number
-        self.layers: tuple[Layer, ...] = unit.layers
+        self.schedule: Any = unit.schedule
         self.steps = unit.steps
         self.trace = trace
         self._all: Trace | None = None
 
     # --- reading ------------------------------------------------------------------------------
+
+    @property
+    def layers(self) -> tuple[Layer, ...]:
+        """Plans, each with the control step from which it counts."""
+        return tuple(self.schedule.layers)
 
     @property
     def plan(self) -> Plan:
@@ -202,7 +207,7 @@ class Episode:
         again, is_replay = self._again(), isinstance(actions, str) and actions == "replay"
         return replace(
             again,
-            layers=(*self.layers, (at, Plan(do))),
+            schedule=Schedule([*self.layers, (at, Plan(do))]),
             policy=again.policy if is_replay else actions,
             names=whole,
             first=at,
@@ -212,7 +217,7 @@ class Episode:
     def _again(self) -> Unit:
         """Return the unit that repeats this episode."""
         past = Given(self.trace.actions)
-        return Unit(self.seed, self.number, self.layers, past, self.steps)
+        return Unit(self.seed, self.number, self.schedule, past, self.steps)
 
     def _arrive(self, world: System, at: int) -> None:
         """Bring a twin to an instant, before anything is done then that the past does not know."""

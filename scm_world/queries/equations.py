@@ -18,7 +18,7 @@ from scm_world.variables import Noise
 from scm_world.world import Audit, Simulation
 from scm_world.world.audit import Applied
 from scm_world.world.compiled_task import ActionVector, slices_of
-from scm_world.world.solver import same
+from scm_world.world.interventions import same
 
 
 @final

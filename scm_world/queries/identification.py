@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
@@ -9,10 +10,11 @@ from typing import Any, final
 
 import networkx as nx
 
+from scm_world._arguments import load, one_of
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM, episode_outcome
 from scm_world.graph.evaluate import AppliedIntervention, source_of
-from scm_world.graph.exchange import to_dowhy
+from scm_world.graph.views import to_dag
 from scm_world.queries.plans import Plan
 from scm_world.queries.rollouts import as_names
 from scm_world.variables import Draw, Mechanism
@@ -30,6 +32,8 @@ class Identification:
         backdoor: A smallest set of observed variables that blocks every back door; None if there
             is none.
         frontdoor: Smallest sets of observed mediators that meet the front-door criterion.
+        instruments: Observed variables that are associated with the treatment, and with the outcome
+            through it alone.
     """
 
     treatment: str
@@ -37,6 +41,18 @@ class Identification:
     graph: nx.DiGraph
     backdoor: tuple[str, ...] | None
     frontdoor: tuple[tuple[str, ...], ...] = ()
+    instruments: tuple[str, ...] = ()
+
+    @property
+    def variables(self) -> dict[str, tuple[str, ...]]:
+        """Variables to observe besides the ends, by criterion, the one that asks least first.
+
+        ``"backdoor"`` and ``"frontdoor"`` identify any effect, ``"iv"`` a linear one.
+        """
+        ways = {} if self.backdoor is None else {"backdoor": self.backdoor}
+        if self.frontdoor:
+            ways["frontdoor"] = self.frontdoor[0]
+        return ways | ({"iv": self.instruments} if self.instruments else {})
 
 
 def nature_graph(
@@ -46,7 +62,7 @@ def nature_graph(
     *,
     contact: bool = True,
 ) -> nx.DiGraph:
-    """Give the static graph of an episode in which nature does something at the beginning.
+    """Return the static graph of an episode in which nature does something at the beginning.
 
     Args:
         model: Of the world.
@@ -62,7 +78,7 @@ def nature_graph(
     if not isinstance(model, SCM):
         raise UnknownOption("model", model, ("an SCM, such as world.model",))
     plan = Plan(nature)
-    acts = plan.at_first()
+    acts = plan.at_start()
     late = sorted(
         {name for name in plan if name not in acts} | {n for n in plan if len(plan[n]) > 1}
     )
@@ -113,8 +129,8 @@ def identify(
         ModelError: The graph has a cycle, or no directions.
 
     Source:
-        Pearl, *Causality*, 2nd edition, 3.3.1 and 3.3.2. A smallest separator is a smallest cut of
-        the moral graph of the ancestors (van der Zander, Liśkiewicz and Textor, Artificial
+        Pearl, *Causality*, 2nd edition, 3.3.1, 3.3.2 and 7.4.5. A smallest separator is a smallest
+        cut of the moral graph of the ancestors (van der Zander, Liśkiewicz and Textor, Artificial
         Intelligence 270, 2019); of several, the one nearest to the outcome.
 
     Example:
@@ -124,7 +140,7 @@ def identify(
         >>> identify(graph, "x", "y", observed=["x", "y", "w"]).backdoor is None
         True
     """
-    graph = to_dowhy(graph)
+    graph = to_dag(graph)
     hidden = {node for node, seen in graph.nodes(data="observed") if seen == "no"}
     seen = set(graph) - hidden if observed is None else set(as_names(observed))
     for node in (treatment, outcome, *seen):
@@ -138,7 +154,66 @@ def identify(
     behind.remove_edges_from(list(graph.out_edges(treatment)))
     backdoor = _smallest_separator(behind, treatment, outcome, allowed)
     doors = tuple(_front_doors(graph, treatment, outcome, watched)) if frontdoor else ()
-    return Identification(treatment, outcome, graph, backdoor, doors)
+    instruments = tuple(
+        node
+        for node in sorted(allowed, key=str)
+        if nx.is_d_separator(behind, {node}, {outcome}, set())
+        and not nx.is_d_separator(graph, {node}, {treatment}, set())
+    )
+    return Identification(treatment, outcome, graph, backdoor, doors, instruments)
+
+
+_METHODS = {
+    "backdoor": "backdoor.linear_regression",
+    "frontdoor": "frontdoor.two_stage_regression",
+    "iv": "iv.instrumental_variable",
+}
+
+
+def estimate(
+    found: Identification, table: Any, *, do: Any, versus: Any, method: str | None = None
+) -> Any:
+    """Estimate an effect that ``identify`` found from observational data, with DoWhy.
+
+    Args:
+        found: The result of ``identify``.
+        table: A data frame whose columns have the names of nodes.
+        do: Value of the treatment.
+        versus: Value that it is compared with.
+        method: One of DoWhy; if None a linear one for the first criterion of ``found.variables``.
+
+    Returns:
+        The ``CausalEstimate`` of DoWhy: ``value``, ``get_confidence_intervals()``, …
+
+    Raises:
+        MissingExtra: DoWhy is not installed.
+        ModelError: The effect is not identified.
+        UnknownOption: The table lacks a column.
+
+    Example:
+        >>> found = identify(nx.DiGraph([("z", "x"), ("z", "y"), ("x", "y")]), "x", "y")
+        >>> estimate(found, table, do=1.0, versus=0.0).value  # doctest: +SKIP
+        2.03
+    """
+    if not found.variables:
+        ends = f"{found.treatment!r} on {found.outcome!r}"
+        advice = "observe more variables, look for front doors, or intervene (effect)"
+        raise ModelError([f"the effect of {ends} is not identified: {advice}"])
+    way = next(iter(found.variables)) if method is None else method.partition(".")[0]
+    one_of("method", way, tuple(found.variables))
+    columns = [found.treatment, found.outcome, *found.variables[way]]
+    for name in columns:
+        one_of("column of the table", name, tuple(map(str, table.columns)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that other nodes of the graph are not in the table
+        dowhy = load("dowhy", "dowhy")
+        model = dowhy.CausalModel(table[columns], found.treatment, found.outcome, graph=found.graph)
+        return model.estimate_effect(
+            model.identify_effect(proceed_when_unidentifiable=True),
+            method_name=_METHODS[way] if method is None else method,
+            control_value=versus,
+            treatment_value=do,
+        )
 
 
 def _smallest_separator(

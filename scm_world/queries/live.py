@@ -13,9 +13,8 @@ from scm_world.errors import InterventionError, UnknownOption
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.policies.scripted import as_policy
 from scm_world.queries.episodes import Episode
-from scm_world.queries.plans import Layer, Plan, Schedule
+from scm_world.queries.plans import Layer, Plan, Schedule, retimed
 from scm_world.queries.rollouts import Running, Unit
-from scm_world.queries.timed import TIMED, At, Clamp, On
 from scm_world.queries.twins import AnyTwins
 from scm_world.variables import Draw, Natural
 from scm_world.world import Audit, Simulation
@@ -74,7 +73,8 @@ class LiveEpisode:
     @property
     def layers(self) -> tuple[Layer, ...]:
         """What was done: plans, each with the control step from which it counts."""
-        return self._running.unit.layers
+        schedule: Any = self._running.unit.schedule
+        return tuple(schedule.layers)
 
     @property
     def actions(self) -> list[Floats]:
@@ -94,13 +94,12 @@ class LiveEpisode:
     def held(self) -> dict[str, Any]:
         """What is in force: interventions that hold a variable, and open windows, by variable."""
         world, step = self.world, self.steps
-        windows: dict[str, Clamp] = {}
+        windows: dict[str, Any] = {}
         for start, plan in self.layers:
-            for name, parts in plan.items() if start <= step else ():
-                clamps = (part for part in parts if isinstance(part, Clamp))
-                open_ = [c for c in clamps if c.start <= step < (c.stop or sys.maxsize)]
+            for name, acts in plan.items() if start <= step else ():
+                held = [act for act in acts if act.time is not None and act.time.holds(step)]
                 windows.pop(name, None)
-                windows.update({name: open_[-1]} if open_ else {})
+                windows.update({name: held[-1]} if held else {})
         model = world.graph if isinstance(world, Simulation) else world.model
         return {**model.interventions, **windows}
 
@@ -109,7 +108,7 @@ class LiveEpisode:
 
         Args:
             request: By variable, a value, an intervention, or one with a time from now on, such as
-                ``Clamp(0.3, 5, 10)``. The numbers are control steps of the episode.
+                ``Hard(0.3, during=(5, 10))``. The numbers are control steps of the episode.
 
         Returns:
             What it did; None if nothing is done before a later control step.
@@ -139,18 +138,14 @@ class LiveEpisode:
             for name, act in (done.acts() if start == step else ())
             if isinstance(act, Draw)
         ]
-        for name, (part, *others) in plan.items():
-            act = part.act if isinstance(part, TIMED) else part
+        for name, (act, *others) in plan.items():
             if name in drawn and isinstance(act, Draw) and act.stream is None:
                 times = drawn.count(name) + (name in random)
-                act = act.model_copy(update={"stream": f"draw {times}"})
-                timed = isinstance(part, TIMED)
-                request[name] = (part.model_copy(update={"act": act}) if timed else act, *others)
+                request[name] = (act.model_copy(update={"stream": f"draw {times}"}), *others)
         return Plan(request)
 
     def _take(self, layers: tuple[Layer, ...]) -> None:
-        self._running.unit = replace(self._running.unit, layers=layers)
-        self._running.__dict__.pop("schedule", None)
+        self._running.unit = replace(self._running.unit, schedule=Schedule(layers))
 
     def step(self, action: Any = None) -> Floats:
         """Take a control step, and do what is due at the instant that it leads to.
@@ -181,7 +176,7 @@ class LiveEpisode:
         try:
             running.intervene(step + 1)
         except InterventionError:
-            due = running.schedule.due(self.world, step + 1, dict(running.trace.fired))
+            due = running.unit.schedule.due(self.world, step + 1, dict(running.trace.fired))
             self.do({str(name): Natural() for name in due})
             raise
         return running.trace.actions[-1]
@@ -238,7 +233,7 @@ class LiveEpisode:
         trace.vectors.append(self._arrival)
         unit = replace(
             self._running.unit,
-            layers=tuple(layer for layer in self.layers if layer[0] < steps),
+            schedule=Schedule(layer for layer in self.layers if layer[0] < steps),
             policy=Given(trace.actions),
             steps=steps,
             first=0,
@@ -253,24 +248,42 @@ class LiveEpisode:
         """
         found: dict[str, list[Any]] = {}
         for start, plan in self.layers:
-            for name, parts in plan.items():
-                kept: list[Any] = []
-                for part in found.pop(name, ()):  # of earlier plans, what was over by then
-                    if isinstance(part, Clamp) and part.start < start:
-                        stop = start if part.stop is None else min(start, part.stop)
-                        kept.append(Clamp(part.act, part.start, stop))
-                    elif (isinstance(part, At) and part.step < start) or (
-                        not isinstance(part, TIMED) and start
-                    ):
-                        kept.append(part)
-                for part in parts:
-                    if isinstance(part, On) and start:
-                        said = "an event that is waited for from a later step needs its own plan"
-                        raise InterventionError(said, variable=name, value=part)
-                    kept.append(At(start, part) if start and not isinstance(part, TIMED) else part)
-                found[name] = kept
-        return Plan({name: tuple(parts) for name, parts in found.items()})
+            for name, acts in plan.items():
+                kept = [part for act in found.pop(name, ()) for part in _until(act, start)]
+                found[name] = kept + [_since(name, act, start) for act in acts]
+        return Plan({name: tuple(acts) for name, acts in found.items()})
 
     def close(self) -> None:
         """Give the twin back. The episode can still be read; closing twice is harmless."""
         self._lease.close()
+
+
+def _until(act: Any, end: int) -> list[Any]:
+    """Return what an intervention has done before another one replaces it at a control step."""
+    time = act.time
+    if time is None:
+        return [act] if end else []
+    if time.when is not None or time.start >= end:
+        return []
+    if time.during is not None:
+        stop = end if time.during[1] is None else min(end, time.during[1])
+        return [retimed(act, during=(time.start, stop))]
+    return [retimed(act, at=step) for step in range(time.start, end, time.every or end)]
+
+
+def _since(name: str, act: Any, start: int) -> Any:
+    """Return an intervention of a plan that begins at a control step, for one from the beginning.
+
+    Raises:
+        InterventionError: It waits for an event from a later control step on.
+    """
+    time = act.time
+    if not start or (time is not None and time.when is None and time.every is None):
+        return act
+    if time is None:
+        return retimed(act, at=start)
+    if time.when is not None:
+        said = "an event that is waited for from a later step needs its own plan"
+        raise InterventionError(said, variable=name, value=act)
+    first = time.start if time.start >= start else start + (time.start - start) % time.every
+    return retimed(act, at=first, every=time.every)

@@ -1,61 +1,32 @@
-"""Which body acts on which in one control step: the causal graph that holds here and now.
+"""Which edges hold in one control step: the causal graph of here and now.
 
-The graph of a world says what *can* act on what: everything that can touch. In one control step
-only what does touch acts, directly or through others. Bodies that press on one another in a
-physics step are an *island*; what stands still for good (floor, stage, obstacles) passes nothing
-on. A control step is several physics steps, so that X acts on Y if a chain of islands leads from X
-to Y in the order of time: what reaches a body only after it has let go of Y does not reach Y.
+The graph of a world has every edge that *can* hold: everything that can touch. In one control step
+only what does touch acts, directly or through others. Bodies that touch, directly or through others
+that move, are an *island*; what stands still for good (floor, stage, obstacles) passes nothing on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, final
+from weakref import WeakKeyDictionary
 
 import networkx as nx
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import ContactPoint
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import ModelError
 from scm_world.world import Simulation
-
-__all__ = ["local_graph"]
+from scm_world.world.compiled_task import CompiledTask
 
 Touching = Sequence[Sequence[ContactPoint]]
 """The contacts of each physics step of a control step."""
 
+_TERMS: WeakKeyDictionary[CompiledTask, dict[str, Any]] = WeakKeyDictionary()
 
-def local_graph(world: Simulation, action: ArrayLike | None = None) -> nx.DiGraph:
-    """Read off from contacts which body acts on which other body in a control step.
 
-    Contacts in which nothing presses do not count.
-
-    Args:
-        world: It is left as it is, bit for bit.
-        action: Of the coming control step, which is simulated to see what touches in each of its
-            physics steps, and undone. If None, the graph is that of the last physics step: all
-            that a backend keeps of the past.
-
-    Returns:
-        A graph of bodies. Its nodes carry ``moves``; what stands still points at what it touches.
-
-    Raises:
-        ActionError: Wrong shape, or a number that is not finite.
-        ModelError: Its contacts are not all known.
-        NotReset: There is no episode yet.
-        UnknownOption: It is a world of something other than fingers and blocks.
-
-    Example:
-        >>> world = Simulation("pushing")
-        >>> world.reset(seed=0)
-        >>> world.step(world["joint_positions"])
-        >>> list(local_graph(world, world["joint_positions"]).edges)
-        [('floor', 'tool_block')]
-    """
-    bodies = world.composition.movers()
-    if not bodies:
-        allowed = ("a world of the block-building robot",)
-        raise UnknownOption("world of local graphs", world.task.name, allowed)
+def local_graph(world: Simulation, action: ArrayLike | None = None) -> nx.MultiDiGraph:
+    """Return the declared graph with the edges that hold now; see ``World.local_graph``."""
     before = world.snapshot()
     steps: Touching = (world.backend.contacts(),)
     if action is not None:
@@ -63,48 +34,19 @@ def local_graph(world: Simulation, action: ArrayLike | None = None) -> nx.DiGrap
             steps = contacts_of(world, action)
         finally:
             world.restore(before)
-    pressing = [[contact for contact in step if contact.force > 0.0] for step in steps]
-    graph = nx.DiGraph()
-    graph.add_nodes_from(bodies, moves=True)
-    for effect, causes in reached(bodies, pressing).items():
-        graph.add_edges_from((cause, effect) for cause in sorted(causes - {effect}))
-    for contact in (contact for step in pressing for contact in step):
-        one, other = (_body_of(name, bodies) for name in contact.bodies)
-        for fixed, body in ((one, other), (other, one)):
-            if body in bodies and fixed not in bodies:
-                graph.add_node(fixed, moves=False)
-                graph.add_edge(fixed, body)
+    pressing = {contact.bodies for step in steps for contact in step if contact.force > 0.0}
+    if world.compiled not in _TERMS:
+        _TERMS[world.compiled] = contact_terms(world)
+    acts = holds(_TERMS[world.compiled], pressing)
+    graph = nx.MultiDiGraph()
+    graph.add_nodes_from(world.graph)
+    for edge in world.graph.edges:
+        if edge.when == "contact" and not acts(edge.cause, edge.effect):
+            continue
+        if edge.when == "set" and world.index > 0:  # it acts where an episode begins
+            continue
+        graph.add_edge(edge.cause, edge.effect, lag=edge.lag, when=edge.when)
     return graph
-
-
-def islands(bodies: Iterable[str], contacts: Iterable[ContactPoint]) -> list[set[str]]:
-    """Part movable bodies into those that touch, directly or through other movable bodies."""
-    graph = nx.Graph()
-    graph.add_nodes_from(bodies)
-    for contact in contacts:
-        first, second = (_body_of(name, graph) for name in contact.bodies)
-        if first in graph and second in graph:
-            graph.add_edge(first, second)
-    return list(nx.connected_components(graph))
-
-
-def reached(bodies: Sequence[str], steps: Touching) -> dict[str, set[str]]:
-    """Return from which bodies each body can have been reached at the end, itself included.
-
-    In each physics step, what has reached one body of an island reaches all of it.
-    """
-    causes = {body: {body} for body in bodies}
-    for contacts in steps:
-        for island in islands(bodies, contacts):
-            if len(island) > 1:
-                together = set().union(*(causes[body] for body in island))
-                causes.update((body, together) for body in island)
-    return causes
-
-
-def _body_of(name: str, bodies: Iterable[str]) -> str:
-    """Return the body that a link belongs to: ``"x_link_1"`` is a part of ``"x"``."""
-    return next((body for body in bodies if name.startswith(f"{body}_link_")), name)
 
 
 # --- conditions of edges --------------------------------------------------------------------------

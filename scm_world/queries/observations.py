@@ -13,14 +13,11 @@ from scm_world.graph import SCM
 from scm_world.variables import Categories
 
 RECORDED = ("episode", "step", "regime", "intervention_targets")
-"""Columns of a frame of a ``Dataset`` besides its variables."""
-
-
-ONE = -1  # in the place of a number of rows: there is no axis for them
+"""Columns of a frame of a ``Dataset`` in addition to its variables."""
 
 
 class Observations(NamedTuple):
-    """What was observed of some units.
+    """Observations of some units.
 
     Attributes:
         values: By variable, shape (rows, steps, *shape); NaN where nothing was observed.
@@ -36,7 +33,7 @@ class Observations(NamedTuple):
 
 
 def observations(model: SCM, observed: Any) -> Observations:
-    """Read what was observed.
+    """Read observations.
 
     Args:
         model: Whose variables were observed.
@@ -51,7 +48,7 @@ def observations(model: SCM, observed: Any) -> Observations:
         ImpossibleObservation: A value is infinite, or neither number nor label.
     """
     temporal, columns = model.is_temporal, _columns(model, observed)
-    rows, steps = set[int](), set[int]()
+    leads, found = set[tuple[int, ...]](), dict[str, Value]()
     for name, values in columns.items():
         shape = model.declared(name).shape
         lead = values.shape[: values.ndim - len(shape)]
@@ -59,66 +56,56 @@ def observations(model: SCM, observed: Any) -> Observations:
             allowed = "(steps,) or (rows, steps)" if temporal else "() or (rows,)"
             said = f"{name!r} was observed with shape {values.shape}: give {allowed}"
             raise ModelError([said + f" and then {shape}" * bool(shape)])
-        steps.add(lead[-1] if temporal else 1)
-        rows.add(lead[0] if len(lead) > temporal else ONE)
-    if len(rows) > 1 or len(steps) > 1 or not columns or 0 in steps | rows:
-        said = "observe at least one variable, and all of the same rows and control steps"
-        raise ModelError([said])
-    count, length, found = max(1, *rows), steps.pop(), dict[str, Value]()
-    for name, values in columns.items():
-        found[name] = values.reshape(count, length, *model.declared(name).shape)
-        unknown = np.isnan(values).reshape(count, length, -1)
+        leads.add(lead)
+        rows = lead[0] if len(lead) > temporal else 1
+        found[name] = values.reshape(rows, lead[-1] if temporal else 1, *shape)
+        unknown = np.isnan(values.reshape(*lead, int(np.prod(shape))))
         if np.isinf(values).any():
             said = "an observation is finite, or NaN where there is none"
             raise ImpossibleObservation(name, said)
-        if (unknown.any(axis=2) & ~unknown.all(axis=2)).any():
+        if (unknown.any(axis=-1) & ~unknown.all(axis=-1)).any():
             raise ModelError([f"{name!r} was observed in part: give all of its numbers, or none"])
-    return Observations(found, count, length, rows == {ONE})
+    if len(leads) != 1 or 0 in next(iter(leads)):
+        said = "observe at least one variable, and all of the same rows and control steps"
+        raise ModelError([said])
+    rows, steps = next(iter(found.values())).shape[:2]
+    return Observations(found, rows, steps, len(leads.pop()) == temporal)
 
 
 def _columns(model: SCM, observed: Any) -> dict[str, Value]:
-    """Give numbers by variable, shape (..., *shape), with an axis for rows if there are several."""
+    """Return numbers by variable, shape (..., *shape), with an axis for rows if there are many."""
     if hasattr(observed, "regimes"):  # a Dataset
-        found = dict(zip(observed.names, observed.values.T, strict=True))
-        found |= {"episode": observed.episode, "step": observed.step}
-        found["intervention_targets"] = np.array([bool(names) for names in observed.targets])
+        given = dict(zip(observed.names, observed.values.T, strict=True))
+        given |= {"episode": observed.episode, "step": observed.step}
+        given["intervention_targets"] = np.array([bool(names) for names in observed.targets])
     elif isinstance(observed, Mapping) or hasattr(observed, "columns"):
         names = observed if isinstance(observed, Mapping) else observed.columns
-        found = {str(name): np.asarray(observed[name]) for name in names}
+        given = {str(name): np.asarray(observed[name]) for name in names}
     else:
         allowed = ("values by name", "a table by name", "a data frame", "a Dataset")
         raise UnknownOption("observed", observed, allowed)
-    apart = {name: found.pop(name) for name in RECORDED if name in found and name not in model}
-    if any(target is not None and target is not np.False_ for target in apart.get(RECORDED[3], ())):
+    about = {name: given.pop(name) for name in RECORDED if name in given and name not in model}
+    if any(target is not None and target is not np.False_ for target in about.get(RECORDED[3], ())):
         advice = "take its rows without (table.observational), or ask model.do({…}) of the others"
         raise ModelError([f"the table has rows in which something was done: {advice}"])
-    parts: dict[str, dict[int, Value]] = {}
     columns: dict[str, Value] = {}
-    for name, values in found.items():
+    for name, values in given.items():
         whole, _, place = name.removesuffix("]").rpartition("[")
-        if name not in model and name.endswith("]") and whole in model and place.isdecimal():
-            parts.setdefault(whole, {})[int(place)] = _numbers(model, whole, values)
-        elif name not in model:
-            raise UnknownVariable(name, model)
-        else:
+        if name in model:
             columns[name] = _numbers(model, name, values)
-    for name, each in parts.items():
-        shape = model.declared(name).shape
-        lost = sorted(set(range(int(np.prod(shape)))) - set(each))
-        if lost:
-            said = f"{name!r} was observed in part: there is no '{name}[{lost[0]}]'"
-            raise ModelError([f"{said}; give all of its numbers, or none"])
-        stacked = np.stack([each[place] for place in sorted(each)], axis=-1)
-        columns[name] = stacked.reshape(*stacked.shape[:-1], *shape)
-    if model.is_temporal and "step" in apart:
-        order = np.lexsort((apart["step"], apart["episode"]))
-        _, counts = np.unique(apart["episode"], return_counts=True)
+        elif name.endswith("]") and whole in model and place.isdecimal():
+            shape, numbers = model.declared(whole).shape, _numbers(model, whole, values)
+            empty = np.full((*numbers.shape, *shape), np.nan)
+            columns.setdefault(whole, empty).reshape(*numbers.shape, -1)[..., int(place)] = numbers
+        else:
+            raise UnknownVariable(name, model)
+    if model.is_temporal and "step" in about:
+        order = np.lexsort((about["step"], about["episode"]))
+        _, counts = np.unique(about["episode"], return_counts=True)
         if len(set(counts.tolist())) != 1:
             raise ModelError(["the episodes of the table have different lengths; give one at once"])
-        columns = {
-            name: values[order].reshape(len(counts), counts[0], *values.shape[1:])
-            for name, values in columns.items()
-        }
+        both = (len(counts), counts[0])
+        columns = {name: v[order].reshape(*both, *v.shape[1:]) for name, v in columns.items()}
     return columns
 
 

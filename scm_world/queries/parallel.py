@@ -7,31 +7,24 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+import pickle
 from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, suppress
 from dataclasses import replace
-from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
-from scm_world.errors import EngineFailure, UnknownOption
+from scm_world.errors import EngineFailure
 from scm_world.policies.scripted import OpenLoopPolicy, as_policy
 from scm_world.queries.equations import Equations
-from scm_world.queries.plans import GroupedSchedules, Schedule
-from scm_world.queries.rollouts import (
-    ALL,
-    Running,
-    RunningTogether,
-    Trace,
-    Unit,
-    run,
-)
-from scm_world.queries.timed import On
-from scm_world.queries.twins import AnyTwins, EquationTwins, Twins, threaded
-from scm_world.work.executors import Executor
+from scm_world.queries.plans import GroupedSchedules
+from scm_world.queries.rollouts import ALL, RunningTogether, Trace, Unit, run
+from scm_world.queries.twins import AnyTwins, EquationTwins, Twins
 from scm_world.work.processes import cores
 from scm_world.world import Simulation
 from scm_world.world.batch import Batch
@@ -41,6 +34,8 @@ R = TypeVar("R")
 Result = Trace | Exception
 """What a unit leaves behind, or the exception that stopped it."""
 
+Results = Generator[Result, None, None]
+
 MOST = 64
 """Worlds that are stepped together, at most."""
 
@@ -49,6 +44,15 @@ LEAST = 4
 
 PRICE = 32
 """Control steps of one thread that it costs to make a world."""
+
+PAYS = 10_000
+"""Control steps that pay for the start of processes."""
+
+GOES_ON = 200
+"""Control steps that are worth sending to processes that are there."""
+
+SHARE = 4
+"""Jobs for each process, so that none waits long for the last one."""
 
 
 def run_units(
@@ -74,19 +78,29 @@ def run_units(
     given = None if workers is None else whole_number("workers", workers, least=1)
     is_child = multiprocessing.parent_process() is not None  # one of many that share the cores
     threads = given or (1 if is_child else cores())
-    n = _batch_size(twins, units, threads)
-    executor = None if n or twins.batches else executor_for(twins, units, given or 1)
-    if n:
+    if n := _batch_size(twins, units, threads):
         results = _in_batches(twins, units, n, threads)
-    elif executor is not None:
-        results = run_in_processes(executor, twins, units)
+    elif not twins.batches and not is_child and _pays(twins, units, given or 1):
+        results = _in_processes(twins, units, given or 1)
     else:
-        return _separately(twins, units, finish, given or 1)
+
+        def one(place: int) -> R:
+            return finish(place, _alone(twins, units[place]))
+
+        if (given or 1) == 1:
+            return [one(place) for place in range(len(units))]
+        with ThreadPoolExecutor(given) as pool:  # backends compute without Python's lock
+            return [*pool.map(one, range(len(units)))]
     with closing(results):
         return [finish(place, result) for place, result in enumerate(results)]
 
 
-Results = Generator[Result, None, None]
+def _alone(twins: Twins, unit: Unit) -> Result:
+    with twins.twin() as world:
+        return unit.result(world)
+
+
+# --- in a batch -----------------------------------------------------------------------------------
 
 
 def _batch_size(twins: Twins, units: Sequence[Unit], threads: int) -> int:
@@ -104,6 +118,11 @@ def _batch_size(twins: Twins, units: Sequence[Unit], threads: int) -> int:
     return math.ceil(len(units) / math.ceil(len(units) / most))
 
 
+def is_known(unit: Unit) -> bool:
+    """Tell whether all actions of a unit are known beforehand, so that it can be in a batch."""
+    return isinstance(as_policy(unit.policy), OpenLoopPolicy) and ALL not in unit.names
+
+
 def _in_batches(twins: Twins, units: Sequence[Unit], n: int, threads: int) -> Results:
     """Run units together, n at a time."""
     with twins.together(n, units[0].names, threads) as batch:
@@ -112,26 +131,103 @@ def _in_batches(twins: Twins, units: Sequence[Unit], n: int, threads: int) -> Re
             try:
                 yield from run_together(batch, some)
             except EngineFailure:  # run separately, it ends its own unit only
-                yield from _separately(twins, some, lambda _, result: result, 1)
+                yield from (_alone(twins, unit) for unit in some)
 
 
-def _separately(
-    twins: Twins, units: Sequence[Unit], finish: Callable[[int, Result], R], workers: int
-) -> list[R]:
-    def one(place: int) -> R:
+def run_together(batch: Batch, units: Sequence[Unit]) -> list[Result]:
+    """Run units in the rows of a batch.
+
+    Args:
+        batch: Of as many worlds or more; see ``RunningTogether``.
+        units: See there.
+
+    Returns:
+        What each leaves behind, or the exception that stopped it.
+
+    Raises:
+        EngineFailure: The backend lost one of the states; that stops all of them.
+    """
+    running = RunningTogether(batch, units)
+    running.begin()
+    run(running, units[0].first, units[0].steps)
+    return running.results()
+
+
+# --- in processes ---------------------------------------------------------------------------------
+
+
+def _pays(twins: Twins, units: Sequence[Unit], workers: int) -> bool:
+    """Tell whether processes pay, and everything can be sent to them."""
+    steps = sum(unit.steps - unit.first for unit in units)
+    worth = GOES_ON if twins.has_pool(workers) else PAYS
+    if workers < 2 or len(units) < 2 or steps < worth:
+        return False
+    try:
+        pickle.dumps((twins, [_sent(unit) for unit in units]))
+    except Exception:  # such as a policy that is a lambda: it acts in this process
+        return False
+    return True
+
+
+def _in_processes(twins: Twins, units: Sequence[Unit], workers: int) -> Results:
+    """Run units in other processes; yield the results in the order of the units.
+
+    Raises:
+        EngineFailure: A process ended.
+    """
+    size = math.ceil(len(units) / (SHARE * workers))
+    jobs = [tuple(map(_sent, units[i : i + size])) for i in range(0, len(units), size)]
+    futures = [twins.pool(workers).submit(_run_there, twins, job) for job in jobs]
+    try:
         with twins.twin() as world:
-            result = units[place].result(world)
-        return finish(place, result)
+            for future in futures:
+                yield from (_unpacked(result, world) for result in future.result())
+    except BrokenProcessPool:
+        twins.close_pool()
+        raise EngineFailure("a worker process ended", "the backend of a worker") from None
+    finally:
+        for future in futures:
+            future.cancel()
 
-    return threaded(one, range(len(units)), workers)
+
+_THERE: dict[bytes, Twins] = {}
+"""In a worker process: the twins that it has, by what was sent."""
+
+
+def _run_there(twins: Twins, units: Sequence[Unit]) -> list[Any]:
+    """Run units in this process for another one, and pack what each leaves behind."""
+    kept = _THERE.setdefault(pickle.dumps(twins), twins)
+    with kept.twin() as world:
+        here = (replace(unit, past=_unpacked(unit.past, world)) for unit in units)
+        return [_packed(unit.result(world)) for unit in here]
+
+
+def _sent(unit: Unit) -> Unit:
+    return replace(unit, past=_packed(unit.past))
+
+
+def _packed(result: Any) -> Any:
+    """Write down a trace for another process: of a structure, what decides it."""
+    if not isinstance(result, Trace):
+        return result
+    return replace(result, declarations=[(step, d.plan) for step, d in result.declarations])
+
+
+def _unpacked(result: Any, world: Simulation) -> Any:
+    if not isinstance(result, Trace):
+        return result
+    found = [(step, world.structures.compiled(plan)) for step, plan in result.declarations]
+    return replace(result, declarations=found)
+
+
+# --- equations ------------------------------------------------------------------------------------
 
 
 def _solved(twins: EquationTwins, units: Sequence[Unit]) -> list[Result]:
     """Run units: together where they can be, else one by one."""
-    try:
+    together = None
+    with suppress(Exception):  # run separately, it ends its own unit only
         together = _solved_together(twins, units)
-    except Exception:  # run separately, it ends its own unit only
-        together = None
     if together is None:
         return [unit.result(Equations(twins.layout)) for unit in units]
     return [
@@ -163,135 +259,24 @@ def _solved_together(twins: EquationTwins, units: Sequence[Unit]) -> tuple[Float
     first, one = units[0], Equations(twins.layout)
     policies = [as_policy(unit.policy, one) for unit in units] if twins.layout.n_actions else []
     numbers = range(first.number, first.number + len(units))
+    schedules: dict[int, Any] = {id(unit.schedule): unit.schedule for unit in units}
     if (
         not twins.layout.is_vectorised
         or any(unit.first or unit.number != i for unit, i in zip(units, numbers, strict=True))
         or any((unit.seed, unit.steps) != (first.seed, first.steps) for unit in units)
         or not all(isinstance(policy, OpenLoopPolicy) for policy in policies)
+        or any(schedule.waits for schedule in schedules.values())
     ):
         return None
-    keys = [tuple((at, id(plan)) for at, plan in unit.layers) for unit in units]
-    kinds = {key: unit.layers for key, unit in zip(keys, units, strict=True)}
-    plans = (plan for layers in kinds.values() for _, plan in layers)
-    if any(isinstance(part, On) for plan in plans for _, part in plan.timed()):
-        return None
-    places = {kind: group for group, kind in enumerate(kinds)}
-    groups = [places[key] for key in keys]
+    places = {key: group for group, key in enumerate(schedules)}
+    groups = [places[id(unit.schedule)] for unit in units]
     actions = np.empty((len(units), first.steps, twins.layout.n_actions))
     for row, policy in enumerate(policies):
         one.reset(seed=first.seed, episode=numbers[row])
         actions[row] = policy.ahead(one, 0, first.steps)  # type: ignore[attr-defined] # OpenLoopPolicy
-    together = Equations(twins.layout, groups)
-    unit = replace(first, policy=lambda system: actions[:, system.index], names=())
-    running = Running(unit, together)
-    running.schedule = GroupedSchedules(map(Schedule, kinds.values()))
-    running.begin()
-    run(running, 0, first.steps)
-    return np.stack(running.trace.vectors, axis=1), actions
-
-
-def is_known(unit: Unit) -> bool:
-    """Tell whether all actions of a unit are known beforehand, so that it can be in a batch."""
-    return isinstance(as_policy(unit.policy), OpenLoopPolicy) and ALL not in unit.names
-
-
-def run_together(batch: Batch, units: Sequence[Unit]) -> list[Result]:
-    """Run units in the rows of a batch.
-
-    Args:
-        batch: Of as many worlds or more; see ``RunningTogether``.
-        units: See there.
-
-    Returns:
-        What each leaves behind, or the exception that stopped it.
-
-    Raises:
-        EngineFailure: The backend lost one of the states; that stops all of them.
-    """
-    running = RunningTogether(batch, units)
-    running.begin()
-    run(running, units[0].first, units[0].steps)
-    return running.results()
-
-
-PAYS = 10_000
-"""Control steps that pay for the start of processes."""
-
-GOES_ON = 200
-"""Control steps that are worth sending to processes that are there."""
-
-SHARE = 4
-"""Jobs for each process, so that none waits long for the last one."""
-
-
-def executor_for(twins: Twins, units: Sequence[Unit], workers: int) -> Executor | None:
-    """Return processes for some units; None where they do not pay, or cannot be.
-
-    Args:
-        twins: Of the world.
-        units: What is to be run.
-        workers: How many processes there may be.
-    """
-    steps = sum(unit.steps - unit.first for unit in units)
-    is_child = multiprocessing.parent_process() is not None
-    worth = GOES_ON if twins.has_executor(workers) else PAYS
-    if workers < 2 or len(units) < 2 or is_child or steps < worth:
-        return None
-    executor = twins.executor(workers)
-    try:
-        executor.check("twins", twins)
-        executor.check("units", [_sent(unit) for unit in units])
-    except UnknownOption:  # such as a policy that is a lambda: it acts in this process
-        return None
-    return executor
-
-
-def run_in_processes(executor: Executor, twins: Twins, units: Sequence[Unit]) -> Results:
-    """Run units in other processes.
-
-    Args:
-        executor: As ``executor_for`` gave it.
-        twins: Of the world.
-        units: To run.
-
-    Returns:
-        The result of each, in the order of the units.
-
-    Raises:
-        EngineFailure: Processes ended again and again.
-    """
-    size = math.ceil(len(units) / (SHARE * executor.workers))
-    jobs = [tuple(map(_sent, units[i : i + size])) for i in range(0, len(units), size)]
-    early: dict[int, list[Any]] = {}
-    done = 0
-    with twins.twin() as world:
-        for job, results in executor.run(partial(partial, _run_there, twins), jobs):
-            early[job] = results
-            while done in early:
-                yield from (_unpacked(result, world) for result in early.pop(done))
-                done += 1
-
-
-def _run_there(twins: Twins, units: Sequence[Unit]) -> list[Any]:
-    """Run units in this process for another one, and pack what each leaves behind."""
-    with twins.twin() as world:
-        here = (replace(unit, past=_unpacked(unit.past, world)) for unit in units)
-        return [_packed(unit.result(world)) for unit in here]
-
-
-def _sent(unit: Unit) -> Unit:
-    return replace(unit, past=_packed(unit.past))
-
-
-def _packed(result: Any) -> Any:
-    """Write down a trace for another process: of a structure, what decides it."""
-    if not isinstance(result, Trace):
-        return result
-    return replace(result, declarations=[(step, d.plan) for step, d in result.declarations])
-
-
-def _unpacked(result: Any, world: Simulation) -> Any:
-    if not isinstance(result, Trace):
-        return result
-    found = [(step, world.structures.compiled(plan)) for step, plan in result.declarations]
-    return replace(result, declarations=found)
+    grouped = GroupedSchedules(schedules.values())
+    unit = replace(
+        first, policy=lambda system: actions[:, system.index], names=(), schedule=grouped
+    )
+    trace = unit.run(Equations(twins.layout, groups))
+    return np.stack(trace.vectors, axis=1), actions

@@ -9,27 +9,58 @@ from typing import Any, final
 import numpy as np
 from pydantic import TypeAdapter
 
-from scm_world.errors import DAMAGED, InterventionError, ModelError
+from scm_world.errors import DAMAGED, InterventionError, ModelError, UnknownOption
 from scm_world.graph import SCM, flatten
+from scm_world.models import Model
 from scm_world.queries.equations import System
-from scm_world.queries.timed import ACTS, TIMED, At, Clamp, On, Timed, as_act
 from scm_world.variables import (
+    ACTS,
     Categories,
+    Contact,
     Draw,
     Function,
     Hard,
     Intervention,
     Mechanism,
     Natural,
+    Reaches,
     Scale,
     Shift,
+    Time,
 )
+from scm_world.variables.kinds import SPACES
 from scm_world.variables.mechanisms import check_portable, check_trusted
+from scm_world.world import Simulation
 
-FORMAT = "scm_world/plan/1"
-PACKAGE = "scm_world"
+FORMAT = "scm_world/plan/2"
 
-_PARTS: TypeAdapter[dict[str, tuple[Any, ...]]] = TypeAdapter(dict[str, tuple[Timed, ...]])
+_PARTS: TypeAdapter[dict[str, tuple[Any, ...]]] = TypeAdapter(dict[str, tuple[Intervention, ...]])
+
+
+def as_act(value: Any) -> Any:
+    """Make a plain value a hard intervention, and the name of a space a draw from it.
+
+    Raises:
+        UnknownOption: It is neither numbers nor an intervention.
+    """
+    if isinstance(value, ACTS) or (isinstance(value, dict) and "kind" in value):  # from a file
+        return value
+    if isinstance(value, dict):
+        allowed = "a value or an intervention: {'pole.mass': Hard(1.0, at=3)}, not Hard({…})"
+        raise UnknownOption("act", value, (allowed,))
+    if isinstance(value, str) and value in SPACES:
+        return Draw(value)
+    return Hard(value.tolist() if isinstance(value, np.ndarray) else value)
+
+
+def at_once(act: Any) -> Any:
+    """Return an intervention without its time."""
+    return act if act.time is None else act.model_copy(update={"time": None})
+
+
+def retimed(act: Any, **time: Any) -> Any:
+    """Return an intervention with another time; see ``Time``."""
+    return act.model_copy(update={"time": Time(**time)})
 
 
 @final
@@ -40,16 +71,16 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     beginning: of the episode, or at the instant from which a counterfactual continues.
 
     Args:
-        request: By variable, dotted or nested: a value, an intervention, or one with a time
-            (``At``, ``Clamp``, ``On``); a tuple or list of timed ones where there are several.
+        request: By variable, dotted or nested: a value, or an intervention, which may have a time
+            (``at=``, ``during=``, ``every=``, ``when=``); a tuple or list where there are several.
 
     Raises:
         UnknownOption: Something is no intervention.
 
     Example:
-        >>> plan = Plan({"tool_block": {"mass": 0.05}, "floor_friction": At(10, 0.2)})
+        >>> plan = Plan({"tool_block": {"mass": 0.05}, "floor_friction": Hard(0.2, at=10)})
         >>> plan.do({"tool_block.mass": 0.08}) == Plan(
-        ...     {"tool_block.mass": 0.08, "floor_friction": At(10, 0.2)}
+        ...     {"tool_block.mass": 0.08, "floor_friction": Hard(0.2, at=10)}
         ... )
         True
         >>> Plan.from_json(plan.to_json()) == plan
@@ -60,10 +91,17 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
     def __init__(self, request: Mapping[str, Any] | None = None) -> None:
         if isinstance(request, Plan):
-            self._parts: dict[str, tuple[Any, ...]] = dict(request._parts)
+            self._parts: dict[str, tuple[Any, ...]] = request._parts
         else:
             flat = flatten({} if request is None else request)
-            self._parts = {name: _parts(value) for name, value in flat.items()}
+            self._parts = {name: _several(value) for name, value in flat.items()}
+
+    @classmethod
+    def of(cls, parts: dict[str, tuple[Any, ...]]) -> Plan:
+        """Return the plan of interventions by dotted name, which are not looked at."""
+        made = cls.__new__(cls)
+        made._parts = parts
+        return made
 
     def __getitem__(self, name: str) -> tuple[Any, ...]:
         return self._parts[name]
@@ -86,43 +124,31 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     def __str__(self) -> str:
         if not self._parts:
             return "nothing done"
-        acts = (f"{name} = {_short(part)}" for name, parts in self._parts.items() for part in parts)
+        acts = (f"{name} = {_short(act)}" for name, acts in self._parts.items() for act in acts)
         return f"do({', '.join(acts)})"
 
     def do(self, request: Mapping[str, Any]) -> Plan:
-        """Give the plan that does this too; where both set a variable, this one counts."""
-        both = Plan()
-        both._parts = {**self._parts, **Plan(request)._parts}
-        return both
+        """Return the plan that does this too; where both set a variable, this one counts."""
+        return Plan.of({**self._parts, **Plan(request)._parts})
 
     def at_start(self) -> dict[str, Intervention]:
-        """Return the interventions at the beginning, by variable."""
+        """Return the interventions at the first instant, by variable and without times."""
         return {
-            name: part
-            for name, parts in self._parts.items()
-            for part in parts
-            if isinstance(part, ACTS)
+            name: at_once(act)
+            for name, acts in self._parts.items()
+            for act in acts
+            if act.time is None or act.time.start == 0
         }
 
-    def at_first(self) -> dict[str, Intervention]:
-        """Return the interventions at the first instant, with or without a time, by variable."""
-        found = self.at_start()
-        for name, part in self.timed():
-            if (isinstance(part, At) and part.step == 0) or (
-                isinstance(part, Clamp) and part.start == 0
-            ):
-                found[name] = part.act
-        return found
-
     def timed(self) -> Iterator[tuple[str, Any]]:
-        """List the interventions at later instants or on events."""
-        for name, parts in self._parts.items():
-            yield from ((name, part) for part in parts if isinstance(part, TIMED))
+        """List the interventions that have a time."""
+        for name, acts in self._parts.items():
+            yield from ((name, act) for act in acts if act.time is not None)
 
     def acts(self) -> Iterator[tuple[str, Intervention]]:
         """List all interventions, without their times."""
-        for name, parts in self._parts.items():
-            yield from ((name, part.act if isinstance(part, TIMED) else part) for part in parts)
+        for name, acts in self._parts.items():
+            yield from ((name, at_once(act)) for act in acts)
 
     # --- files --------------------------------------------------------------------------------
 
@@ -151,10 +177,9 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             ModelError: It is no plan, or it names a function outside of the trusted packages.
         """
         if not isinstance(data, dict) or data.get("format") != FORMAT:
-            raise ModelError([f"not a plan: expected the format {FORMAT!r}"])
-        plan = cls()
+            raise ModelError([f"not a plan: expected the format {FORMAT!r}; write it again"])
         try:
-            plan._parts = _PARTS.validate_json(json.dumps(data["do"]))
+            plan = cls.of(_PARTS.validate_json(json.dumps(data["do"])))
         except DAMAGED as error:
             raise ModelError([f"not a plan: {error}"]) from None
         check_trusted(plan._functions(), trusted)
@@ -170,40 +195,37 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         return cls.from_dict(data, trusted=trusted)
 
     def _functions(self) -> Iterable[Function]:
-        for _, act in self.acts():
-            if isinstance(act, Mechanism) and isinstance(act.function, Function):
-                yield act.function
+        for acts in self._parts.values():
+            for act in acts:
+                if isinstance(act, Mechanism) and isinstance(act.function, Function):
+                    yield act.function
 
 
-def _short(part: Any) -> str:
+def _short(act: Any) -> str:
     """Write an intervention down in few words."""
-    match part:
+    match act:
         case Hard(value=value):
-            return np.array2string(np.asarray(value), precision=4, separator=", ", threshold=9)
-        case At(step=step, act=act):
-            return f"{_short(act)} at {step}"
-        case Clamp(act=act, start=start, stop=stop):
-            return f"{_short(act)} from {start} to {'the end' if stop is None else stop}"
+            text = np.array2string(np.asarray(value), precision=4, separator=", ", threshold=9)
         case Shift(by=by) | Scale(by=by):
-            return f"{type(part).__name__}({by})"
+            text = f"{type(act).__name__}({by})"
         case Draw(source=source):
-            return f"Draw({source!r})"
+            text = f"Draw({source!r})"
         case Mechanism(parents=parents):
-            return f"a function of {', '.join(p.name for p in parents) or 'nothing'}"
-    return f"{type(part).__name__}()"
+            text = f"a function of {', '.join(p.name for p in parents) or 'nothing'}"
+        case _:
+            text = f"{type(act).__name__}()"
+    return text if act.time is None else f"{text} {act.time}"
 
 
-def _parts(value: Any) -> tuple[Any, ...]:
-    if isinstance(value, TIMED):
-        return (value,)
-    several = isinstance(value, list | tuple) and len(value) > 0
-    if several and all(isinstance(part, (*TIMED, *ACTS)) for part in value):
+def _several(value: Any) -> tuple[Any, ...]:
+    is_list = isinstance(value, list | tuple) and len(value) > 0
+    if is_list and all(isinstance(act, ACTS) for act in value):
         return tuple(value)
     return (as_act(value),)
 
 
 def do(request: Mapping[str, Any]) -> Plan:
-    """Give the plan that does this; see ``Plan``.
+    """Return the plan that does this; see ``Plan``.
 
     Example:
         >>> do({"floor_friction": 0.3}).do({"floor_friction": 0.4})
@@ -222,9 +244,6 @@ def numbered(model: SCM, request: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-__all__ = ["At", "Clamp", "On", "Plan", "do"]
-
-
 # --- which interventions are due when -----------------------------------------------------------
 
 Layer = tuple[int, Plan]
@@ -241,47 +260,66 @@ class Schedule:
         layers: In the order of their making.
 
     Raises:
-        InterventionError: An intervention is due before its plan begins, or a state is to be
-            held at what is no value.
+        InterventionError: An intervention is due before its plan begins.
     """
 
-    def __init__(self, layers: Iterable[Layer]) -> None:
-        self.layers = tuple((start, plan) for start, plan in layers if len(plan))
+    def __init__(self, layers: Iterable[Layer] = ()) -> None:
+        self.layers = tuple(layers)
         for start, plan in self.layers:
-            for name, part in plan.timed():
-                step = part.step if isinstance(part, At) else start
-                step = part.start if isinstance(part, Clamp) else step
-                if step < start:
+            for name, act in plan.timed():
+                time = act.time
+                if time.every is None and time.when is None and time.start < start:
                     raise InterventionError(
-                        f"do({name}): control step {step} is over; the plan begins at {start}",
+                        f"do({name}): control step {time.start} is over; the plan begins at "
+                        f"{start}",
                         variable=name,
-                        value=part,
+                        value=act,
                     )
-        self._is_simple = not any(True for _, plan in self.layers for _ in plan.timed())
-        self._starts = frozenset(start for start, _ in self.layers)
+        self._starts = frozenset(start for start, plan in self.layers if len(plan))
+        self._all, self._later = (
+            [
+                ((number, name, index), act)
+                for number, (_, plan) in enumerate(self.layers)
+                for name, acts in plan.items()
+                for index, act in enumerate(acts)
+                if act.time is not None or with_untimed
+            ]
+            for with_untimed in (True, False)
+        )
+
+    @property
+    def waits(self) -> bool:
+        """Whether anything waits for an event."""
+        return any(act.time.when is not None for _, act in self._later)
 
     def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[str, Intervention]:
-        """Give what is to be done at the beginning of a control step.
+        """Return what is to be done at the beginning of a control step, without times.
 
         Args:
             world: As it is then; events are looked for in it.
             step: Number of the control step.
             fired: When events happened; those of now are added.
         """
-        if self._is_simple and step not in self._starts:
-            return {}
         found: dict[str, Intervention] = {}
-        for number, name, start, parts in self._owners(step, world):
-            released = False
-            for index, part in enumerate(parts):
-                act = _due(part, step, start, name, world, fired, (number, name, index))
-                if isinstance(part, Clamp) and isinstance(act, Natural) and step == part.stop:
-                    released = True
-                elif act is not None:
-                    found[name] = act
-            if released and name not in found:
-                found[name] = _still_held(parts, step)
-        return found
+        ended: dict[str, Intervention] = {}
+        for key, act in self._possible(world, step, fired):
+            name, time = key[1], act.time
+            if time is not None and time.when is not None and key not in fired:
+                if not happens(time.when, world):
+                    continue
+                fired[key] = step
+            if time is not None and time.during is not None:
+                if _is_state(name, world) and not isinstance(act, Hard | Mechanism):
+                    raise InterventionError(
+                        f"do({name}): a state is held at a value or by a Mechanism, not by {act!r}",
+                        variable=name,
+                        value=act,
+                    )
+                if step == time.during[1]:
+                    ended[name] = self._still_held(key, step)
+                    continue
+            found[name] = at_once(act)
+        return {**ended, **found}
 
     def concerns(self, world: System, step: int, fired: Mapping[Key, int]) -> bool:
         """Tell whether anything may be due at a control step, without a look at the present.
@@ -291,29 +329,46 @@ class Schedule:
             step: Number of the control step.
             fired: When events happened.
         """
-        if self._is_simple or step in self._starts:
-            return step in self._starts
-        return any(
-            _concerns(part, step, start, world, name, fired, (number, name, index))
-            for number, (start, plan) in enumerate(self.layers)
-            if start <= step
-            for name, parts in plan.items()
-            for index, part in enumerate(parts)
-        )
+        return any(True for _ in self._possible(world, step, fired))
 
-    def _owners(self, step: int, world: System) -> Iterator[tuple[int, str, int, tuple[Any, ...]]]:
-        """List what counts at a step: of each quantity the last plan that names it."""
-        last: dict[str, tuple[int, dict[str, None]]] = {}
-        for number, (start, plan) in enumerate(self.layers):
-            for name in plan if start <= step else ():
-                for target in world.model.targets(name) if name in world.model else (name,):
-                    if last.get(target, (-1, {}))[0] != number:
-                        last[target] = (number, {})
-                    last[target][1][name] = None
-        owners = dict.fromkeys((number, name) for number, names in last.values() for name in names)
-        for number, name in owners:
-            start, plan = self.layers[number]
-            yield number, name, start, plan[name]
+    def _possible(
+        self, world: System, step: int, fired: Mapping[Key, int]
+    ) -> Iterator[tuple[Key, Any]]:
+        """List what is due at a control step, or waits for an event."""
+        for key, act in self._all if step in self._starts else self._later:
+            (number, name, _), time = key, act.time
+            start = self.layers[number][0]
+            if time is None:
+                is_possible = step == start
+            elif time.when is not None:
+                is_possible = step > start and fired.get(key, step) == step
+            elif time.during is not None:
+                at_end = step in time.during  # a state is put there at every step between
+                is_possible = time.holds(step) if _is_state(name, world) else at_end
+            elif time.every is not None:
+                since = step - time.start
+                is_possible = step >= start and since >= 0 and since % time.every == 0
+            else:
+                is_possible = step == time.at
+            if is_possible and self._counts(number, name, step, world):
+                yield key, act
+
+    def _counts(self, number: int, name: str, step: int, world: System) -> bool:
+        """Tell whether no later plan has taken over all quantities that a name sets."""
+        model = world.model
+        later = [plan for start, plan in self.layers[number + 1 :] if start <= step]
+        if not later or self.layers[number][0] > step:
+            return self.layers[number][0] <= step
+        taken = {target for plan in later for one in plan for target in targets(model, one)}
+        return not taken.issuperset(targets(model, name))
+
+    def _still_held(self, key: Key, step: int) -> Intervention:
+        """Return what holds where a window ends: one around it, or the variable's mechanism."""
+        for act in self.layers[key[0]][1][key[1]]:
+            if act.time is not None and act.time.holds(step):
+                held: Intervention = at_once(act)
+                return held
+        return Natural()
 
 
 @final
@@ -333,72 +388,43 @@ class GroupedSchedules:
         return {group: due for group, due in enumerate(dues) if due}
 
 
-def _still_held(parts: tuple[Any, ...], step: int) -> Intervention:
-    """Say what holds where a window ends: a window around it, or the variable's own mechanism."""
-    for part in parts:
-        is_open = isinstance(part, Clamp) and part.start <= step
-        if is_open and (part.stop is None or step < part.stop):
-            held: Intervention = part.act
-            return held
-    return Natural()
-
-
-def _concerns(
-    part: Any,
-    step: int,
-    start: int,
-    world: System,
-    name: str,
-    fired: Mapping[Key, int],
-    key: Key,
-) -> bool:
-    """Tell whether a part may be due at a control step."""
-    match part:
-        case At():
-            return part.step == step
-        case Clamp():
-            if step < part.start or (part.stop is not None and step > part.stop):
-                return False
-            is_held = name not in world.model or _is_state(name, world)
-            return is_held or step in (part.start, part.stop)
-        case On():
-            return step > start and fired.get(key, step) == step
-    return False
-
-
-def _due(
-    part: Any, step: int, start: int, name: str, world: System, fired: dict[Key, int], key: Key
-) -> Intervention | None:
-    act: Intervention | None = None
-    match part:
-        case At():
-            act = part.act if part.step == step else None
-        case Clamp():
-            act = _held(part, step, name, world)
-        case On():
-            if step > start and key not in fired and part.event.happens(world):
-                fired[key] = step
-            act = part.act if fired.get(key) == step else None
-        case _ if isinstance(part, ACTS):
-            act = part if step == start else None
-    return act
-
-
-def _held(part: Clamp, step: int, name: str, world: System) -> Intervention | None:
-    """Say what a clamp does: a state is put back at every step, a parameter is set and released."""
-    if step < part.start or (part.stop is not None and step > part.stop):
-        return None
-    if not _is_state(name, world):
-        return {part.start: part.act, part.stop: Natural()}.get(step)
-    if not isinstance(part.act, Hard | Mechanism):
-        raise InterventionError(
-            f"do({name}): a state is held at a value or by a Mechanism, not by {part.act!r}",
-            variable=name,
-            value=part.act,
-        )
-    return part.act if step != part.stop else None
+def targets(model: SCM, name: str) -> tuple[str, ...]:
+    """Return the quantities that a name sets; itself where the model does not have it."""
+    return model.targets(name) if name in model else (name,)
 
 
 def _is_state(name: str, world: System) -> bool:
-    role: str = world.model.declared(world.model.target(name)).role
-    return role == "state"
+    return name in world.model and world.model.declared(world.model.target(name)).role == "state"
+
+
+def happens(event: Contact | Reaches, world: System) -> bool:
+    """Tell whether an event is there now.
+
+    Raises:
+        UnknownOption: There is no such body or number; equations have no bodies at all.
+    """
+    if isinstance(event, Reaches):
+        numbers = np.ravel(world[event.name])
+        if event.component >= len(numbers):
+            allowed = (f"0 to {len(numbers) - 1}",)
+            raise UnknownOption(f"component of {event.name}", event.component, allowed)
+        number = float(numbers[event.component])
+        return number > event.above if event.above is not None else number < (event.below or 0.0)
+    if not isinstance(world, Simulation):
+        raise UnknownOption("event of equations", event, ("Reaches(name, above=…)",))
+    known = world.structure.body_names if isinstance(world.structure, Model) else ()
+    for body in event.bodies if known else ():
+        if not any(name.startswith(body) for name in known):
+            raise UnknownOption("body of a contact", body, known)
+    first, second = event.bodies
+    return any(
+        contact.force > 0.0
+        and any(
+            one.startswith(first) and other.startswith(second)
+            for one, other in (contact.bodies, contact.bodies[::-1])
+        )
+        for contact in world.backend.contacts()
+    )
+
+
+__all__ = ["Plan", "do"]

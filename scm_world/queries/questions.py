@@ -19,7 +19,7 @@ from scm_world.queries.equations import Equations, System
 from scm_world.queries.estimates import Effect, effect_of
 from scm_world.queries.live import LiveEpisode
 from scm_world.queries.outcomes import Outcome, as_outcome, is_category, usual_outcomes
-from scm_world.queries.plans import Plan, numbered
+from scm_world.queries.plans import Plan, Schedule, numbered
 from scm_world.queries.progress import Progress, part
 from scm_world.queries.rollouts import Unit, as_names, length
 from scm_world.queries.samples import Samples, Setting
@@ -84,7 +84,7 @@ class Questions(ABC):
             unit = Unit(
                 seed=seed,
                 number=episode,
-                layers=((0, plan),),
+                schedule=Schedule([(0, plan)]),
                 policy=policy,
                 steps=length(world, steps),
                 names=as_names(record),
@@ -111,7 +111,7 @@ class Questions(ABC):
             InterventionError: An intervention was refused.
         """
         plan = self._with(do)
-        made = LiveEpisode(self._asked()[0], Unit(seed, episode, ((0, plan),), policy, 1))
+        made = LiveEpisode(self._asked()[0], Unit(seed, episode, Schedule([(0, plan)]), policy, 1))
         made.begin()
         return made
 
@@ -430,10 +430,10 @@ class SCM(Questions, graph.SCM):
 
         Abduction finds the noise of each unit from its observed values; then the model is solved
         again under the intervention, with the same noise. The noise of what was observed follows
-        exactly if it is added, if the mechanism is monotone in it, or if there is an
-        ``inverse_noise``; where several values of the noise are possible, and where a variable was
-        not observed, it is drawn given the observations. The replay of a simulated episode, whose
-        noise is known, is ``rollout(…).counterfactual(do)``.
+        as ``inverse_noise`` of the variable declares; where several values of the noise are
+        possible, where nothing is declared, and where a variable was not observed, it is drawn and
+        weighed by the observations. The replay of a simulated episode, whose noise is known, is
+        ``rollout(…).counterfactual(do)``.
 
         Args:
             observed: Values or labels by name, of some or all variables: a row (values of the shape
@@ -446,14 +446,14 @@ class SCM(Questions, graph.SCM):
                 where everything follows exactly, and 1000 elsewhere, if None.
             seed: Of the draws.
             tolerance: How far a value may lie from what follows of its causes, relative to one plus
-                its size.
+                its size. Of a function that declares no ``inverse_noise``, draws within it count.
 
         Returns:
             Values by name, with what they were, weights and effective number of draws.
 
         Raises:
             ImpossibleObservation: The model cannot give it; the error names the variable.
-            ModelError: A mechanism cannot be inverted; the error says what to declare.
+            ModelError: No draw gives an observation; the error says what to observe or declare.
             InterventionError: The intervention was refused.
 
         Example:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, final
 
 import numpy as np
@@ -16,7 +15,7 @@ from scm_world.errors import ActionError, UnknownOption, blamed
 from scm_world.policies.scripted import Policy, as_policy
 from scm_world.queries.equations import Equations, System
 from scm_world.queries.local import contacts_of
-from scm_world.queries.plans import GroupedSchedules, Key, Layer, Schedule
+from scm_world.queries.plans import GroupedSchedules, Key, Schedule
 from scm_world.world import Audit, Simulation
 from scm_world.world.batch import Batch, StateTable
 
@@ -129,7 +128,7 @@ class Unit:
     Attributes:
         seed: Of the noise.
         number: Of the episode within that noise.
-        layers: Plans, each with the control step from which it counts.
+        schedule: What is done, and when.
         policy: Who acts; see ``rollout``.
         steps: How many control steps the episode has.
         names: Variables to record at every instant; ``ALL`` for all.
@@ -142,7 +141,7 @@ class Unit:
 
     seed: int
     number: int
-    layers: tuple[Layer, ...]
+    schedule: Schedule | GroupedSchedules
     policy: Any
     steps: int
     names: tuple[str, ...] = ()
@@ -212,11 +211,6 @@ class Running:
         self.trace.values = {name: list(values) for name, values in unit.past.values.items()}
         self._version = -1
 
-    @cached_property
-    def schedule(self) -> Schedule | GroupedSchedules:
-        """The interventions of the unit."""
-        return Schedule(self.unit.layers)
-
     def begin(self, arrive: Callable[[System], None] | None = None) -> None:
         """Go to the first instant and do what is due then; see ``Unit.run``."""
         if arrive is not None:
@@ -229,7 +223,7 @@ class Running:
 
     def intervene(self, step: int) -> None:
         """Do what is due at an instant."""
-        due: Any = self.schedule.due(self.world, step, self.trace.fired)
+        due: Any = self.unit.schedule.due(self.world, step, self.trace.fired)
         if due:
             self.trace.audits[step] = self.world.do(due)
 
@@ -292,12 +286,10 @@ class RunningTogether:
         self._first, self._steps, self._names = units[0].first, units[0].steps, units[0].names
         self._goes_on = np.arange(len(batch)) < len(units)
         self._pending = np.zeros(len(batch), dtype=np.bool_)  # stepped, and not recorded
-        self._shifts = [0] * len(units)  # of the clock: an intervention can set it
         n_actions = self._rows[0].world.compiled.n_actions
         self._commands = np.zeros((self._steps, len(batch), n_actions))
-        self._columns: dict[int, tuple[StateTable, _Columns]] = {}
         self._numbers: list[list[Floats]] = [[] for _ in units]  # of rows, not in the trace yet
-        self._read_by: list[_Columns | None] = [None] * len(units)
+        self._tables: dict[int, StateTable] = {}  # of the rows that have such numbers
 
     def begin(self) -> None:
         """Bring every world to the first instant."""
@@ -308,7 +300,7 @@ class RunningTogether:
         """Do what is due at an instant."""
         for row in np.flatnonzero(self._goes_on).tolist():
             one = self._rows[row]
-            schedule: Any = one.schedule
+            schedule: Any = one.unit.schedule
             if schedule.concerns(one.world, step, one.trace.fired):
                 self._alone(row, step)
 
@@ -316,12 +308,9 @@ class RunningTogether:
         """Record an instant of those rows that have not been recorded by themselves."""
         rows = np.flatnonzero(self._pending)
         for table, members in self._batch.tables(rows) if len(rows) else ():
-            if id(table) not in self._columns:
-                self._columns[id(table)] = table, _Columns.of(table, self._names)
-            columns = self._columns[id(table)][1]
-            numbers = table.matrix[members[:, None], columns.read]
+            numbers = table.matrix[members[:, None], _columns(table, self._names)]
             for row, mine in zip(members.tolist(), numbers, strict=True):
-                self._read_by[row] = columns
+                self._tables[row] = table
                 self._numbers[row].append(mine)
 
     def act(self, step: int) -> None:
@@ -337,7 +326,7 @@ class RunningTogether:
         return [self._errors.get(row, one.trace) for row, one in enumerate(self._rows)]
 
     def _alone(self, row: int, step: int) -> None:
-        """Reset or intervene in one world alone, and record the instant."""
+        """Reset or intervene in one world alone, record the instant, and ask for what follows."""
         one = self._rows[row]
         self._flush(row)
         self._pending[row] = False
@@ -348,61 +337,36 @@ class RunningTogether:
             else:
                 one.intervene(step)
             one.note(step)
-            shift = one.world.index - step
-            if step == self._first or shift != self._shifts[row]:
-                self._shifts[row] = shift
-                self._look_ahead(row, step)
+            with blamed(lambda: _who(one.policy, one.world)):
+                given = one.policy.ahead(one.world, one.world.index, self._steps - step)
+            for command, action in zip(self._commands[step:, row], given, strict=True):
+                command[:] = one.world.compiled.clipped(action)
+            one.trace.actions[step:] = np.array(given)
         except Exception as error:  # it ends this unit, and no other one
             self._errors[row] = error
             self._goes_on[row] = False
 
-    def _look_ahead(self, row: int, step: int) -> None:
-        """Ask a policy for all actions that are left."""
-        one = self._rows[row]
-        with blamed(lambda: _who(one.policy, one.world)):
-            given = one.policy.ahead(one.world, one.world.index, self._steps - step)
-        for command, action in zip(self._commands[step:, row], given, strict=True):
-            command[:] = one.world.compiled.clipped(action)
-        one.trace.actions[step:] = np.array(given)
-
     def _flush(self, row: int) -> None:
         """Move the numbers of a row into its trace."""
-        columns, trace = self._read_by[row], self._rows[row].trace
-        if not self._numbers[row] or columns is None:
+        if not self._numbers[row]:
             return
+        table, trace = self._tables[row], self._rows[row].trace
         numbers, self._numbers[row] = np.array(self._numbers[row]), []
-        trace.vectors.extend(numbers[:, : columns.size].copy())
-        for name, (place, shape) in columns.names.items():
-            values = trace.values[name]
-            found = numbers[:, place].reshape(-1, *shape)
-            cast = found.astype(values[-1].dtype)  # the last one was recorded by the world itself
-            values.extend(cast if np.array_equal(cast, found, equal_nan=True) else found)
+        width = table.state_size
+        trace.vectors.extend(numbers[:, :width].copy())
+        for name in self._names:
+            if name in table.compiled.model:
+                shape = table.compiled.model.declared(name).shape
+                size = table.where[name].stop - table.where[name].start
+                found = numbers[:, width : width + size].reshape(-1, *shape)
+                width += size
+                values = trace.values[name]
+                cast = found.astype(values[-1].dtype)  # recorded by the world itself
+                values.extend(cast if np.array_equal(cast, found, equal_nan=True) else found)
 
 
-@final
-@dataclass
-class _Columns:
-    """Which columns of a table are recorded.
-
-    Attributes:
-        read: The columns, those of the state first.
-        size: How many are those of the state.
-        names: For each variable its place among these columns, and its shape.
-    """
-
-    read: Integers
-    size: int
-    names: dict[str, tuple[slice, tuple[int, ...]]]
-
-    @classmethod
-    def of(cls, table: StateTable, names: Sequence[str]) -> _Columns:
-        """Find them."""
-        model, width = table.compiled.model, table.state_size
-        parts, places = [np.arange(width)], {}
-        for name in names:
-            if name in model:
-                where = table.where[name]
-                parts.append(np.arange(where.start, where.stop))
-                places[name] = slice(width, width + len(parts[-1])), model.declared(name).shape
-                width += len(parts[-1])
-        return cls(np.concatenate(parts), table.state_size, places)
+def _columns(table: StateTable, names: Sequence[str]) -> Integers:
+    """Return the columns of a table that are recorded: the state, and variables by name."""
+    places = [table.where[name] for name in names if name in table.compiled.model]
+    found: Integers = np.r_[slice(0, table.state_size), *places]
+    return found

@@ -26,11 +26,11 @@ from scm_world.queries.outcomes import (
     read,
 )
 from scm_world.queries.parallel import Result, paths, run_units
-from scm_world.queries.plans import Plan
+from scm_world.queries.plans import Plan, Schedule
 from scm_world.queries.progress import Progress
 from scm_world.queries.rollouts import Unit, as_names, length
 from scm_world.queries.twins import AnyTwins, EquationTwins
-from scm_world.world.plan import merged
+from scm_world.world.interventions import merged
 
 STEPS = 25
 """Control steps of an episode by default: one second at 25 steps a second."""
@@ -86,7 +86,7 @@ class Setting:
         """
         nature, acts = Plan(self.nature), Plan(do)
         for name in acts:
-            if name in nature and name not in acts.at_first():
+            if name in nature and name not in acts.at_start():
                 acts = acts.do({name: (*nature[name], *acts[name])})  # until then nature counts
         return Plan(merged(world.model, nature, acts))
 
@@ -105,7 +105,7 @@ class Setting:
         return Unit(
             seed=self.seed,
             number=number,
-            layers=((0, plan),),
+            schedule=Schedule([(0, plan)]),
             policy=self.policy,
             steps=length(world, self.steps),
             names=as_names(names),
@@ -244,15 +244,14 @@ def sample(
     first = whole_number("first", first, least=0)
     numbers, plan = range(first, first + count), setting.plan(world, do)
     unit = setting.unit(world, plan, first, names)
-    for name, part in Plan(do).timed():
-        begin = getattr(part, "step", getattr(part, "start", 0))
-        if begin > 0 and begin >= unit.steps:
+    for name, act in Plan(do).timed():
+        if (act.time.start or 0) >= max(unit.steps, 1):
             allowed = (f"a control step before {unit.steps}, where episodes end",)
-            raise UnknownOption(f"time of an intervention on {name}", part, allowed)
+            raise UnknownOption(f"time of an intervention on {name}", act, allowed)
     units = [replace(unit, number=number) for number in numbers]
     if each:
-        several = [((0, plan.do(more)),) for more in each]
-        units = [replace(one, layers=own) for one, own in zip(units, several, strict=True)]
+        several = [Schedule([(0, plan.do(more))]) for more in each]
+        units = [replace(one, schedule=own) for one, own in zip(units, several, strict=True)]
     if isinstance(twins, EquationTwins) and all(isinstance(one, Outcome) for one in wanted):
         vectors = paths(twins, units)
         read_off = (one.of_many(twins.layout.read(one.name, vectors)) for one in wanted)

@@ -2,47 +2,34 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
-from scm_world.output.reading import read_text
 
 _COMPONENT = re.compile(r"(.+)\[(\d+)\]")
 
 Row = tuple[dict[str, Any], int]
-"""What is done, and in how many episodes."""
+"""The intervention, and in how many episodes."""
 
 
-def read_protocol(protocol: Path | str | Iterable[Mapping[str, Any]], model: SCM) -> list[Row]:
+def read_protocol(protocol: Iterable[Mapping[str, Any]], model: SCM) -> list[Row]:
     """Read a table of settings.
 
     Args:
-        protocol: A CSV file, or rows. Columns are variables, or components ``name[i]`` of them
-            (all of them then), and ``n``, the number of episodes, which is 1 without it.
+        protocol: Rows. Columns are variables, or components ``name[i]`` of them (all of them then),
+            and ``n``, the number of episodes, which is 1 without it.
         model: Knows the shapes of the variables.
 
     Raises:
-        UnreadableFile: There is no such table.
         UnknownOption: A cell is no number, or a component is missing.
         UnknownVariable: A column is no variable.
     """
-    if isinstance(protocol, str | Path):
-        try:
-            text = read_text(protocol, "utf-8-sig")
-            rows: list[Mapping[str, Any]] = list(csv.DictReader(io.StringIO(text, newline="")))
-        except (OSError, csv.Error, UnicodeDecodeError) as error:
-            advice = "give a CSV file whose first line names variables"
-            raise UnreadableFile(str(protocol), str(error), advice) from None
-    else:
-        rows = list(protocol) if isinstance(protocol, Iterable) else [protocol]
+    rows = list(protocol) if isinstance(protocol, Iterable) else [protocol]
     for number, row in enumerate(rows):
         if not isinstance(row, Mapping) or not all(isinstance(column, str) for column in row):
             allowed = ("a dictionary of variables and numbers", "as many cells as columns")
@@ -60,32 +47,26 @@ def _row(cells: dict[str, Any], model: SCM, number: int) -> Row:
     if count < 1:
         raise UnknownOption(f"n of row {number}", n, ("a whole number from 1 on",))
     whole: dict[str, Any] = {}
-    parts: dict[str, dict[int, float]] = {}
     for column, cell in cells.items():
         if cell is None or (isinstance(cell, str) and not cell.strip()):
             continue
+        try:
+            value = float(cell) if isinstance(cell, str) else cell
+        except ValueError:
+            raise UnknownOption(
+                f"{column} of row {number}", cell, ("a number", "nothing")
+            ) from None
         match = _COMPONENT.fullmatch(column)
-        value = _number(cell, f"{column} of row {number}")
+        variable = model.declared(column if match is None else match[1])
         if match is None:
-            model.declared(column)
             whole[column] = value
         else:
-            model.declared(match[1])
-            parts.setdefault(match[1], {})[int(match[2])] = value
-    for name, found in parts.items():
-        size = int(np.prod(model.declared(name).shape))
-        if sorted(found) != list(range(size)):
-            raise UnknownOption(
-                f"columns of {name}", sorted(found), (f"all of {name}[0…{size - 1}]",)
-            )
-        whole[name] = [found[i] for i in range(size)]
+            size, place = int(np.prod(variable.shape)), int(match[2])
+            if place >= size:
+                raise UnknownOption(f"column of row {number}", column, (f"0 to {size - 1}",))
+            whole.setdefault(variable.name, [None] * size)[place] = value
+    for name, value in whole.items():
+        if isinstance(value, list) and None in value:
+            allowed = (f"all of {name}[0…{len(value) - 1}]",)
+            raise UnknownOption(f"columns of {name}", value, allowed)
     return whole, count
-
-
-def _number(cell: Any, where: str) -> Any:
-    if not isinstance(cell, str):
-        return cell
-    try:
-        return float(cell)
-    except ValueError:
-        raise UnknownOption(where, cell, ("a number", "nothing")) from None

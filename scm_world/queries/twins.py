@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import copy
+import multiprocessing
 import threading
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from typing import Any, TypeVar, final
+from typing import Any, final
 from weakref import WeakKeyDictionary
 
 from scm_world.backends.base import EngineBatch
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.equations import Equations, Layout
-from scm_world.work.executors import Executor, Processes
 from scm_world.world import Simulation
 from scm_world.world.batch import Batch
 from scm_world.world.structures import StructureCache
-
-T = TypeVar("T")
-R = TypeVar("R")
 
 
 @final
@@ -47,11 +44,11 @@ class Twins:
         self._lock = threading.Lock()
         self._members: list[Simulation] = []  # of batches
         self._batching = threading.RLock()
-        self._executor: Executor | None = None
+        self._pool: tuple[int, ProcessPoolExecutor] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Copy and pickle without the twins."""
-        private = ("_free", "_lock", "_members", "_batching", "_executor")
+        private = ("_free", "_lock", "_members", "_batching", "_pool")
         return {name: value for name, value in self.__dict__.items() if name not in private}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -98,37 +95,30 @@ class Twins:
         """How many twins there are that can be stepped together."""
         return len(self._members)
 
-    def has_executor(self, workers: int) -> bool:
-        """Tell whether there are processes already."""
-        return self._executor is not None and self._executor.workers == workers
+    def has_pool(self, workers: int) -> bool:
+        """Tell whether there are so many processes already."""
+        return self._pool is not None and self._pool[0] == workers
 
-    def executor(self, workers: int) -> Executor:
+    def pool(self, workers: int) -> ProcessPoolExecutor:
         """Return processes, which end with the twins."""
-        with self._lock:
-            if self._executor is None or self._executor.workers != workers:
-                if self._executor is not None:
-                    self._executor.close()
-                self._executor = Processes(workers)
-                weakref.finalize(self, self._executor.close)
-            return self._executor
+        if self._pool is not None and self._pool[0] == workers:
+            return self._pool[1]
+        self.close_pool()
+        made = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+        weakref.finalize(self, made.shutdown, wait=False, cancel_futures=True)
+        self._pool = workers, made
+        return made
+
+    def close_pool(self) -> None:
+        """End the processes, if there are any."""
+        if self._pool is not None:
+            self._pool[1].shutdown(wait=False, cancel_futures=True)
+            self._pool = None
 
     def _make(self, family: StructureCache | None = None) -> Simulation:
         task = copy.copy(self.task) if family is None else family
         made: Simulation = self._build(self._kind, task, dict(self.options), None)
         return made
-
-
-def threaded(work: Callable[[T], R], items: Iterable[T], workers: int) -> list[R]:
-    """Do a piece of work for each item.
-
-    The backends compute without Python's lock, so that threads are worth it. The result does not
-    depend on how many there are.
-    """
-    todo: Sequence[T] = list(items)
-    if workers <= 1 or len(todo) <= 1:
-        return [work(item) for item in todo]
-    with ThreadPoolExecutor(min(workers, len(todo))) as pool:
-        return list(pool.map(work, todo))
 
 
 @final

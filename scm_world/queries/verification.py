@@ -43,25 +43,18 @@ class Report(BaseModel):
             raise UnreadableFile(cls.__name__, reason, "give what to_json() wrote") from None
 
 
-@final
-class Fired(Report):
-    """A declared edge that moved its child.
+class EdgeReport(Report):
+    """What was found of one edge.
 
     Attributes:
-        cause: The variable that was changed.
-        effect: The variable that responded.
-        lag: 0 or 1.
-        after: How many probe states it took.
-        largest: Largest effect observed, in the unit of the child.
-        states: In how many probe states it was observed.
+        cause: The variable that was changed; several, joined by ``" & "``, if each is needed.
+        effect: The variable that responded, or did not.
+        lag: After how many control steps.
     """
 
     cause: str
     effect: str
     lag: int
-    after: int
-    largest: float
-    states: int = 1
 
     @property
     def key(self) -> EdgeKey:
@@ -70,81 +63,49 @@ class Fired(Report):
 
 
 @final
-class Undeclared(Report):
-    """An effect without an edge.
+class Fired(EdgeReport):
+    """A declared edge that moved its child.
 
     Attributes:
-        cause: The variable that was changed; several, joined by ``" & "``, if each is needed.
-        effect: The variable that should not have responded.
-        lag: After how many control steps; from 2 on, something remembers what no state holds.
+        after: How many probe states it took.
+        largest: Largest effect observed, in the unit of the child.
+    """
+
+    after: int
+    largest: float
+
+
+@final
+class Undeclared(EdgeReport):
+    """An effect without an edge; at a lag of 2 or more, something remembers what no state holds.
+
+    Attributes:
         size: Largest effect observed, in the unit of the child.
         probe: Number of the probe state in which it was observed.
         kind: How this probe state came about.
-        change: By how much the cause was moved, flattened; empty if no world was intervened on.
-        again: Whether it was observed in the held-out probe states, too; None if there were none.
+        change: By how much the cause was moved, flattened; empty if a mechanism was evaluated.
     """
 
-    cause: str
-    effect: str
-    lag: int
     size: float
     probe: int
     kind: str
     change: tuple[float, ...]
-    again: bool | None = None
-
-    @property
-    def key(self) -> EdgeKey:
-        """Cause, effect and lag."""
-        return self.cause, self.effect, self.lag
 
     def __str__(self) -> str:
-        where = f"{self.size:.3g} in probe {self.probe} ({self.kind})"
-        again = {None: "", True: ", and held out", False: ", not held out"}[self.again]
-        return f"{arrow(self.key)}: {where}{again}"
+        return f"{arrow(self.key)}: {self.size:.3g} in probe {self.probe} ({self.kind})"
 
 
 @final
-class Unstable(Report):
-    """A variable that differs by itself, or after another one was changed and put back.
-
-    Attributes:
-        variable: That differs.
-        after: The other one, or ``""``.
-        size: Largest difference, in the unit of the variable.
-    """
-
-    variable: str
-    after: str
-    size: float
-
-    def __str__(self) -> str:
-        after = f" after {self.after} was put back" if self.after else ""
-        return f"{self.variable}{after}: {self.size:.3g}"
-
-
-@final
-class Unseen(Report):
+class Unseen(EdgeReport):
     """A declared edge that moved its child in no probe state.
 
     Attributes:
-        cause: The variable that was changed, or could not be.
-        effect: The variable that did not respond.
-        lag: 0 or 1.
         states: In how many probe states the cause was changed.
         reason: Why nothing was seen, as far as the experiments tell.
     """
 
-    cause: str
-    effect: str
-    lag: int
     states: int
     reason: str
-
-    @property
-    def key(self) -> EdgeKey:
-        """Cause, effect and lag."""
-        return self.cause, self.effect, self.lag
 
     def __str__(self) -> str:
         return f"{arrow(self.key)}: {self.reason}"
@@ -165,32 +126,23 @@ class Verification(Report):
             of an edge (the mass of what falls freely moves nothing).
         probes: Probe states that were used.
         held_out: Further ones, of another seed and without the task's scenarios, in which effects
-            without an edge were looked for; of a generated graph, what never fired and what is
-            undeclared.
-        seen_held_out: How many declared edges were seen in the held-out states; None of a generated
-            graph, of which not all are looked for.
+            without an edge were looked for.
         provenance: How many declared edges were seen, how many there are, and how many effects
             without an edge were seen, by what decides the effect: ``"engine"``, ``"readout"``
             (computed from states) or ``"definition"``.
-        unstable: What differed though nothing had been changed: from one evaluation or run to the
-            next, or after something was put back.
-        shared_noise: Pairs of variables that are given one and the same noise.
+        unstable: By how much a variable differed though nothing had been changed: in a second run,
+            or evaluated a second time.
         planned: How many probe states there may have been, without those.
         interrupted: Whether it was stopped (Ctrl-C) before it was through.
         rollouts: Control steps simulated in an experiment of their own.
-        floor: Largest difference one step after something was changed and put back.
-        threshold: An effect must exceed it.
-        settable: How many variables ``do`` accepts.
-        untried: Those of them for which no feasible value was found in any probe state.
         fired: Declared edges that were seen.
         unseen: Declared edges that were not, with the reasons.
         undeclared: Effects without an edge.
-        colors: Edges from a color to something that moves, declared or seen.
         seconds: Wall time.
         versions: Of everything that decides the result.
     """
 
-    format: Literal["scm_world/verification/2"] = "scm_world/verification/2"
+    format: Literal["scm_world/verification/3"] = "scm_world/verification/3"
     task: str
     arguments: tuple[str, ...] = ()
     backend: str
@@ -199,23 +151,21 @@ class Verification(Report):
     generated: bool = False
     probes: int
     held_out: int = 0
-    seen_held_out: int | None = None
     provenance: dict[str, tuple[int, int, int]] = {}
-    unstable: tuple[Unstable, ...] = ()
-    shared_noise: tuple[tuple[str, str], ...] = ()
+    unstable: dict[str, float] = {}
     planned: int
     interrupted: bool
     rollouts: int
-    floor: float
-    threshold: float
-    settable: int
-    untried: tuple[str, ...]
     fired: tuple[Fired, ...]
     unseen: tuple[Unseen, ...]
     undeclared: tuple[Undeclared, ...]
-    colors: tuple[EdgeKey, ...]
     seconds: float
     versions: dict[str, str]
+
+    @property
+    def floor(self) -> float:
+        """The largest difference between two runs without a change."""
+        return max(self.unstable.values(), default=0.0)
 
     @property
     def never_fired(self) -> tuple[EdgeKey, ...]:
@@ -259,14 +209,13 @@ class Verification(Report):
     def outcome(self) -> Outcome:
         """The verdict on the declared graph.
 
-        ``"refuted"`` if something was seen that it excludes: an effect without an edge, a
-        difference without a cause, noise in common, or a trace that undoing leaves. Otherwise
-        ``"confirmed"`` if every declared edge was seen and nothing was interrupted, and
-        ``"not refuted"`` if not.
+        ``"refuted"`` if something was seen that it excludes: an effect without an edge, or a
+        difference without a cause. Otherwise ``"confirmed"`` if every declared edge was seen and
+        nothing was interrupted, and ``"not refuted"`` if not.
         """
-        wrong = (self.undeclared, self.colors, self.unstable, self.shared_noise)
         return outcome(
-            wrong=self.floor > 0.0 or any(wrong), unseen=bool(self.unseen) or self.interrupted
+            wrong=bool(self.undeclared or self.unstable),
+            unseen=bool(self.unseen) or self.interrupted,
         )
 
     @property
@@ -280,15 +229,12 @@ class Verification(Report):
         """
         counts = (
             (len(self.undeclared), "effects without an edge"),
-            (len(self.colors), "colors that move something"),
             (len(self.unstable), "variables that differ by themselves"),
-            (len(self.shared_noise), "pairs of variables with noise in common"),
         )
         names, more = self.unresponsive[:NAMED], len(self.unresponsive) - NAMED
         also, its = f" and {more} more" if more > 0 else "", "its" if len(names) == 1 else "their"
         said = [f"{', '.join(names)}{also} never changed under any of {its} declared causes"]
         said = said * bool(names) + [f"{number} {what}" for number, what in counts if number]
-        said += ["undoing leaves a trace"] * (self.floor > 0.0)
         if self.unseen:
             said.append(f"{len(self.unseen)} of {len(self.declared)} edges were never seen")
         elif self.outcome == "confirmed":
@@ -300,32 +246,20 @@ class Verification(Report):
         """List the numbers, what they mean, and whether they are good."""
         states = f"{self.probes} of at most {self.planned}"
         states += f", {self.held_out} held out" if self.held_out else ""
-        least = min((edge.states for edge in self.fired), default=0)
-        more: list[Row] = [("each seen one in at least", f"{least} states", None)]
-        if self.seen_held_out is not None:
-            text = (
-                f"{self.seen_held_out} of {len(self.declared)} in {self.held_out} held-out states"
-            )
-            more.append(("without the task's scenarios", text, None))
         return (
             *counted(self.provenance),
             ("engine", f"{self.backend} {self.versions.get(self.backend, '')}".strip(), None),
             ("preset, seed", f"{self.preset}, {self.seed}", None),
             ("probe states", states + ": interrupted" * self.interrupted, None),
             ("rollouts", f"{self.rollouts:,}", None),
-            ("floor (do and undo)", f"{self.floor:g}", self.floor == 0.0),
-            ("settable variables", str(self.settable), None),
-            ("never feasible", listed(self.untried), None),
-            *more,
+            ("noise floor (run twice)", f"{self.floor:g}", self.floor == 0.0),
             ("never seen", self._reasons(), None),
             ("undeclared effects", listed(map(str, self.undeclared)), not self.undeclared),
-            ("differs by itself", listed(map(str, self.unstable)), not self.unstable),
             (
-                "noise in common",
-                listed(map(" and ".join, self.shared_noise)),
-                not self.shared_noise,
+                "differs by itself",
+                listed(f"{name}: {size:.3g}" for name, size in self.unstable.items()),
+                not self.unstable,
             ),
-            ("colors that move something", listed(map(arrow, self.colors)), not self.colors),
             ("seconds", f"{self.seconds:.1f}", None),
         )
 

@@ -8,17 +8,22 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Self, final
 
-from scm_world._types import Floats
+import networkx as nx
+
+from scm_world._types import ArrayLike, Floats
 from scm_world.backends import Backend
+from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import System
+from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Key, Plan, Schedule
+from scm_world.queries.progress import Progress
 from scm_world.queries.questions import Questions
 from scm_world.queries.twins import AnyTwins, twins_of
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit, Simulation, WorldSnapshot
-from scm_world.world.plan import merged
+from scm_world.world.interventions import merged
 
 
 @final
@@ -38,6 +43,25 @@ class World(Simulation, Questions):
         >>> episode.counterfactual({}) == episode
         True
     """
+
+    @classmethod
+    def of(cls, world: Simulation) -> Self:
+        """Return a world like another one, at the same instant, that can be asked.
+
+        Args:
+            world: Such as ``env.unwrapped.world``; it is left as it is.
+
+        Example:
+            >>> import gymnasium
+            >>> env = gymnasium.make("scm_world/Pushing-v0", backend="fake")
+            >>> _ = env.reset(seed=0)
+            >>> with World.of(env.unwrapped.world) as world:
+            ...     world.effect("reward", do={"floor_friction": 0.9}, n=2, steps=3).n
+            2
+        """
+        build, (_, *how) = Simulation.__reduce__(world)
+        made: Self = build(cls, *how)
+        return made
 
     @classmethod
     def from_mjcf(
@@ -207,6 +231,62 @@ class World(Simulation, Questions):
         factual = self.rollout(policy, seed=seed, episode=episode, steps=steps, record=record)
         return factual.counterfactual(do, at=at, actions=actions, record=record)
 
+    def compare(
+        self, backend: str, *, probes: int = 12, seed: int = 0, progress: Progress | None = None
+    ) -> Comparison:
+        """Compare the effects of parameters on two backends: their signs and sizes.
+
+        In states that are made of the same numbers on both, each parameter is changed alike, and
+        a control step is taken. What counts are effects that are ten times as large as the
+        difference of the two backends without any change.
+
+        Args:
+            backend: Name of the other backend.
+            probes: Number of states.
+            seed: Of states and values.
+            progress: Called with (finished, planned) after each state.
+
+        Raises:
+            MissingEngine: The backend is not installed.
+            UnknownOption: There is no such backend, or ``probes`` is not a positive whole number.
+
+        Example:
+            >>> World("reaching", backend="fake").compare("fake", probes=1).share
+            1.0
+        """
+        return compare_backends(self, backend, probes=probes, seed=seed, progress=progress)
+
+    def local_graph(self, action: ArrayLike | None = None) -> nx.MultiDiGraph:
+        """Return the declared graph with the edges that hold now, whose conditions are met.
+
+        An edge by contact holds if bodies that press on one another, directly or through others
+        that move, join its cause to its effect. The edges into a variable that is intervened on
+        are not there.
+
+        Args:
+            action: Of the coming control step, which is simulated to see what touches in any of
+                its physics steps, and undone. If None, the contacts are those of the last physics
+                step: all that a backend keeps of the past.
+
+        Returns:
+            A graph of variables; its edges have ``lag`` (in control steps) and ``when``.
+
+        Raises:
+            ActionError: Wrong shape, or a number that is not finite.
+            ModelError: Its contacts are not all known.
+            NotReset: There is no episode yet.
+
+        Example:
+            >>> world = World("pushing", backend="fake")
+            >>> world.reset(seed=0)
+            >>> graph = world.local_graph()
+            >>> graph.has_edge("tool_block.mass", "tool_block.linear_velocity")
+            True
+            >>> graph.has_edge("joint_positions", "tool_block.linear_velocity")
+            False
+        """
+        return local_graph(self, action)
+
     def __enter__(self) -> Self:
         return self
 
@@ -227,18 +307,23 @@ class World(Simulation, Questions):
         )
 
     def reset(
-        self, *, seed: int | None = None, episode: int = 0, do: Mapping[str, Any] | None = None
+        self,
+        *,
+        seed: int | None = None,
+        episode: int = 0,
+        do: Mapping[str, Any] | None = None,
+        space: AnyRegion | None = None,
     ) -> Audit | None:
         """Begin an episode, with what is given; see ``Simulation.reset``."""
         plan = self._with(do)
         if not len(self._standing) and not any(True for _ in plan.timed()):
             self._schedule, self._fired = Schedule(()), {}
-            return super().reset(seed=seed, episode=episode, do=do)
+            return super().reset(seed=seed, episode=episode, do=do, space=space)
         super().reset(seed=seed, episode=episode)
         fired: dict[Key, int] = {}
         self._schedule, self._fired = Schedule([(0, plan)]), fired
         due = self._schedule.due(self, 0, fired)
-        return self.do(due) if due else None
+        return self.do(due, space=space) if due else None
 
     def advance(self, command: Floats) -> None:
         """Advance one control step, with what is due at its beginning."""

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from scm_world._types import Floats
 from scm_world.backends.base import ContactPoint
-from scm_world.backends.renderer import body_names, shapes_of
+from scm_world.backends.renderer import shapes_of
 from scm_world.errors import ModelError
 from scm_world.models.scene import Scene
 from scm_world.models.shapes import KINDS, Mesh, Shapes
@@ -64,7 +64,7 @@ class SentShapes:
 
     def _described(self, number: int, shapes: Shapes, scene: Any) -> dict[str, Any]:
         table, n = shapes.table, len(shapes.table.kinds)
-        names = body_names(scene.structure) if n else ()
+        names = scene.structure.body_names if n else ()
         goals = n - (len(scene.goals) if n else 0)
         sent, listed = [], []
         for i in range(n):

@@ -22,7 +22,7 @@ from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, in_one_line
 from scm_world.evaluation import in_world
 from scm_world.policies.zoo import PREFIX as ZOO
-from scm_world.queries import At, Clamp, LiveEpisode, World, save_episode
+from scm_world.queries import LiveEpisode, World, save_episode
 from scm_world.studio.jobs import StudioJob
 from scm_world.studio.reading import (
     Spec,
@@ -36,7 +36,7 @@ from scm_world.studio.reading import (
     told,
 )
 from scm_world.studio.scene import SentShapes, frame, touching
-from scm_world.variables import Draw, Natural, Scale, Shift
+from scm_world.variables import Draw, Hard, Natural, Scale, Shift
 from scm_world.variables.spaces import problems_of
 from scm_world.world import Simulation
 
@@ -77,22 +77,21 @@ class Act(BaseModel):
         Raises:
             UnknownOption: A value is missing.
         """
-        act: Any
-        if self.kind == "draw":
-            act, code = Draw(self.source), f"sw.Draw({self.source!r})"
-        elif self.value is None:
+        kinds: dict[str, Any] = {"hard": Hard, "shift": Shift, "scale": Scale, "draw": Draw}
+        kind: Any = kinds[self.kind]
+        value = self.source if kind is Draw else self.value
+        if value is None:
             raise UnknownOption("value", None, ("a number", "a list of numbers"))
-        elif self.kind == "hard":
-            act, code = self.value, repr(self.value)
-        else:
-            kind = Shift if self.kind == "shift" else Scale
-            act, code = kind(self.value), f"sw.{kind.__name__}({self.value!r})"
         start = now if self.start is None else self.start
+        time: dict[str, Any] = {}
         if self.window:
-            return Clamp(act, start, self.stop), f"sw.Clamp({code}, {start}, {self.stop})"
-        if start != now:
-            return At(start, act), f"sw.At({start}, {code})"
-        return act, code
+            time = {"during": (start, self.stop)}
+        elif start != now:
+            time = {"at": start}
+        elif kind is Hard:
+            return value, repr(value)
+        given = ", ".join([repr(value), *(f"{name}={when!r}" for name, when in time.items())])
+        return kind(value, **time), f"sw.{kind.__name__}({given})"
 
 
 @final

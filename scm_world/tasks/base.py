@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self, final
 
@@ -13,6 +13,7 @@ import numpy as np
 from scm_world._types import Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
+from scm_world.graph import SCM
 from scm_world.tasks.composition import Composition
 from scm_world.variables import Box, Draw, Integers, Variable
 from scm_world.variables.kinds import SpaceName
@@ -278,6 +279,16 @@ class Task(ABC):
 
     def solution(self, values: Values) -> dict[str, Value]:
         """Return an intervention that fulfils the goal; an empty one without a goal."""
+        return {}
+
+    def groups(
+        self, model: SCM, spaced: Sequence[Variable], bodies: Collection[str]
+    ) -> dict[str, list[str]]:
+        """Return the groups of variables that curricula know by a word, such as ``"poses"``.
+
+        ``"unphysical"`` are those that ``@physics`` leaves out. Given are all variables, the roots
+        and states that have a space, and the bodies that move.
+        """
         return {}
 
     def sample_goal(self, space: SpaceName = "A") -> dict[str, Any]:

@@ -12,7 +12,7 @@ from numba import njit
 from scm_world._arguments import real_number
 from scm_world._types import Value, Values
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.geometry.scalars import scalar
+from scm_world.geometry.numbers import scalar
 from scm_world.variables import Box, Derived, Function, Integers, Linear, Measured, Parent, Variable
 
 FRACTION = "fractional_success"
@@ -63,14 +63,10 @@ def resolve(
     options: Common,
     terms: Iterable[Measured] = (),
 ) -> dict[str, float]:
-    """Compute the weight of every term.
+    """Compute the weight of every term, the further ones, too.
 
-    Args:
-        default: Weights of the dense terms of the task in their order, and of the fractional
-            success.
-        paper: Those of the published training runs, where they differ.
-        options: What the user asked for.
-        terms: Further ones; see ``further_terms``.
+    Default weights are those of the dense terms of the task in their order, and of the fractional
+    success; ``paper`` has those of the published training runs, where they differ.
 
     Raises:
         UnknownOption: A preset or a term does not exist, or a weight is not a finite number.
@@ -109,12 +105,7 @@ def resolve(
 def further_terms(
     asked: Any, known: Iterable[str], ready: Iterable[Measured]
 ) -> tuple[Measured, ...]:
-    """Check reward terms that a task does not have by itself.
-
-    Args:
-        asked: Any number of them; a name stands for one that is ready.
-        known: Names of the terms that there are.
-        ready: The terms that names may stand for.
+    """Check reward terms besides the known ones of a task; a name stands for a ready one.
 
     Raises:
         UnknownOption: A name is not one of those, or a term is not a measured number with a
@@ -204,15 +195,7 @@ def reward(weights: Mapping[str, float]) -> Variable:
 
 
 def declared(name: str, given: Any) -> Variable:
-    """Declare reward, success or the end of an episode from a function and its parents.
-
-    Args:
-        name: ``"reward"``, ``"success"``, ``"terminated"`` or ``"fractional_success"``.
-        given: A ``Measured`` of this name, or ``(function, "parent", …)``.
-
-    Raises:
-        ModelError: It is neither.
-    """
+    """Declare reward, success or the end of an episode: ``(function, "parent", …)``, or itself."""
     if isinstance(given, Measured | Derived) and given.name == name:
         return given
     function, *parents = given if isinstance(given, tuple | list) else (given,)

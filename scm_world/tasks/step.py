@@ -7,6 +7,7 @@ from typing import Any, Literal, Self, final
 
 import numpy as np
 
+from scm_world._arguments import real_number
 from scm_world._types import Floats, Values
 from scm_world.backends import Backend
 from scm_world.backends.step import Quantity, StepModel
@@ -33,10 +34,6 @@ class ProcessNoise(Commands):
 
     A draw depends on seed, episode, control step and name only: interventions on other
     variables do not change it.
-
-    Args:
-        sources: What is drawn from, by name.
-        shapes: Of one draw.
     """
 
     def __init__(
@@ -152,8 +149,10 @@ class StepTask(DeclaredTask):
             yield 'a compiled function takes no dicts: set signature="arrays"'
         if self.signature not in ("dicts", "arrays"):
             yield f'signature={self.signature!r} must be "dicts" or "arrays"'
-        if not 0.0 < self.control_dt < np.inf:
+        if real_number("control_dt", self.control_dt) <= 0.0:
             yield f"control_dt={self.control_dt!r} must be a positive number [s]"
+        if not isinstance(self.noise, Mapping):
+            yield f"noise={self.noise!r} is not a dict of distributions by name"
         if not self.states:
             yield "there is no state: give states=[sw.Measured(name=…, parents=…)]"
 

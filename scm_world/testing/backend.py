@@ -100,7 +100,8 @@ class BackendConformance(ABC):
     def busy(self) -> Scene:
         """Return a scene in which bodies touch: the default one of the model."""
         with closing(World.from_mjcf(self.model, backend=self.make())) as world:
-            return world.structure.default_scene()
+            scene: Scene = world.structure.default_scene()
+            return scene
 
     def commands(self, structure: Any, steps: int, seed: int = SEED) -> Floats:
         """Draw commands, shape (steps, n_commands)."""

@@ -20,7 +20,6 @@ from scm_world._arguments import missing, one_of
 from scm_world._types import Floats
 from scm_world.curricula import make_vec
 from scm_world.env import IDS
-from scm_world.env.batched.vector_env import fastest
 from scm_world.errors import Diverged, UnknownOption, UnreadableFile
 from scm_world.output.durable import made, write_durably, write_whole
 from scm_world.policies import save_policy
@@ -137,23 +136,21 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
         UnknownOption: There is no such backend, or an option of the environment does not exist.
         InterventionError: The curriculum names something that does not exist.
     """
-    kind = fastest(backend, recipe.worlds, workers=None)
-    several = {"native": {"threads": threads}, "processes": {"workers": threads}}.get(kind, {})
+    several = "workers" if backend == "bullet" else "threads"
     ids = {task: name for name, task in IDS.items()}
     envs = make_vec(
         ids.get(recipe.task, ids["general"]),  # the task decides, not the id
         recipe.worlds,
         curriculum_of(recipe.curriculum),
-        vectorization_mode=kind,
         autoreset_mode=AutoresetMode.SAME_STEP,
         backend=backend,
         task=recipe.task,
-        **several,
+        **{several: threads},
         **recipe.trained_in,
     )
     try:
         vec_env = Sb3VecEnv(envs, [])
-        there = vec_env.executor.buffers.infos
+        (there,) = vec_env.get_attr("info_shapes", 0)
         vec_env.names = tuple(name for name in (SUCCESS, FRACTION) if name in there)
         (length,) = vec_env.get_attr("limit", 0)
         return Episodes(vec_env, length, staggered=recipe.staggered)

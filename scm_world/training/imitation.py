@@ -394,7 +394,7 @@ def _episode(
         observation, _, terminated, truncated, info = env.step(given)
         row = row + 1 if float(info[metric]) >= lesson.keep else 0
         over = terminated or truncated or row == lesson.settled
-        if not over and turn.step(env):
+        if not over and turn.stepped(env, env.world.index) and turn.act(env):
             observation = env.observe()
     return pairs, info
 

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from scm_world._arguments import missing, one_of
-from scm_world.env.batched import LoopExecutor, ScmWorldVectorEnv
+from scm_world.env import ScmWorldVectorEnv
 from scm_world.errors import UnknownOption
 
 try:
@@ -52,7 +52,6 @@ class Sb3VecEnv(VecEnv):
 
     Attributes:
         worlds: For all that Stable-Baselines3 knows nothing of: ``do``, ``branch``, …
-        executor: What simulates them.
         names: Keys of ``info`` that are passed on at every step; all if None.
 
     Raises:
@@ -67,9 +66,9 @@ class Sb3VecEnv(VecEnv):
         if not isinstance(envs.unwrapped, ScmWorldVectorEnv):
             raise UnknownOption("envs", envs, ("what gymnasium.make_vec makes of a task",))
         self.worlds: Any = envs
-        bare: Any = envs.unwrapped
-        self.executor: LoopExecutor = bare.executor
-        known = self.executor.buffers.infos
+        self._members: Any = envs.unwrapped
+        (shapes, *_) = self._members.get_attr("info_shapes")
+        known = (*shapes, "reward_terms")
         self.names = infos and tuple(name for name in infos if name in known or name not in USUAL)
         for name in self.names or ():
             one_of("info", name, known)
@@ -114,17 +113,19 @@ class Sb3VecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of some worlds."""
-        return self.executor.attribute(self._chosen(indices), attr_name)
+        return self.env_method("get_wrapper_attr", attr_name, indices=indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of some worlds to one value."""
-        self.executor.assign(attr_name, dict.fromkeys(self._chosen(indices), value))
+        self.env_method("set_wrapper_attr", attr_name, value, indices=indices)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
         """Call a method of some worlds."""
-        return self.executor.call(self._chosen(indices), method_name, *method_args, **method_kwargs)
+        chosen = self._chosen(indices)
+        found: list[Any] = self._members.call_in(chosen, method_name, *method_args, **method_kwargs)
+        return found
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """Tell whether worlds are in a wrapper: none is, one by one."""

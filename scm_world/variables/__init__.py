@@ -17,6 +17,7 @@ from scm_world.variables.distributions import (
     StudentT,
 )
 from scm_world.variables.interventions import (
+    ACTS,
     SOFT,
     Draw,
     Hard,
@@ -51,9 +52,11 @@ from scm_world.variables.spaces import (
     Switch,
 )
 from scm_world.variables.subsets import AB, A, B, Subset
+from scm_world.variables.times import Contact, Reaches, Time
 
 __all__ = [
     "AB",
+    "ACTS",
     "SOFT",
     "A",
     "Action",
@@ -65,6 +68,7 @@ __all__ = [
     "Categorical",
     "Categories",
     "Concatenation",
+    "Contact",
     "Continuous",
     "Cylinder",
     "Derived",
@@ -92,6 +96,7 @@ __all__ = [
     "Normal",
     "Null",
     "Parent",
+    "Reaches",
     "Rotations",
     "Scale",
     "Shift",
@@ -100,6 +105,7 @@ __all__ = [
     "Subset",
     "Switch",
     "Table",
+    "Time",
     "Variable",
     "bundle",
     "divided",

@@ -11,12 +11,9 @@ import numpy as np
 from scm_world._types import Value, Values
 from scm_world.errors import (
     InterventionError,
-    NotFinite,
     OutOfBounds,
-    OutOfSpace,
     UnknownVariable,
-    WrongShape,
-    WrongType,
+    WrongValue,
 )
 from scm_world.variables.interventions import Draw
 from scm_world.variables.kinds import SPACES, SpaceName, Variable
@@ -43,30 +40,29 @@ def coerce(variable: Variable, value: Any) -> Value:
         An array of the declared shape; float64 for a real variable, int64 else.
 
     Raises:
-        WrongType: It is not a number, or not a whole one where one is asked for.
-        WrongShape: It has another shape.
-        NotFinite: It has a NaN or an infinity.
+        WrongValue: It is not a number, not a whole one where one is asked for, not finite, or of
+            another shape.
     """
     if isinstance(variable.bounds, Categories) and variable.bounds.labels:
         with suppress(KeyError, ValueError, TypeError):  # refused below
             value = variable.bounds.numbers(value)
     if np.ma.isMaskedArray(value):  # there is something under the mask
-        raise WrongType(variable.name, value, _expected(variable))
+        raise WrongValue(variable.name, value, _expected(variable))
     try:
         given = np.asarray(value)
     except (ValueError, TypeError):  # a ragged list, or an object that refuses
-        raise WrongType(variable.name, value, _expected(variable)) from None
+        raise WrongValue(variable.name, value, _expected(variable)) from None
     if given.dtype.kind not in "iuf":
-        raise WrongType(variable.name, value, _expected(variable))
+        raise WrongValue(variable.name, value, _expected(variable))
     if given.shape != variable.shape:
-        raise WrongShape(variable.name, value, variable.shape, given.shape)
+        raise WrongValue(variable.name, value, variable.shape, given.shape)
     if not np.isfinite(given).all():
-        raise NotFinite(variable.name, value)
+        raise WrongValue(variable.name, value)
     if variable.dtype == "real":
         return given.astype(np.float64)
     whole = given.dtype.kind != "f" or (given == np.rint(given)).all()
     if not whole or (np.abs(given.astype(np.float64)) >= _LARGEST).any():
-        raise WrongType(variable.name, value, _expected(variable))
+        raise WrongValue(variable.name, value, _expected(variable))
     return given.astype(np.int64)
 
 
@@ -78,11 +74,11 @@ def check_bounds(variable: Variable, value: Value, values: Values) -> None:
     """Refuse what is physically impossible.
 
     Raises:
-        NotFinite: It came out of a shift, a scale or other coordinates without being finite.
+        WrongValue: It came out of a shift, a scale or other coordinates without being finite.
         OutOfBounds: With the nearest value that is possible.
     """
     if not np.isfinite(value).all():
-        raise NotFinite(variable.name, _plain(value))
+        raise WrongValue(variable.name, _plain(value))
     bounds = variable.bounds
     if bounds is not None and not bounds.contains(value, values):
         raise OutOfBounds(
@@ -172,7 +168,7 @@ def check_space(
     """Refuse what lies outside the space that was asked for.
 
     Raises:
-        OutOfSpace: With the nearest value of the space.
+        OutOfBounds: With the nearest value of the space.
     """
     region = space.region(variable.name) if isinstance(space, Subset) else space
     found = variable.space(region) if isinstance(region, str) else region
@@ -186,7 +182,7 @@ def check_space(
     if inside:
         return
     none = "∅ (none is declared)" if isinstance(region, str) else "∅ (it is not to be set)"
-    raise OutOfSpace(
+    raise OutOfBounds(
         variable.name,
         _plain(value),
         space=region if isinstance(region, str) else str(space),

@@ -13,15 +13,15 @@ from scm_world.variables.spaces import (
     Box,
     Categories,
     Either,
-    Frozen,
     Integers,
     Rotations,
+    Source,
     refuse_infinite,
 )
 
 
 @final
-class Normal(Frozen):
+class Normal(Source):
     """The normal distribution, component by component.
 
     Attributes:
@@ -38,10 +38,6 @@ class Normal(Frozen):
 
     def __init__(self, mean: float = 0.0, std: float = 1.0, **fields: Any) -> None:
         super().__init__(mean=mean, std=std, **fields)
-
-    def parents(self) -> frozenset[str]:
-        """Name the variables that it depends on: there are none."""
-        return frozenset()
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
         """Count the uniform numbers that one draw takes: two for each component."""
@@ -60,7 +56,7 @@ class Normal(Frozen):
 
 
 @final
-class Cylinder(Frozen):
+class Cylinder(Source):
     """Uniform over the volume of a box in cylindrical coordinates (radius, angle, …).
 
     A box of cylindrical coordinates, drawn component by component, crowds its points near the
@@ -88,10 +84,6 @@ class Cylinder(Frozen):
         """Name the variables that the corners depend on."""
         return self.box.parents()
 
-    def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes."""
-        return self.box.n_uniforms(shape)
-
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
         """Turn uniform numbers into points, the radius first."""
         low, high = self.box.bounds(shape, values)
@@ -106,7 +98,7 @@ class Cylinder(Frozen):
 
 
 @final
-class Continuous(Frozen):
+class Continuous(Source):
     """A continuous distribution of scipy, by its name there, component by component.
 
     ``Laplace``, ``Exponential``, ``Gamma``, ``StudentT`` and ``Gumbel`` make the usual ones.
@@ -149,14 +141,6 @@ class Continuous(Frozen):
         self.frozen.support()
         return self
 
-    def parents(self) -> frozenset[str]:
-        """Name the variables that it depends on: there are none."""
-        return frozenset()
-
-    def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes: one for each component."""
-        return int(np.prod(shape))
-
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
         """Turn uniform numbers into quantiles."""
         inside = uniforms.reshape(*uniforms.shape[:-1], *shape) + 2.0**-54  # never 0
@@ -168,17 +152,17 @@ class Continuous(Frozen):
 
 
 def Laplace(loc: float = 0.0, scale: float = 1.0) -> Continuous:  # noqa: N802 # a distribution
-    """Give the Laplace distribution; its standard deviation is √2 times the scale."""
+    """Return the Laplace distribution; its standard deviation is √2 times the scale."""
     return Continuous("laplace", loc=loc, scale=scale)
 
 
 def Exponential(scale: float = 1.0, loc: float = 0.0) -> Continuous:  # noqa: N802
-    """Give the exponential distribution, whose mean is the scale (plus ``loc``)."""
+    """Return the exponential distribution, whose mean is the scale (plus ``loc``)."""
     return Continuous("expon", loc=loc, scale=scale)
 
 
 def Gamma(shape: float, scale: float = 1.0, loc: float = 0.0) -> Continuous:  # noqa: N802
-    """Give the gamma distribution, whose mean is shape times scale (plus ``loc``)."""
+    """Return the gamma distribution, whose mean is shape times scale (plus ``loc``)."""
     return Continuous("gamma", a=shape, loc=loc, scale=scale)
 
 
@@ -188,12 +172,12 @@ def StudentT(df: float, loc: float = 0.0, scale: float = 1.0) -> Continuous:  # 
 
 
 def Gumbel(loc: float = 0.0, scale: float = 1.0) -> Continuous:  # noqa: N802
-    """Give the Gumbel distribution of maxima."""
+    """Return the Gumbel distribution of maxima."""
     return Continuous("gumbel_r", loc=loc, scale=scale)
 
 
 @final
-class Discrete(Frozen):
+class Discrete(Source):
     """A few numbers, each with a probability, component by component.
 
     ``Bernoulli``, ``Categorical`` and ``Empirical`` make the usual ones.
@@ -231,14 +215,6 @@ class Discrete(Frozen):
         n = len(self.values)
         return np.full(n, 1.0 / n) if self.probabilities is None else np.array(self.probabilities)
 
-    def parents(self) -> frozenset[str]:
-        """Name the variables that it depends on: there are none."""
-        return frozenset()
-
-    def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes: one for each component."""
-        return int(np.prod(shape))
-
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
         """Turn uniform numbers into values."""
         unit = uniforms.reshape(*uniforms.shape[:-1], *shape)
@@ -263,7 +239,7 @@ def Categorical(probabilities: Any, values: Any = None) -> Discrete:  # noqa: N8
 
 
 def Empirical(sample: Any) -> Discrete:  # noqa: N802
-    """Give the numbers of a sample, each as often as it is there."""
+    """Return the numbers of a sample, each as often as it is there."""
     return Discrete(np.ravel(np.asarray(sample, dtype=float)))
 
 

@@ -2,28 +2,32 @@
 
 A plain number or array is the hard intervention: the variable is cut from its parents and held
 at this value. ``Shift`` and ``Scale`` keep the parents and change what they say; ``Draw`` cuts
-them and draws.
+them and draws. In a plan each has a time: ``Hard(0.2, at=10)``, ``Shift(0.1, during=(5, 9))``,
+``Draw("A", every=25)``, ``Natural(when=Contact("robot", "tool_block"))``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal, final
+from typing import Annotated, Any, ClassVar, Literal, final
 
 import numpy as np
-from pydantic import (
-    ConfigDict,
-    Field,
-    SerializerFunctionWrapHandler,
-    model_serializer,
-    model_validator,
-)
+from pydantic import ConfigDict, Field, model_validator
 
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.variables.distributions import Distribution
-from scm_world.variables.kinds import SPACES, AsMechanism, AsParents, Parent, SpaceName, names
+from scm_world.variables.kinds import (
+    SPACES,
+    AsMechanism,
+    AsParents,
+    InverseNoise,
+    Parent,
+    SpaceName,
+    names,
+)
 from scm_world.variables.mechanisms import Concatenation, Function, Linear, Table, check_order
 from scm_world.variables.spaces import Frozen
+from scm_world.variables.times import Timed
 
 Number = float | tuple[float, ...]
 
@@ -38,14 +42,8 @@ def _number(what: str, value: Any) -> Any:
     return tuple(given.ravel().tolist()) if given.ndim else value
 
 
-def _without_bundle(data: dict[str, Any], *names: str) -> dict[str, Any]:
-    """Leave out of written data what is mostly None, such as the bundle that a part is of."""
-    rare = names or ("of",)
-    return {name: value for name, value in data.items() if name not in rare or value is not None}
-
-
 @final
-class Hard(Frozen):
+class Hard(Timed):
     """Set a variable to a value, independently of its parents."""
 
     model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
@@ -58,7 +56,7 @@ class Hard(Frozen):
 
 
 @final
-class Shift(Frozen):
+class Shift(Timed):
     """Add to what a variable would have been. Its parents remain causes.
 
     Example:
@@ -76,7 +74,7 @@ class Shift(Frozen):
 
 
 @final
-class Scale(Frozen):
+class Scale(Timed):
     """Multiply what a variable would have been. Its parents remain causes."""
 
     model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
@@ -89,7 +87,7 @@ class Scale(Frozen):
 
 
 @final
-class Draw(Frozen):
+class Draw(Timed):
     """Draw a variable from its space ``"A"``, ``"B"`` or ``"A|B"``, or from a distribution.
 
     Attributes:
@@ -104,20 +102,16 @@ class Draw(Frozen):
         'A'
     """
 
+    RARE: ClassVar[tuple[str, ...]] = ("of", "time")
+
     kind: Literal["draw"] = "draw"
     source: SpaceName | Distribution
     stream: str | None = None
     of: str | None = None
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """Show stream and bundle only if there is one."""
-        for name, value in super().__repr_args__():
-            if name not in ("stream", "of") or value is not None:
-                yield name, value
-
-    @model_serializer(mode="wrap")
-    def _shorter(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return _without_bundle(handler(self))
+        """Show the stream only if there is one."""
+        return (pair for pair in super().__repr_args__() if pair != ("stream", None))
 
     def __init__(self, source: Any, **fields: Any) -> None:
         if not isinstance(source, Frozen | dict) and source not in SPACES:
@@ -126,7 +120,7 @@ class Draw(Frozen):
 
 
 @final
-class Mechanism(Frozen):
+class Mechanism(Timed):
     """Give a variable another structural equation: it follows other variables than before.
 
     A parameter may follow parameters (so that a color can cause a friction, which it does not by
@@ -142,6 +136,7 @@ class Mechanism(Frozen):
             parents in another order is refused.
         parents: The causes; the graph then has these edges in place of the others.
         noise: Distribution of the noise; that of the variable if None.
+        inverse_noise: As of ``Derived``, for counterfactuals of units observed under it.
         of: A bundle that the function gives as a whole; the variable gets its part of it.
 
     Example:
@@ -150,15 +145,14 @@ class Mechanism(Frozen):
         ('floor_color', 0)
     """
 
+    RARE: ClassVar[tuple[str, ...]] = ("noise", "inverse_noise", "of", "time")
+
     kind: Literal["mechanism"] = "mechanism"
     function: AsMechanism | None = None
     parents: AsParents = ()
     noise: Distribution | None = None
+    inverse_noise: InverseNoise | None = None
     of: str | None = None
-
-    @model_serializer(mode="wrap")
-    def _shorter(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return _without_bundle(handler(self), "of", "noise")
 
     @property
     def equation(self) -> Function | Linear | Concatenation | Table:
@@ -184,14 +178,14 @@ class Mechanism(Frozen):
 
 
 @final
-class Natural(Frozen):
+class Natural(Timed):
     """Hand a variable back to its own structural equation: no intervention holds it any more."""
 
     kind: Literal["natural"] = "natural"
 
 
 @final
-class Null(Frozen):
+class Null(Timed):
     """An entity is not there: asked for by its name, not by a variable of it.
 
     A block, an obstacle or a goal is taken out of the world and of its graph, with everything that
@@ -200,11 +194,20 @@ class Null(Frozen):
 
     kind: Literal["null"] = "null"
 
+    def __init__(self, **fields: Any) -> None:
+        if fields.get("during") is not None:
+            allowed = ("a value or an intervention on a variable", "Null(at=step)")
+            raise UnknownOption("intervention of a window", "Null", allowed)
+        super().__init__(**fields)
+
 
 Intervention = Annotated[
     Hard | Shift | Scale | Draw | Mechanism | Natural | Null, Field(discriminator="kind")
 ]
 """Anything that ``do`` accepts, once a plain value has become ``Hard``."""
+
+ACTS = (Hard, Shift, Scale, Draw, Mechanism, Natural, Null)
+"""The same, as classes."""
 
 SOFT = (Shift, Scale)
 """The interventions that leave the parents in place."""

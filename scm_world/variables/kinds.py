@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
-from typing import Annotated, Any, Literal, final, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, final, get_args
 
 import numpy as np
 from pydantic import BeforeValidator, Field, WrapValidator, model_validator
@@ -52,6 +52,7 @@ def _as_mechanism(value: Any) -> Any:
 
 AsNumber = Annotated[Number, BeforeValidator(_as_number)]
 AsMechanism = Annotated[Equation, BeforeValidator(_as_mechanism)]
+InverseNoise = Literal["additive", "monotone"] | AsMechanism
 
 
 @final
@@ -136,7 +137,7 @@ def _as_parents(value: Any, validate: Callable[[Any], Any]) -> Any:
 
 @lru_cache(maxsize=2**14)
 def parent_of(name: str, lag: int = 0, when: str | None = None) -> Parent:
-    """Give an edge; many variables have the same ones, which are one object then."""
+    """Return an edge; many variables have the same ones, which are one object then."""
     return Parent(name, lag, when)
 
 
@@ -198,7 +199,7 @@ class Variable(Frozen):
         return np.asarray(value, dtype=kind).reshape(self.shape)
 
     def space(self, name: SpaceName) -> Space | None:
-        """Give one of the declared spaces, or their union; None where it is not declared.
+        """Return one of the declared spaces, or their union; None where it is not declared.
 
         Whole numbers that lie in both are left out of B; of a continuum, the border stays in the
         set and is distinguished by ``in_space``.
@@ -215,7 +216,7 @@ class Variable(Frozen):
                 return Either(self.a, self.space("B")) if both else (self.a or self.b)
 
     def in_space(self, value: Value, name: SpaceName, values: Values) -> bool:
-        """Tell whether a value lies in a space, given the values of the other variables."""
+        """Return whether a value lies in a space, given the values of the other variables."""
         space = self.space(name)
         if space is None or not space.contains(value, values):
             return False
@@ -292,8 +293,26 @@ class Exogenous(Variable):
         return self
 
 
+class _Computed(Variable):
+    """A variable that names its parents."""
+
+    if TYPE_CHECKING:
+        parents: AsParents
+        mechanism: Any
+
+    @property
+    def all_parents(self) -> tuple[Parent, ...]:
+        """The edges into this variable."""
+        return self.parents
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The parents of a bundle; nothing for other variables."""
+        return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
+
+
 @final
-class Derived(Variable):
+class Derived(_Computed):
     """A Python function of its parents.
 
     Attributes:
@@ -302,8 +321,10 @@ class Derived(Variable):
         mechanism: The function.
         noise: Distribution of its own noise, or None. The mechanism takes it as ``noise=``.
         noise_shape: Shape of the noise; that of the variable if None.
-        inverse_noise: The function from a value of this variable, and those of the parents, to its
-            noise. ``SCM.counterfactual`` needs it where it cannot invert the mechanism itself.
+        inverse_noise: How the noise follows from a value of this variable and those of the parents,
+            for ``SCM.counterfactual``: ``"additive"`` where the function adds it, ``"monotone"``
+            where each component rises or falls with its own noise, or a function of the value and
+            the parents. It is known of ``Linear``, of a ``Table``, and of a discrete noise.
         start: The value that lagged children see before the first step.
         inverse: For other coordinates of one quantity (cylindrical for Cartesian): the function
             from a value of this variable to the one of its only parent. An intervention on this
@@ -317,17 +338,7 @@ class Derived(Variable):
     noise_shape: tuple[int, ...] | None = None
     start: AsNumber = 0.0
     inverse: AsMechanism | None = None
-    inverse_noise: AsMechanism | None = None
-
-    @property
-    def all_parents(self) -> tuple[Parent, ...]:
-        """The edges into this variable."""
-        return self.parents
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """The parents of a bundle; nothing for other variables."""
-        return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
+    inverse_noise: InverseNoise | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -354,11 +365,14 @@ class Derived(Variable):
         check_order(self.name, self.inverse_noise, names(self.parents), before=1)
         if self.noise is None and (self.noise_shape is not None or self.inverse_noise is not None):
             raise ValueError(f"{self.name}: noise_shape and inverse_noise need a noise")
+        alike = self.noise_shape in (None, self.shape)
+        if isinstance(self.inverse_noise, str) and not alike:
+            raise ValueError(f"{self.name}: {self.inverse_noise} noise has the shape of the value")
         return self
 
 
 @final
-class Measured(Variable):
+class Measured(_Computed):
     """Something that physics decides, or a readout of it.
 
     A state (``mechanism`` None, ``settable_state`` True) can be set at an instant; physics
@@ -384,16 +398,6 @@ class Measured(Variable):
     start: AsMechanism | None = None
     carry: AsMechanism | None = None
     restart: tuple[str, ...] = ()
-
-    @property
-    def all_parents(self) -> tuple[Parent, ...]:
-        """The edges into this variable."""
-        return self.parents
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """The parents of a bundle; nothing for other variables."""
-        return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
 
     @property
     def role(self) -> Role:

@@ -129,7 +129,7 @@ class Function(Frozen):
         return data if isinstance(data, dict) else {"reference": data}
 
     def is_defined_in(self, packages: Iterable[str]) -> bool:
-        """Tell whether the function is one of some packages or modules, importing no other.
+        """Return whether the function is one of some packages or modules, importing no other.
 
         What a module of theirs merely imports (``"my_package.module:os.system"``) is not.
         """
@@ -143,7 +143,7 @@ class Function(Frozen):
         return _lies_in(getattr(found, "__module__", None) or "", packages)
 
     def is_portable(self) -> bool:
-        """Tell whether the function can be found again under its name."""
+        """Return whether the function can be found again under its name."""
         try:
             return self._look_up() is self.resolve()
         except (ModelError, AttributeError, ImportError):
@@ -160,7 +160,7 @@ class Function(Frozen):
         return function
 
     def resolve(self) -> Callable[..., Any]:
-        """Give the function, importing its module if need be."""
+        """Return the function, importing its module if need be."""
         if self._function is None:
             self._function = self._look_up()
         return self._function
@@ -172,7 +172,7 @@ class Function(Frozen):
         return copied
 
     def bind(self) -> Callable[..., Any]:
-        """Give a callable with the constants filled in; always the same one."""
+        """Return a callable with the constants filled in; always the same one."""
         return self._bound
 
     @property
@@ -207,7 +207,7 @@ class Function(Frozen):
         )
 
     def _is_named(self) -> bool:
-        """Tell whether the reference stands for one function: not for a lambda or an object."""
+        """Return whether the reference stands for one function: not for a lambda or an object."""
         unnamed = self._function is not None and not hasattr(self._function, "__qualname__")
         return "<" not in self.reference and not unnamed
 
@@ -313,7 +313,7 @@ class Linear(Frozen):
     takes_noise: ClassVar[bool] = True
 
     def bind(self) -> Callable[..., Any]:
-        """Give the function of the parents."""
+        """Return the function of the parents."""
         weights, intercept = self.weights, self.intercept
 
         def linear(*parents: Value, noise: Value | float = 0.0) -> Any:
@@ -323,10 +323,6 @@ class Linear(Frozen):
             return total
 
         return linear
-
-    def is_portable(self) -> bool:
-        """Tell that numbers can always be written down."""
-        return True
 
 
 @final
@@ -354,39 +350,25 @@ class Concatenation(Frozen):
         ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)]).tolist()
         return tuple(slice(first, last) for first, last in pairwise(ends))
 
-    def bind(self) -> Joined:
-        """Give the function of the parents."""
-        return Joined(self.shapes)
+    def bind(self) -> Callable[..., Any]:
+        """Return the function that puts values together, shape ``(..., n)``; leads broadcast."""
+        shapes = self.shapes
+
+        def joined(*parts: Value) -> Value:
+            ends = [np.ndim(part) - len(s) for part, s in zip(parts, shapes, strict=True)]
+            leads = [np.shape(part)[:end] for part, end in zip(parts, ends, strict=True)]
+            flat = [np.reshape(part, (*lead, -1)) for part, lead in zip(parts, leads, strict=True)]
+            whole = np.broadcast_shapes(*leads)
+            full = (np.broadcast_to(each, (*whole, each.shape[-1])) for each in flat)
+            return np.concatenate([*full], axis=-1)
+
+        return joined
 
     def split(self, value: Value) -> tuple[Value, ...]:
-        """Give the values of the parents; the numbers are the last axis of the value."""
+        """Return the values of the parents; the numbers are the last axis of the value."""
         lead = np.shape(value)[:-1]
         both = zip(self.shapes, self.slices, strict=True)
         return tuple(np.asarray(value[..., at]).reshape((*lead, *shape)) for shape, at in both)
-
-    def is_portable(self) -> bool:
-        """Tell that shapes can always be written down."""
-        return True
-
-
-@final
-class Joined:
-    """The function of a bundle.
-
-    Args:
-        shapes: Of the parts.
-    """
-
-    def __init__(self, shapes: tuple[tuple[int, ...], ...]) -> None:
-        self._shapes = shapes
-
-    def __call__(self, *parts: Value) -> Value:
-        """Put values together, shape ``(..., n)``; leading axes broadcast."""
-        ends = [np.ndim(part) - len(s) for part, s in zip(parts, self._shapes, strict=True)]
-        leads = [np.shape(part)[:end] for part, end in zip(parts, ends, strict=True)]
-        flat = [np.reshape(part, (*lead, -1)) for part, lead in zip(parts, leads, strict=True)]
-        whole = np.broadcast_shapes(*leads)
-        return np.concatenate([np.broadcast_to(f, (*whole, f.shape[-1])) for f in flat], axis=-1)
 
 
 @final
@@ -437,7 +419,7 @@ class Table(Frozen):
         return np.reshape(self.probabilities, self.shape)
 
     def row(self, *parents: Value) -> Any:
-        """Give the probabilities given the parents, shape (..., number of values).
+        """Return the probabilities given the parents, shape (..., number of values).
 
         Raises:
             ModelError: A parent has another value.
@@ -452,7 +434,7 @@ class Table(Frozen):
         return self.table[tuple(places)]
 
     def bind(self) -> Callable[..., Any]:
-        """Give the function of the parents and of uniform noise."""
+        """Return the function of the parents and of uniform noise."""
         values = np.asarray(self.values or range(self.shape[-1]))
 
         def category(*parents: Value, noise: Value | float = 0.0) -> Any:
@@ -460,10 +442,6 @@ class Table(Frozen):
             return values[(ends <= np.asarray(noise)[..., None]).sum(axis=-1)]
 
         return category
-
-    def is_portable(self) -> bool:
-        """Tell that numbers can always be written down."""
-        return True
 
 
 Equation = Annotated[Function | Linear | Concatenation | Table, Field(discriminator="kind")]

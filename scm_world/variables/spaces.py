@@ -177,22 +177,24 @@ def _widened(low: Floats, high: Floats) -> tuple[Floats, Floats]:
     return low - TOLERANCE * np.abs(low), high + TOLERANCE * np.abs(high)
 
 
-class _Space(Frozen):
+class Source(Frozen):
+    """Anything that values are drawn from: a space, or a distribution."""
+
     if TYPE_CHECKING:  # as in ``Frozen``
 
         def __init__(self, **fields: Any) -> None: ...
 
     def parents(self) -> frozenset[str]:
-        """Name the variables that the bounds depend on."""
+        """Return the names of the variables that it depends on."""
         return frozenset()
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes."""
+        """Return how many uniform numbers one draw takes: one for each component."""
         return prod(shape)
 
 
 @final
-class Box(_Space):
+class Box(Source):
     """All points between two corners, both included.
 
     Attributes:
@@ -235,7 +237,7 @@ class Box(_Space):
         return frozenset(_parents(self.low, self.high))
 
     def parents(self) -> frozenset[str]:
-        """Name the variables that the bounds depend on."""
+        """Return the names of the variables that the bounds follow."""
         return self._followed
 
     def bounds(self, shape: tuple[int, ...], values: Values) -> tuple[Floats, Floats]:
@@ -253,7 +255,7 @@ class Box(_Space):
         return _widened(low, high)
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Tell whether a value lies inside, borders included."""
+        """Return whether a value lies inside, borders included."""
         if self._widened is not None and np.ndim(value) < 2:
             low, high = self._widened
             return bool((value >= low).all() and (value <= high).all())
@@ -310,7 +312,7 @@ def refuse_infinite(option: str, region: Any) -> None:
 
 
 @final
-class Integers(_Space):
+class Integers(Source):
     """All whole numbers between two ends, both included.
 
     Example:
@@ -332,7 +334,7 @@ class Integers(_Space):
         return self
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Tell whether a value is whole and lies between the ends."""
+        """Return whether a value is whole and lies between the ends."""
         whole = np.all(value == np.rint(value))
         return bool(whole and np.all(value >= self.low) and np.all(value <= self.high))
 
@@ -357,7 +359,7 @@ class Integers(_Space):
 
 
 @final
-class Categories(_Space):
+class Categories(Source):
     """A few whole numbers, without an order, which may have labels.
 
     Attributes:
@@ -391,7 +393,7 @@ class Categories(_Space):
         return data if self.labels else {k: v for k, v in data.items() if k != "labels"}
 
     def numbers(self, labels: Any) -> Value:
-        """Give the numbers of labels, of any shape.
+        """Return the numbers of labels, of any shape.
 
         Raises:
             KeyError: There is no such label.
@@ -401,7 +403,7 @@ class Categories(_Space):
         return found.reshape(np.shape(labels))
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Tell whether every component is a member."""
+        """Return whether every component is a member."""
         return bool(np.all(np.isin(value, self.members)))
 
     def nearest(self, value: Value, values: Values | None = None) -> Value:
@@ -431,7 +433,7 @@ _Part = Annotated[Box | Integers | Categories, Field(discriminator="kind")]
 
 
 @final
-class Either(_Space):
+class Either(Source):
     """The union of two spaces: not their hull. A draw is uniform over both.
 
     Example:
@@ -448,11 +450,11 @@ class Either(_Space):
         super().__init__(first=first, second=second, **fields)
 
     def parents(self) -> frozenset[str]:
-        """Name the variables that the bounds depend on."""
+        """Return the names of the variables that the bounds follow."""
         return self.first.parents() | self.second.parents()
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Tell whether one of the two contains the value."""
+        """Return whether one of the two contains the value."""
         return self.first.contains(value, values) or self.second.contains(value, values)
 
     def nearest(self, value: Value, values: Values | None = None) -> Value:
@@ -465,7 +467,7 @@ class Either(_Space):
         return self.first.volume(shape, values) + self.second.volume(shape, values)
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes: one decides which of the two."""
+        """Return how many uniform numbers one draw takes: one decides which of the two."""
         return 1 + max(self.first.n_uniforms(shape), self.second.n_uniforms(shape))
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
@@ -485,7 +487,7 @@ class Either(_Space):
 
 
 @final
-class Rotations(_Space):
+class Rotations(Source):
     """All unit quaternions (x, y, z, w); q and -q are one rotation, written with w >= 0.
 
     Attributes:
@@ -500,7 +502,7 @@ class Rotations(_Space):
     keeps_sign: bool = False
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Tell whether the norm is 1, to six digits."""
+        """Return whether the norm is 1, to six digits."""
         return bool(np.all(np.abs(np.linalg.norm(value, axis=-1) - 1.0) < 1e-6))
 
     def nearest(self, value: Value, values: Values | None = None) -> Value:
@@ -514,11 +516,11 @@ class Rotations(_Space):
         return unit + 0.0
 
     def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
-        """Give the volume of the group, π²: half of the unit sphere in four dimensions."""
+        """Return the volume of the group, π²: half of the unit sphere in four dimensions."""
         return np.asarray(float(np.pi**2))
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes."""
+        """Return how many uniform numbers one draw takes: three."""
         return 3
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:

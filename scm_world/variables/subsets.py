@@ -52,7 +52,7 @@ class Subset(Frozen):
         super().__init__(parts=tuple(_pair(pair) for pair in pairs), **fields)
 
     def region(self, name: str) -> Region | None:
-        """Say where a variable may lie; None where it is not to be set."""
+        """Return where a variable may lie; None where it is not to be set."""
         for pattern, region in reversed(self.parts):
             if fnmatchcase(name, pattern):
                 return region
@@ -75,7 +75,7 @@ class Subset(Frozen):
         return Subset([(pattern, only["*"]) for pattern in wanted])
 
     def __mul__(self, other: Subset) -> Subset:
-        """Give the product of two parts; where both name a variable, the second one counts."""
+        """Return the product of two parts; where both name a variable, the second one counts."""
         return Subset((*self.parts, *other.parts))
 
     def __sub__(self, patterns: str | tuple[str, ...]) -> Subset:

@@ -12,10 +12,9 @@ from scm_world._types import Value
 from scm_world.backends import Backend
 from scm_world.models import Difference, Parameters
 from scm_world.variables import Hard
-from scm_world.variables.reserved import CONTROL_INDEX
-from scm_world.world.feasibility import Present
-from scm_world.world.plan import InterventionPlan
-from scm_world.world.solver import same
+from scm_world.world.compiled_task import StepBase
+from scm_world.world.interventions import Solution, same
+from scm_world.world.mechanisms import Row
 
 
 @final
@@ -84,10 +83,10 @@ def _show(value: Value) -> str:
 
 def report(
     request: Mapping[str, Any],
-    plan: InterventionPlan,
-    change: Difference,
-    before: Present,
-    now: Present,
+    solution: Solution,
+    change: Difference | None,
+    before: StepBase,
+    now: Row,
     inertia: Parameters,
     reported: Parameters,
     backend: Backend,
@@ -96,85 +95,74 @@ def report(
 
     Args:
         request: As it was given, with dotted names.
-        plan: That was applied.
+        solution: That was applied.
         change: What the backend had to change.
-        before: What the backend had before; its values are not overwritten.
-        now: What it has now.
+        before: The world before.
+        now: The values that the world has now.
         inertia: Principal moments of bodies whose mass or size changed, before.
         reported: Parameters that were read back already.
-        backend: That took over the plan.
+        backend: That took over the change.
     """
-    model, keys = plan.compiled.model, plan.compiled.parameter_keys
-    wanted = {keys[t] for name in plan.asked for t in model.targets(name) if t in keys}
-    reported = {**reported, **backend.parameters([*(wanted - reported.keys()), *inertia])}
-    targets = {}
-    for name in plan.asked:
-        applied, read_back = _asked(plan, now, reported, name)
-        targets[name] = Applied(name, request[name], applied, read_back)
-    bundles = plan.compiled.bundles
+    compiled, old, changed = solution.compiled, before.row, solution.changed
+    keys, bundles, model = compiled.parameter_keys, compiled.bundles, compiled.model
+    wanted = {keys[t] for name in solution.asked for t in model.targets(name) if t in keys}
+    missing = [*(wanted - reported.keys()), *inertia]
+    reported = {**reported, **backend.parameters(missing)} if missing else reported
+    targets = {
+        name: Applied(name, request[name], *_asked(solution, now, reported, name))
+        for name in solution.asked
+    }
     known = {*targets, *(part for name in targets for part in bundles.get(name, ()))}
     followed = {
-        name: (np.array(before.values[name]), np.array(value))
-        for name, value in plan.static.items()
-        if value is not before.values.get(name, value)
-        and name not in known
-        and not (
-            np.shape(value) == np.shape(before.values[name]) and same(value, before.values[name])
-        )
+        name: (np.array(old[name]), np.array(now[name])) for name in changed if name not in known
     }
-    moved = (n for n in before.compiled.slices if n not in before.compiled.bundles)
-    for name in moved if change.state is not None else ():
-        if name in now.values and name not in known:
-            old, new = before.compiled.view(name, before.state), now.values[name]
-            if not same(old, new):
-                followed[name] = (_typed(old, new), np.array(new))
-    engine = {".".join(key): (old, reported[key]) for key, old in inertia.items()}
-    there, were = ({*one.compiled.composition.bodies} for one in (now, before))
-    came, went = sorted(there - were), sorted(were - there)
+    if change is not None and change.state is not None:
+        for name in before.compiled.slices:
+            if name in bundles or name in known or name not in compiled.slices:
+                continue
+            if not same(old[name], now[name]):
+                followed[name] = (np.array(old[name]), np.array(now[name]))
+    engine = {".".join(key): (was, reported[key]) for key, was in inertia.items()}
+    came: list[str] = []
+    went: list[str] = []
+    if compiled is not before.compiled:
+        there, were = ({*one.composition.bodies} for one in (compiled, before.compiled))
+        came, went = sorted(there - were), sorted(were - there)
     remarks: tuple[str, ...] = ()
-    if change.structure is None and any(what.endswith("friction") for _, what in change.parameters):
-        known_keys = before.compiled.parameter_keys.items()
-        changed = {key: before.values[name] for name, key in known_keys if key in change.parameters}
-        remarks = backend.capabilities.remarks(backend, changed)
+    set_here = change.parameters if change is not None and change.structure is None else {}
+    if any(what.endswith("friction") for _, what in set_here):
+        frictions = {keys[name]: old[name] for name in changed if name in keys}
+        remarks = backend.capabilities.remarks(backend, frictions)
     return Audit(targets, followed, engine, tuple(came), tuple(went), remarks)
 
 
-def _typed(old: Value, new: Value) -> Value:
-    return old.astype(np.asarray(new).dtype)
-
-
 def _asked(
-    plan: InterventionPlan, now: Present, reported: Parameters, name: str
+    solution: Solution, now: Row, reported: Parameters, name: str
 ) -> tuple[Value | None, Value | None]:
-    """Give what was applied and read back of what was asked for: also coordinates, or a bundle."""
-    compiled = plan.compiled
+    """Return the value that something asked for has now, and what the backend reports of it.
+
+    None of an action that is known only at its step, and of what the backend does not know.
+    """
+    compiled = solution.compiled
     targets = compiled.model.targets(name)
-    outcomes = [_outcome(plan, now, reported, target) for target in targets]
-    if targets == (name,):
-        return outcomes[0]
-    values = [applied for applied, _ in outcomes if applied is not None]
-    backs = [back for _, back in outcomes if back is not None]
+    values, backs = list[Value](), list[Value]()
+    for target in targets:
+        if target in compiled.actions:
+            act = solution.draft.acts[target][1]
+            values += [np.array(act.value)] if isinstance(act, Hard) else []
+            continue
+        values.append(np.array(now[target]))
+        key = compiled.parameter_keys.get(target)
+        if key is not None:
+            backs.append(np.array(reported[key]))
+        elif target in compiled.set_by_hand:
+            backs.append(values[-1].copy())
     if len(values) < len(targets):
         return None, None
+    if targets == (name,):
+        return values[0], backs[0] if backs else None
     applied = compiled.in_coordinates(name, *values)
     if len(backs) < len(targets):
         return applied, None
     exact = all(map(same, backs, values))
     return applied, applied if exact else compiled.in_coordinates(name, *backs)
-
-
-def _outcome(
-    plan: InterventionPlan, now: Present, reported: Parameters, target: str
-) -> tuple[Value | None, Value | None]:
-    """Give the value that a target has now, and what the backend reports; None if unknown."""
-    compiled = plan.compiled
-    if target in compiled.actions:
-        act = plan.pending[target][1]
-        return (np.array(act.value) if isinstance(act, Hard) else None), None
-    applied = np.array(now.values[target])
-    if target == CONTROL_INDEX:
-        return applied, np.array(applied)
-    if target in compiled.slices:
-        return applied, np.array(compiled.view(target, now.state))
-    key = compiled.parameter_keys.get(target)
-    return applied, None if key is None else np.array(reported[key])

@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import real_numbers, whole_number
-from scm_world._types import ArrayLike, Floats, Value, Values
+from scm_world._types import ArrayLike, Floats, Integers, Value, Values
 from scm_world.errors import ActionError, InterventionError, ModelError, UnknownOption
-from scm_world.geometry.clipping import clip_kernel
+from scm_world.geometry.numbers import clip_kernel
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
+from scm_world.models.scene import SURFACES
 from scm_world.tasks import Conventions, Task, Timing
-from scm_world.variables import Action, Derived, Exogenous, Intervention, Measured
+from scm_world.variables import Action, Box, Derived, Exogenous, Intervention, Measured
 from scm_world.variables.checks import check_bounds, coerce
-from scm_world.world.mechanisms import Mechanisms, wrong_value
+from scm_world.world.mechanisms import Mechanisms, Row, wrong_value
 
 Plan = tuple[Hashable, frozenset[str]]
 """A structure: which bodies the task asks for, and the names of those that were taken away."""
@@ -177,9 +178,12 @@ class CompiledTask(ActionVector):
         commanded: Where each action stands, with the bundles of actions.
         parameter_keys: Which physical parameter each variable sets.
         carried: States that follow others when these are set.
+        carried_by_name: The same, by name.
+        set_by_hand: Everything that is set at one instant: states, and the clock.
         set_parents: These others, of each.
         computed: Variables that are computed from what moves, causes before effects.
         static_names: Everything that interventions alone decide, causes before effects.
+        static: The same, without their order.
         random: Variables that are drawn when an episode begins.
     """
 
@@ -195,9 +199,6 @@ class CompiledTask(ActionVector):
         self.commanded = {**self.actions, **_in_a_row(self.bundles, self.actions)}
         states = self.composition.system.layout.slices
         self.slices = {**states, **_in_a_row(self.bundles, states)}
-        self._places = [
-            (name, where, self.model.declared(name).shape) for name, where in self.slices.items()
-        ]
         self.whole = tuple(
             name for name in self.slices if self.model.declared(name).dtype != "real"
         )
@@ -205,6 +206,8 @@ class CompiledTask(ActionVector):
         measured = [v for v in ordered if isinstance(v, Measured)]
         self.set_parents = {v.name: found for v in measured if (found := v.set_parents())}
         self.carried = tuple(v for v in measured if v.name in self.set_parents)
+        self.carried_by_name = {v.name: v for v in self.carried}
+        self.set_by_hand = frozenset(v.name for v in self.model.variables if v.role == "state")
         problems = [
             f"{v.name!r} is drawn in every step, which a world does not do: use a noise of the task"
             for v in self.model.variables
@@ -221,12 +224,16 @@ class CompiledTask(ActionVector):
             raise ModelError(problems)
         self.computed = _computed(self.model)
         self.static_names = _static(self.model, self.computed)
+        self.static = frozenset(self.static_names)
         self.random = tuple(
             v.name
             for v in self.model.variables
             if (isinstance(v, Exogenous) and v.distribution) or (isinstance(v, Derived) and v.noise)
         )
         self._coordinates: dict[str, Callable[..., Any]] = {}
+        self._boxes: dict[Any, tuple[Integers, Floats, Floats] | None] = {}
+        self._reached: dict[frozenset[str], frozenset[str]] = {}
+        self._material: dict[str, bool] = {}
         self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._constants: dict[Structure, Mapping[ParameterKey, Floats]] = {}
 
@@ -239,9 +246,8 @@ class CompiledTask(ActionVector):
     def mechanisms(self) -> Mechanisms:
         """The mechanisms of what is computed in every step, bound to a row of values."""
         sizes = (self._start.vector.size, self.n_actions)
-        static = frozenset(self.static_names)
         where = (self.slices, self.commanded)
-        return Mechanisms(self.model, self.computed, static, *where, sizes)
+        return Mechanisms(self.model, self.computed, self.static_names, *where, sizes)
 
     @cached_property
     def places(self) -> Mapping[str, slice]:
@@ -256,6 +262,17 @@ class CompiledTask(ActionVector):
         for name, where in self.places.items():
             found[where] |= name not in self.bundles
         return found
+
+    @cached_property
+    def can_be_set(self) -> NDArray[np.bool_]:
+        """Which numbers of the state can be set, shape (size,)."""
+        found: NDArray[np.bool_] = self._start.layout.can_be_set
+        return found
+
+    @cached_property
+    def movers(self) -> frozenset[str]:
+        """The bodies that can come and go, and move."""
+        return frozenset(self.composition.movers())
 
     @cached_property
     def entity_names(self) -> frozenset[str]:
@@ -281,6 +298,55 @@ class CompiledTask(ActionVector):
             self._follow[key] = tuple(name for name in self.static_names if name in follow)
         return self._follow[key]
 
+    def box(self, name: str, source: Any) -> tuple[Integers, Floats, Floats] | None:
+        """Return columns, lower ends and edges of a box that a variable is drawn from.
+
+        None where the source is no box, follows other variables or reaches beyond the bounds.
+        """
+        key = name, source
+        if key not in self._boxes:
+            variable: Any = self.model.declared(name)
+            space: Any = variable.space(source) if isinstance(source, str) else source
+            self._boxes[key] = None
+            ends = []
+            for one in (space, variable.bounds or space):
+                if isinstance(one, Box) and not one.parents() and variable.dtype == "real":
+                    ends += [np.ravel(end) for end in one.bounds(variable.shape, {})]
+            if len(ends) == 4 and (ends[0] >= ends[2]).all() and (ends[1] <= ends[3]).all():
+                where = self.mechanisms.where[name]
+                columns = np.arange(where.start, where.stop)
+                self._boxes[key] = columns, ends[0], ends[1] - ends[0]
+        return self._boxes[key]
+
+    def reached(self, names: Iterable[str]) -> frozenset[str]:
+        """Name the parameters and states that change at an instant with some targets."""
+        key = frozenset(target for name in names for target in self.model.targets(name))
+        if key not in self._reached:
+            found = {*key, *self.static_order(sorted(key))}
+            for state in self.carried:
+                if not found.isdisjoint(self.set_parents[state.name]):
+                    found.add(state.name)
+            self._reached[key] = frozenset(found)
+        return self._reached[key]
+
+    def surfaces(self, names: Iterable[str]) -> set[str]:
+        """Name those of ``reached`` that decide where bodies are, or how large."""
+        keys = self.parameter_keys
+        shapes = {name for name, key in keys.items() if key[1] in SURFACES}
+        return {name for name in self.reached(names) if name in self.places or name in shapes}
+
+    def is_material(self, name: str) -> bool:
+        """Return whether a variable moves a body or changes its size, when it is set.
+
+        Goals count as bodies where there are obstacles, in which they must not be.
+        """
+        if name not in self._material:
+            follow, hides = self.reached((name,)), self.composition.hides_goals
+            goal = hides and any(n.endswith(tuple(SURFACES)) for n in follow)
+            moves = not follow.isdisjoint(self.set_by_hand)
+            self._material[name] = goal or moves or bool(self.surfaces((name,)))
+        return self._material[name]
+
     @cached_property
     def _start(self) -> State:
         found: State = self.composition.system.empty_state()
@@ -290,13 +356,9 @@ class CompiledTask(ActionVector):
         """Give a state to read into, or one with some numbers."""
         return self._start.copy() if vector is None else self._start.with_vector(vector)
 
-    def states(self, state: State) -> dict[str, Value]:
-        """Give the states by name, as views of a vector; whole numbers as copies."""
-        vector = state.vector
-        found = {name: vector[where].reshape(shape) for name, where, shape in self._places}
-        for name in self.whole:
-            found[name] = found[name].astype(np.int64)
-        return found
+    def state_of(self, row: Row) -> State:
+        """Return where everything is in a row, as a view of it."""
+        return self._start.with_vector(row.numbers[: self.mechanisms.state_size])
 
     def read(self, name: str, vectors: Floats) -> Value:
         """Give a state in many vectors, shape (n, size): an array of shape (n, *shape)."""
@@ -316,6 +378,13 @@ class CompiledTask(ActionVector):
             variable: Any = self.model.declared(name)
             function = self._coordinates[name] = variable.mechanism.bind()
         return np.asarray(function(*values))
+
+    def coordinates(self, name: str, row: Row) -> Value:
+        """Return a parameter or a state of a row, also in other coordinates, or a bundle."""
+        targets = self.model.targets(name)
+        if targets == (name,):
+            return row[name]
+        return self.in_coordinates(name, *(row[target] for target in targets))
 
     def describe(self, values: Values, state: State) -> Scene:
         """Describe the scene that some values stand for."""
@@ -360,7 +429,7 @@ def _in_a_row(
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class StepBase:
     """A world as physics left it at a control step, before anyone intervened.
 
@@ -370,38 +439,33 @@ class StepBase:
     Attributes:
         compiled: The task in the structure that there is.
         model: With the interventions of earlier steps.
-        static: Values of everything that physics does not move.
-        state: Where everything is.
-        index: The control step.
+        row: The values.
         pending: The interventions at this step so far.
+        drawn: How often each variable was drawn at this instant, by nature or by an intervention.
         at_start: Whether an episode is just beginning.
         fresh: States of bodies that come into being.
-        drawn: How often each variable was drawn at this instant, by nature or by an intervention.
     """
 
     compiled: CompiledTask
     model: SCM
-    static: Mapping[str, Value]
-    state: State
-    index: int
+    row: Row
     pending: PendingInterventions = field(default_factory=dict)
+    drawn: Mapping[str, int] = field(default_factory=dict)
     at_start: bool = False
     fresh: frozenset[str] = frozenset()
-    drawn: Mapping[str, int] = field(default_factory=dict)
 
     def value(self, name: str) -> Value | None:
         """Return a parameter or a state, also in other coordinates; None for anything else."""
-        if name in self.compiled.slices:
-            return self.compiled.view(name, self.state)
-        targets = self.compiled.model.targets(name)
-        if targets == (name,):
-            return self.static.get(name)
-        parts = [self.value(target) for target in targets]
-        known = [part for part in parts if part is not None]
-        return self.compiled.in_coordinates(name, *known) if len(known) == len(parts) else None
+        compiled = self.compiled
+        if name not in compiled.slices and not all(
+            target in compiled.static or target in compiled.slices
+            for target in compiled.model.targets(name)
+        ):
+            return None
+        return self.row[name] if name in compiled.slices else compiled.coordinates(name, self.row)
 
 
-def beginning(compiled: CompiledTask, key: NoiseKey | None) -> tuple[dict[str, Value], State]:
+def beginning(compiled: CompiledTask, key: NoiseKey | None) -> Row:
     """Compute where an episode begins without interventions.
 
     Args:
@@ -409,15 +473,17 @@ def beginning(compiled: CompiledTask, key: NoiseKey | None) -> tuple[dict[str, V
         key: Where to draw what is random by declaration; its default if None.
 
     Returns:
-        The values of everything that physics does not move, and the state of the rest.
+        A row with everything that physics does not move, and the states.
     """
+    row = Row(compiled.mechanisms, compiled.mechanisms.start.copy())
     static = compiled.model.solve(only=compiled.static_names, key=key)
-    state = compiled.empty_state()
+    for name in compiled.static_names:
+        row[name] = static[name]
     for variable in compiled.model.variables:
-        where = compiled.slices.get(variable.name)
-        if where is not None and isinstance(variable, Measured) and not variable.parts:
-            state.vector[where] = np.ravel(_first(compiled, variable, static))
-    return static, state
+        is_state = variable.name in compiled.slices
+        if isinstance(variable, Measured) and is_state and not variable.parts:
+            row[variable.name] = _first(compiled, variable, static)
+    return row
 
 
 def _first(compiled: CompiledTask, variable: Measured, static: Values) -> Value:
@@ -438,17 +504,16 @@ def refuse_impossible(compiled: CompiledTask) -> None:
     Raises:
         ModelError: A default is out of bounds, or two bodies are in one place.
     """
-    static, state = beginning(compiled, None)
-    values = {**static, **compiled.states(state)}
+    values = beginning(compiled, None)
     problems = []
     for variable in compiled.model.variables:
-        if variable.name in values:
+        if variable.name in compiled.static or variable.name in compiled.slices:
             try:
                 coerce(variable, values[variable.name])
                 check_bounds(variable, values[variable.name], values)
             except InterventionError as problem:
                 problems.append(str(problem).replace(f"do({variable.name}):", variable.name + " ="))
-    found = compiled.composition.overlaps(compiled.describe(static, state))
+    found = compiled.composition.overlaps(compiled.describe(values, compiled.state_of(values)))
     problems += map(str, found)
     if problems:
         advice = f"choose other arguments of the task {compiled.task.name!r}"

@@ -7,7 +7,7 @@ row, a batch one of many; both are computed by the same program, so the bits are
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from inspect import signature
@@ -18,7 +18,7 @@ import numpy as np
 from numba.core.errors import NumbaError
 from numba.extending import is_jitted
 
-from scm_world._types import Floats, Integers, Value
+from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.errors import FunctionFailure, ScmWorldError, in_one_line
 from scm_world.graph import SCM
 from scm_world.variables import Integers as WholeNumbers
@@ -35,7 +35,7 @@ class Mechanisms:
     Args:
         model: That declares them.
         computed: Variables that are computed from what moves, causes before effects.
-        static: What interventions alone decide.
+        static: Variables that interventions alone decide.
         states: Columns of the states, which come first.
         actions: Where each action is in the vector of all.
         sizes: How many numbers the states and the actions have.
@@ -46,14 +46,19 @@ class Mechanisms:
         actions: Columns of all actions.
         start: A row before anything is written into it, shape (width,).
         computed: What is computed, causes before effects.
-        whole: Variables that are whole numbers and that not only interventions decide.
+        whole: Variables that are whole numbers.
+        reading: Columns and shape of each variable, and whether it is a whole number.
+        static: Variables that interventions alone decide.
+        decided: The same, without their order.
+        places: Their columns, shape (m,).
+        owners: Which of them each of these columns belongs to, shape (m,).
     """
 
     def __init__(
         self,
         model: SCM,
         computed: Iterable[str],
-        static: Container[str],
+        static: Iterable[str],
         states: Mapping[str, slice],
         actions: Mapping[str, slice],
         sizes: tuple[int, int],
@@ -72,8 +77,16 @@ class Mechanisms:
         parents = [p for name in self.computed for p in model.declared(name).all_parents]
         lagged = dict.fromkeys(p.name for p in parents if p.lag)
         self.earlier = {n: self._take(_size(model.declared(n).shape)) for n in lagged}
-        self._whole = frozenset(n for n in model if model.declared(n).dtype != "real")
-        self.whole = tuple(name for name in self._whole if name not in static)
+        self.whole = frozenset(n for n in model if model.declared(n).dtype != "real")
+        self.reading = {
+            name: (place, model.declared(name).shape, name in self.whole)
+            for name, place in self.where.items()
+        }
+        self.static = tuple(static)
+        self.decided = frozenset(self.static)
+        self.places = places(self.where[name] for name in self.static)
+        widths = [self.where[name].stop - self.where[name].start for name in self.static]
+        self.owners = np.repeat(np.arange(len(widths)), widths)
         self._steps = {name: self._bound(name) for name in self.computed}
         remembered = [self.where[name] for name in self.earlier]
         self._memory = _program([_copy(remembered, self.earlier.values())])
@@ -164,7 +177,62 @@ class Mechanisms:
         """Give values of parents as their declarations have them: arrays of floats or integers."""
         for parent, place in zip(parents, columns, strict=True):
             value = row[place].reshape(self._model.declared(parent.name).shape)
-            yield value.astype(np.int64) if parent.name in self._whole else value
+            yield value.astype(np.int64) if parent.name in self.whole else value
+
+
+@final
+class Row(Mapping[str, Value]):
+    """The values of one world by name: views of one row of numbers, whole numbers as copies.
+
+    Args:
+        mechanisms: That know the columns.
+        numbers: Shape (width,).
+        unknown: Variables whose values are to be computed first.
+    """
+
+    __slots__ = ("mechanisms", "numbers", "unknown")
+
+    def __init__(
+        self, mechanisms: Mechanisms, numbers: Floats, unknown: Iterable[str] = ()
+    ) -> None:
+        self.mechanisms, self.numbers, self.unknown = mechanisms, numbers, {*unknown}
+
+    def __getitem__(self, name: str) -> Value:
+        place, shape, is_whole = self.mechanisms.reading[name]
+        value = self.numbers[place].reshape(shape)
+        return value.astype(np.int64) if is_whole else value
+
+    def __setitem__(self, name: str, value: ArrayLike) -> None:
+        self.numbers[self.mechanisms.where[name]] = np.ravel(value)
+        self.unknown.discard(name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.mechanisms.where and name not in self.unknown
+
+    def differing(self, other: Row) -> list[str]:
+        """List what interventions alone decide, in both rows, and differs in another one."""
+        mine, its = self.mechanisms, other.mechanisms
+        if mine is not its:
+            both = (name for name in its.static if name in mine.decided)
+            return [name for name in both if not np.array_equal(self[name], other[name])]
+        apart = self.numbers[mine.places] != other.numbers[mine.places]
+        return [mine.static[i] for i in dict.fromkeys(mine.owners[apart].tolist())]
+
+    def following(self, last: Row) -> Row:
+        """Take over the clock, the actions and the memory of a row of another structure."""
+        mine, other = self.mechanisms, last.mechanisms
+        self[CONTROL_INDEX] = last[CONTROL_INDEX]
+        if last.numbers[other.actions].shape == self.numbers[mine.actions].shape:
+            self.numbers[mine.actions] = last.numbers[other.actions]
+        for name in mine.earlier.keys() & other.earlier.keys():
+            self.numbers[mine.earlier[name]] = last.numbers[other.earlier[name]]
+        return self
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.mechanisms.where)
+
+    def __len__(self) -> int:
+        return len(self.mechanisms.where)
 
 
 @final
@@ -298,12 +366,7 @@ def _size(shape: tuple[int, ...]) -> int:
 
 
 def _positional(mechanism: Any, count: int) -> tuple[Any, tuple[Any, ...]]:
-    """Split the function of a mechanism into one without constants, and these in order.
-
-    Args:
-        mechanism: Of a variable.
-        count: How many parents it has.
-    """
+    """Split the function of a mechanism into one without constants, and these in order."""
     if isinstance(mechanism, Linear):
         return Stacked(weighted_sum), (np.array(mechanism.weights), mechanism.intercept)
     function = mechanism.bind()

@@ -6,12 +6,14 @@ Source:
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, final
 
 import numpy as np
 from numba import njit
 
 from scm_world._types import Floats
+from scm_world.graph import NoiseKey
 from scm_world.variables import Noise
 from scm_world.variables.noise import word_of
 
@@ -53,6 +55,14 @@ def philox(where: Any, keys: Any, out: Floats) -> None:
             words = (c0, c1, c2, c3)
             for i in range(min(4, n - 4 * block)):
                 out[row, 4 * block + i] = np.float64(words[i] >> _LAST) * 2.0**-53
+
+
+def uniforms(key: NoiseKey, streams: Iterable[str], n: int) -> Floats:
+    """Draw numbers of several streams at one control step, shape (streams, n)."""
+    words = np.array([word_of(stream) for stream in streams], dtype=np.uint64)
+    found = np.empty((len(words), n))
+    philox(np.array([key.noise.key, key.episode, key.step], dtype=np.uint64), words, found)
+    return found
 
 
 @final

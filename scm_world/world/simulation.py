@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, get_args
+from typing import Any
 
+import gymnasium
 import numpy as np
 
 from scm_world._arguments import whole_number
@@ -18,23 +19,21 @@ from scm_world.errors import (
     CyclicModel,
     EngineFailure,
     InterventionError,
-    NotFinite,
     NotReset,
-    ScmWorldError,
     SnapshotMismatch,
     UnknownOption,
-    WrongShape,
+    WrongValue,
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.models import Difference, Parameters, Scene, State
+from scm_world.models import Difference, ParameterKey, Parameters, Scene, State, Structure
 from scm_world.models.camera import Camera
-from scm_world.tasks import Task
-from scm_world.variables import Draw, Intervention, Mechanism, Subset
+from scm_world.tasks import Conventions, Task
+from scm_world.tasks.composition import Composition
+from scm_world.variables import Draw, Mechanism, Subset
 from scm_world.variables.checks import check_subset
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.variables.subsets import AnyRegion, as_region
-from scm_world.world.attributes import WorldAttributes
 from scm_world.world.audit import Audit, report
 from scm_world.world.compiled_task import (
     CompiledTask,
@@ -43,25 +42,26 @@ from scm_world.world.compiled_task import (
     beginning,
     check_functions,
 )
-from scm_world.world.feasibility import (
-    CarriedOut,
-    Present,
-    carried_out,
-    feasible_plan,
+from scm_world.world.interventions import (
+    Draft,
+    Instant,
+    Solution,
+    difference,
+    feasible,
+    overlaps,
     refusal,
+    same,
 )
+from scm_world.world.mechanisms import Row
 from scm_world.world.philox import CompiledNoise
-from scm_world.world.plan import InterventionPlan
-from scm_world.world.snapshot import WorldSnapshot
-from scm_world.world.solver import same
-from scm_world.world.structures import CheckedSnapshot, StructureCache, as_structures, as_task
+from scm_world.world.snapshot import WorldSnapshot, opened
+from scm_world.world.structures import StructureCache, as_structures, as_task
 from scm_world.world.values import PresentValues
 
-_INTERVENTIONS = get_args(get_args(Intervention)[0])
 READ_BACK = 1e-6  # how far a backend may report a number from what it was given
 
 
-class Simulation(WorldAttributes):
+class Simulation:
     """The causal model of a task, stepped by a physics backend; ``scm_world.World`` adds questions.
 
     Args:
@@ -133,8 +133,7 @@ class Simulation(WorldAttributes):
         self._checked = self._closed = False
         self.version = 0  # counts changes of anything but what physics moves
         self._origin: EngineSnapshot | None = None
-        self._origin_static: Values = {}
-        self._earlier: CarriedOut | None = None
+        self._origin_row: Row | None = None
         self._have_no_episode()
         if isinstance(self.variables_space, Subset):
             # Where variables decide which bodies there are, some may be named that are not there.
@@ -150,8 +149,10 @@ class Simulation(WorldAttributes):
         self._base: StepBase | None = None
         compiled = self.structures.natural(None)
         self._values = PresentValues(compiled)
+        row = beginning(compiled, None)
+        self._values.put(row, [*compiled.static_names])
         self._adopt_model(compiled.model)
-        self.structure = compiled.structure(compiled.model.solve(only=compiled.static_names))
+        self._adopt_structure(compiled.structure(row))
 
     @property
     def compiled(self) -> CompiledTask:
@@ -225,7 +226,12 @@ class Simulation(WorldAttributes):
         return self.composition.cameras(_copies(self._values.now))
 
     def reset(
-        self, *, seed: int | None = None, episode: int = 0, do: Mapping[str, Any] | None = None
+        self,
+        *,
+        seed: int | None = None,
+        episode: int = 0,
+        do: Mapping[str, Any] | None = None,
+        space: AnyRegion | None = None,
     ) -> Audit | None:
         """Begin an episode. Nothing that was done in the last one remains.
 
@@ -235,6 +241,7 @@ class Simulation(WorldAttributes):
             episode: Number of the episode, with a seed.
             do: An intervention that takes part in the beginning: a block of another size stands
                 on the floor. It holds until the next reset.
+            space: In which every target of it must lie; see ``do``.
 
         Returns:
             The audit of the intervention, or None if there was none.
@@ -250,20 +257,20 @@ class Simulation(WorldAttributes):
         else:
             self.episode += 1
         self._begin()
-        return self.do(do) if do else None
+        return self.do(do, space=space) if do else None
 
     def _begin(self) -> None:
         self._lost, self._offset = "", 0
         origin = self.structures.natural(None)
-        if self._started and self._origin is not None:
+        row = self._origin_row
+        if self._started and self._origin is not None and row is not None:
             self.backend.restore(self._origin)
         else:
-            static, state = beginning(origin, None)
-            self.backend.build(origin.describe(static, state))
-            self._origin, self._origin_static = self.backend.snapshot(), static
+            row = beginning(origin, None)
+            self.backend.build(origin.describe(row, origin.state_of(row)))
+            self._origin, self._origin_row = self.backend.snapshot(), row
             self._started = True
-        self._values.action[:] = 0.0
-        self._adopt(origin, origin.model, self._origin_static, 0)
+        self._adopt(origin, origin.model, row)
         self._draw_nature()
         self._forget()
         if not self._checked:
@@ -273,26 +280,22 @@ class Simulation(WorldAttributes):
         self._base = self._step_base(at_start=True)
 
     def _draw_nature(self) -> None:
-        """Draw what is random by declaration: the noise of this episode.
-
-        Raises:
-            Infeasible: It puts two bodies in one place.
-        """
+        """Draw what is random by declaration: the noise of this episode."""
         key = self.noise_key(0)
         compiled = self.structures.natural(key)
         if not compiled.random:
             return
-        static, state = beginning(compiled, key)
-        plan = InterventionPlan(compiled, static, state, 0)
-        base, present = self._step_base(), self._present()
-        change = present.difference(plan)
-        problems = present.overlaps(base, plan, change) if compiled.composition.solid else []
+        row, present, base = beginning(compiled, key), self._values.row, self._step_base()
+        change = difference(compiled, present, self.structure, row, present.differing(row))
+        solid = compiled.composition.solid
+        problems = overlaps(compiled, base, present, row, change) if solid else []
         if problems:
-            request = {compiled.random[0]: Draw("A")}
-            raise refusal(self.structures, base, present, plan, request, problems, key)
-        if change:
+            draft = Draft(self.structures, base, {compiled.random[0]: Draw("A")}, None, key)
+            here = Instant(self.structures, base, present, self.structure)
+            raise refusal(here, draft, problems, key)
+        if change is not None:
             self.backend.apply(change)
-        self._adopt(compiled, compiled.model, static, 0)
+        self._adopt(compiled, compiled.model, row)
 
     def noise_key(self, index: int) -> NoiseKey:
         """Return the noise key of a control step of this episode.
@@ -300,6 +303,157 @@ class Simulation(WorldAttributes):
         Noise follows the steps that were taken: an intervention on ``control_index`` leaves it.
         """
         return NoiseKey(self.noise, self.episode, index - self._offset, origin=0)
+
+    # --- the task and the options -------------------------------------------------------------
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle through a snapshot: another backend, the same future bit for bit."""
+        try:
+            snapshot = self.snapshot()
+        except NotReset:
+            snapshot = None
+        options = {
+            "backend": self.backend.name,
+            "preset": self.options.preset,
+            "action_mode": self.action_mode,
+            "frame_skip": self.frame_skip,
+            "max_episode_length": self.given_length,
+            "conventions": self.conventions.name,
+            "variables_space": self.variables_space,
+        }
+        usual = self.task.choices["resolution"][0]
+        if self.resolution != usual:  # logs and files of before have none
+            options["resolution"] = self.resolution
+        return _copied, (type(self), self.structures.task, options, snapshot)
+
+    @property
+    def engine(self) -> str:
+        """Name and version of the physics engine."""
+        return f"{self.backend.name} {self.backend.version}"
+
+    @property
+    def task(self) -> Task:
+        """The task, with its present plan."""
+        return self.compiled.task
+
+    @property
+    def model(self) -> SCM:
+        """The causal model of the present structure, without interventions."""
+        return self.compiled.model
+
+    @property
+    def composition(self) -> Composition:
+        """The entities."""
+        return self.compiled.composition
+
+    @property
+    def slices(self) -> Mapping[str, slice]:
+        """Where each state stands in the state vector."""
+        return self.compiled.slices
+
+    @property
+    def parameter_keys(self) -> Mapping[str, ParameterKey]:
+        """Which physical parameter each variable sets."""
+        return self.compiled.parameter_keys
+
+    @property
+    def static_names(self) -> tuple[str, ...]:
+        """Everything that interventions alone decide, causes before effects."""
+        return self.compiled.static_names
+
+    @property
+    def computed(self) -> tuple[str, ...]:
+        """Variables that are computed from what moves, causes before effects."""
+        return self.compiled.computed
+
+    @property
+    def conventions(self) -> Conventions:
+        """Ours or the predecessor's."""
+        return self.options.conventions
+
+    @property
+    def action_mode(self) -> str:
+        """How the system is commanded."""
+        return self.options.action_mode
+
+    @property
+    def resolution(self) -> str:
+        """How finely the variables are cut."""
+        return self.options.resolution
+
+    @property
+    def frame_skip(self) -> int:
+        """Length of a control step in units of the task; 4 ms for the robot."""
+        return self.options.frame_skip
+
+    @property
+    def control_period(self) -> float:
+        """Length of a control step [s]."""
+        return self.options.control_period
+
+    @property
+    def given_length(self) -> int | None:
+        """Length of an episode in control steps, if one was given."""
+        return self.options.given_length
+
+    @property
+    def max_episode_length(self) -> int:
+        """Length of an episode in control steps."""
+        return self.structures.steps
+
+    @property
+    def action_low(self) -> Floats:
+        """Lower end of all actions, shape (n_actions,)."""
+        return self.compiled.action_bounds[0]
+
+    @property
+    def action_high(self) -> Floats:
+        """Upper end of all actions, shape (n_actions,)."""
+        return self.compiled.action_bounds[1]
+
+    @property
+    def action_space(self) -> gymnasium.spaces.Box:
+        """The space of actions in SI units."""
+        low, high = self.compiled.action_bounds
+        return gymnasium.spaces.Box(low, high, dtype=np.float64)
+
+    @property
+    def observation_space(self) -> gymnasium.spaces.Dict:
+        """The space of the observed variables by name, in SI units; nothing is clipped."""
+        names = (part.variable for part in self.task.observation.rows)
+        shapes = {name: self.model.declared(name).shape for name in names}
+        return gymnasium.spaces.Dict(
+            {
+                name: gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float64)
+                for name, shape in shapes.items()
+            }
+        )
+
+    @property
+    def identity(self) -> tuple[Any, ...]:
+        """What two worlds have in common if one can take up a snapshot of the other."""
+        return (*self._settings, self.structures.digest)
+
+    @property
+    def _settings(self) -> tuple[Any, ...]:
+        numbers = (self.frame_skip, self.max_episode_length)
+        options = (self.options.preset, self.action_mode, self.conventions.name)
+        usual = self.task.choices["resolution"][0]
+        finer = () if self.resolution == usual else (self.resolution,)
+        return (self.task.name, *options, *numbers, *finer)
+
+    def __fingerprint__(self) -> dict[str, Any]:
+        """Return what decides what happens here, except versions: the task, and the options."""
+        options = (self.backend.name, self.variables_space, self._settings)
+        return {**self.structures.__fingerprint__(), "options": options}
+
+    def describe(self, values: Values, state: State) -> Scene:
+        """Describe the scene that some values stand for."""
+        return self.compiled.describe(values, state)
+
+    def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
+        """Name some variables and what follows them at lag 0, without physics, causes first."""
+        return self.compiled.static_order(targets)
 
     # --- a control step -----------------------------------------------------------------------
 
@@ -413,23 +567,22 @@ class Simulation(WorldAttributes):
             InterventionError: The request was refused; the world is bit-identical to before.
             NotReset: There is no episode yet.
         """
-        self._require_state()
+        if not self._started or self._lost:
+            self._require_state()
         twice: list[InterventionError] = []
         flat = flatten(request, twice)
-        base = self._base or self._step_base()
-        twice += self._wrong_actions(flat)
-        flat, drawn = self._anew(flat, base)
-        region = self.variables_space if space is None else space
+        base, drawn = self._base or self._step_base(), dict[str, int]()
+        if any(isinstance(act, Draw | Mechanism) for act in flat.values()):
+            twice += self._wrong_actions(flat)
+            flat, drawn = self._anew(flat, base)
+        region = self.variables_space if space is None else as_region("space", space)
         key = self.noise_key(self._index)
-        earlier = self._earlier
-        if earlier is not None and (twice or not earlier.is_again(base, flat, region)):
-            earlier = None
-        plan, change = feasible_plan(
-            self.structures, base, self._present(), flat, region, key, twice, earlier
+        here = Instant(self.structures, base, self._values.row, self.structure)
+        solution, change = feasible(here, flat, region, key, twice)
+        audit = self._commit(solution, change, flat, check, at_start=base.at_start)
+        self._base = StepBase(
+            base.compiled, base.model, base.row, solution.kept(), drawn or base.drawn, base.at_start
         )
-        audit = self._commit(plan, change, flat, check, at_start=base.at_start)
-        self._earlier = earlier or carried_out(self.structures, base, flat, region, plan)
-        self._base = replace(base, pending=plan.pending, drawn=drawn)
         return audit
 
     def _anew(
@@ -469,9 +622,9 @@ class Simulation(WorldAttributes):
                 for target in targets:
                     value, declared = model.evaluate(target, values), model.declared(target)
                     if np.shape(value) != declared.shape:
-                        raise WrongShape(name, act, declared.shape, np.shape(value))
+                        raise WrongValue(name, act, declared.shape, np.shape(value))
                     if not np.isfinite(value).all():
-                        raise NotFinite(name, value)
+                        raise WrongValue(name, value)
             except CyclicModel:
                 continue  # refused with the reason
             except InterventionError as problem:
@@ -482,65 +635,59 @@ class Simulation(WorldAttributes):
         return problems
 
     def _step_base(self, *, at_start: bool = False) -> StepBase:
-        values, state = self._values, self._values.state.copy()
-        return StepBase(
-            self.compiled, self._held, values.static, state, self._index, at_start=at_start
-        )
-
-    def _present(self) -> Present:
-        values = self._values
-        return Present(self.compiled, self.structure, values.now, values.state)
+        row = Row(self.compiled.mechanisms, self._values.row.numbers.copy())
+        return StepBase(self.compiled, self._held, row, at_start=at_start)
 
     def _commit(
         self,
-        plan: InterventionPlan,
-        change: Difference,
+        solution: Solution,
+        change: Difference | None,
         request: Mapping[str, Any],
         check: Callable[[], object] | None,
         *,
         at_start: bool,
     ) -> Audit:
-        """Apply a plan, read it back, and report; or put everything back and raise.
+        """Apply what was computed, read it back, and report; or put everything back and raise."""
+        before, index = self._step_base(), self._index
 
-        Raises:
-            EngineFailure: The backend does not report what it was given.
-        """
-        values = self._values
-        before = Present(self.compiled, self.structure, dict(values.now), values.state.copy())
-        undo = before.inverse(change)
-        with self._all_or_nothing(lambda: self.backend.apply(undo) if change else None):
-            inertia = self._inertia(change)
+        def undo() -> None:
+            there = solution.compiled.structure(solution.row)
+            lost = difference(before.compiled, solution.row, there, before.row, solution.changed)
+            if lost is not None:
+                self.backend.apply(lost)
+
+        with self._all_or_nothing(before, undo):
+            inertia: Parameters = {}
             reported: Parameters = {}
-            if change:
+            if change is not None:
+                inertia = self._inertia(change)
                 self.backend.apply(change)
                 reported = self._applied(change)
-            moved = plan.index - self._index
-            self._adopt(plan.compiled, plan.model, plan.static, plan.index)
-            now = self._present()
-            audit = report(request, plan, change, before, now, inertia, reported, self.backend)
-            self._offset += moved
-            if at_start:
+            row, changed = solution.row, solution.changed
+            if change is None and not changed and row[CONTROL_INDEX] == index:
+                self._adopt_model(solution.model)
+                self.version += 1
+            else:
+                self._adopt(solution.compiled, solution.model, row, changed, change)
+            now = self._values.row
+            audit = report(request, solution, change, before, now, inertia, reported, self.backend)
+            self._offset += self._index - index
+            if at_start and (change is not None or changed):
                 self._forget()
             if check is not None:
                 check()
         return audit
 
     @contextmanager
-    def _all_or_nothing(self, undo: Callable[[], None]) -> Iterator[None]:
-        """Put everything back, should something fail half way.
-
-        Args:
-            undo: Puts the backend back.
-        """
-        kept, numbers, index = self._values, self._values.matrix.copy(), self._index
-        model, static, state, offset = self._held, kept.static, kept.state.copy(), self._offset
+    def _all_or_nothing(self, before: StepBase, undo: Callable[[], None]) -> Iterator[None]:
+        """Put everything back as it was before, should something fail half way."""
+        kept, offset = self._values, self._offset
         try:
             yield
         except BaseException:
             undo()
             self._values = kept
-            self._adopt(kept.compiled, model, static, index, state)
-            kept.matrix[...] = numbers
+            self._adopt(before.compiled, before.model, before.row, moved=False)
             self._offset = offset
             raise
 
@@ -548,18 +695,13 @@ class Simulation(WorldAttributes):
         bodies = {body for body, what in change.parameters if what in ("mass", "size")}
         if change.structure is not None or not bodies:
             return {}
-        movers = self.composition.movers()
-        if not movers:
+        if not self.compiled.movers:
             return {}
-        bodies -= {*self.composition.bodies}.difference(movers)
+        bodies -= {*self.composition.bodies} - self.compiled.movers
         return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
     def _applied(self, change: Difference) -> Parameters:
-        """Read back what was applied.
-
-        Raises:
-            EngineFailure: The backend did not take it over.
-        """
+        """Read back what was applied."""
         reported = self.backend.parameters(change.parameters)
         values = change.parameters.items()
         wrong = [".".join(key) for key, value in values if not _close(value, reported[key])]
@@ -577,42 +719,48 @@ class Simulation(WorldAttributes):
         self,
         compiled: CompiledTask,
         model: SCM,
-        static: Values,
-        index: int,
-        state: State | None = None,
+        row: Row,
+        changed: list[str] | None = None,
+        change: Difference | None = None,
+        *,
+        moved: bool = True,
     ) -> None:
         """Take over what an intervention decided; the backend has taken over its part.
 
         Args:
             compiled: The task in the structure that there is now.
             model: With the interventions that hold.
-            static: Values of everything that physics does not move.
-            index: The control step.
-            state: Where everything is; what the engine reports if None.
+            row: The values.
+            changed: What only interventions decide and differs from the present, if known.
+            change: What the backend had to change.
+            moved: Whether the backend reports where everything is; else the row does.
         """
         last = self._values
-        if compiled is not last.compiled:
-            self._values = PresentValues(compiled)
-            if self._values.action.shape == last.action.shape:
-                self._values.action[:] = last.action
-        values = self._values
-        values.take(static)
-        self._adopt_model(model)
-        commands = compiled.composition.commands
-        self.translates = commands is not None and commands.applies(static)
-        self.structure = compiled.structure(static)
-        self._substeps = max(1, round(self.control_period / self.structure.timestep))
-        self.version += 1
-        if state is None:
-            self.backend.read(values.state)
+        if changed is None:
+            changed, structure = last.row.differing(row), compiled.structure(row)
         else:
-            values.state.vector[:] = state.vector
-        self._index = index
-        values.be_at(index)
+            structure = change.structure if change and change.structure else self.structure
+        if compiled is not last.compiled:
+            self._values, changed = PresentValues(compiled), [*compiled.static_names]
+        values = self._values
+        values.put(row, changed)
+        self._adopt_model(model)
+        if changed or values is not last:
+            self._adopt_structure(structure)
+        self.version += 1
+        if moved:
+            self.backend.read(values.state)
+        self._index = int(values.row[CONTROL_INDEX])
         if values is not last:
             self._forget()
             for name in last.before.keys() & values.before.keys():
                 values.before[name][...] = last.before[name]
+
+    def _adopt_structure(self, structure: Structure) -> None:
+        commands = self.composition.commands
+        self.translates = commands is not None and commands.applies(self._values.row)
+        self.structure = structure
+        self._substeps = max(1, round(self.control_period / float(structure.timestep)))
 
     def _adopt_model(self, model: SCM) -> None:
         self._held, held = model, model.interventions
@@ -653,54 +801,33 @@ class Simulation(WorldAttributes):
             EngineFailure: The backend has lost the state.
         """
         self._require_state()
-        base = self._base
-        saved = base and WorldSnapshot(
-            engine=None,
-            kept=dict(base.static),
-            interventions=base.model.interventions,
-            index=base.index,
-            plan=base.compiled.plan,
-            vector=base.state.vector.copy(),
-            pending=dict(base.pending),
-            drawn=dict(base.drawn),
-            at_start=base.at_start,
-        )
-        static, engine = self._values.static, self.backend.snapshot()
-        found = WorldSnapshot(
-            engine=engine,
-            kept=dict(static),
-            interventions=self._held.interventions,
-            previous=self.previous(),
-            action=np.array(self._values.action),
-            index=self._index,
+        return WorldSnapshot(
+            engine=self.backend.snapshot(),
+            present=self._step_base(),
+            base=self._base,
             offset=self._offset,
             seed=self.noise.seed,
             episode=self.episode,
             world=self.identity,
-            plan=self.compiled.plan,
-            base=saved,
         )
-        present = StepBase(self.compiled, self._held, static, self._values.state, self._index)
-        self.structures.checked[found] = self.engine, engine, present, base
-        return found
 
     def restore(self, snapshot: WorldSnapshot) -> None:
         """Go back to a snapshot, bit for bit.
 
-        What a snapshot holds is checked when a world of this process meets it for the first time.
-
         Raises:
             SnapshotMismatch: It is one of another task or backend, or damaged. The world is as it
                 was.
-            EngineFailure: The backend failed on the way. If the snapshot had been checked before,
-                the world needs a reset or a snapshot.
+            EngineFailure: The backend failed on the way; the world needs a reset or a snapshot.
         """
-        known = self._known(snapshot)
-        found = known or self._validated(snapshot)
-        _, engine, present, base = found
+        if not isinstance(snapshot, WorldSnapshot):
+            raise SnapshotMismatch(f"{snapshot!r} is no snapshot of a world")
+        if snapshot.world != self.identity:
+            raise SnapshotMismatch(
+                "the snapshot is one of another task, of other arguments of it or of other options"
+            )
         if not self._started:
             self._begin()
-        before = None if known else self.backend.snapshot()
+        before = self.backend.snapshot() if isinstance(snapshot.engine, bytes) else None
 
         def undo() -> None:
             if before is not None:
@@ -709,22 +836,22 @@ class Simulation(WorldAttributes):
                 self._lost = "a snapshot was restored in part"
 
         try:
-            with self._all_or_nothing(undo):
+            engine, base = snapshot.unpacked(self.structure), snapshot.base
+            engine.opened(self.backend)
+            present = opened(snapshot.present, self.structures)
+            base = base if base is None else opened(base, self.structures)
+            noise = CompiledNoise(snapshot.seed)
+            with self._all_or_nothing(self._step_base(), undo):
                 self.backend.restore(engine)
-                if not known:
-                    self._check_restored(present)
-                self._adopt(present.compiled, present.model, present.static, snapshot.index)
-                self._values.action[:] = snapshot.action
-                for name, value in snapshot.previous.items():
-                    self._values.before[name][...] = value
+                self._adopt(present.compiled, present.model, present.row, moved=False)
+                self._values.matrix[0] = present.row.numbers
+        except (SnapshotMismatch, EngineFailure):
+            raise
         except Exception as error:
-            if isinstance(error, ScmWorldError):
-                raise
             raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
         self._lost, self._offset = "", snapshot.offset
-        self.noise, self.episode = CompiledNoise(snapshot.seed), snapshot.episode
+        self.noise, self.episode = noise, snapshot.episode
         self._base = base
-        self.structures.checked[snapshot] = found
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
@@ -756,91 +883,6 @@ class Simulation(WorldAttributes):
                 self._lost, self._base = lost, None
                 self.noise, self.episode, self._index, self._offset = noise
 
-    def _known(self, snapshot: WorldSnapshot) -> CheckedSnapshot | None:
-        """Give what is known of a snapshot that has been checked with this engine."""
-        if not isinstance(snapshot, WorldSnapshot):
-            raise SnapshotMismatch(f"{snapshot!r} is no snapshot of a world")
-        found = self.structures.checked.get(snapshot)
-        if found is None or found[0] != self.engine:
-            return None
-        compiled = found[2].compiled  # it may have been compiled again since
-        return found if self.structures.compiled(compiled.plan) is compiled else None
-
-    def _validated(self, snapshot: WorldSnapshot) -> CheckedSnapshot:
-        """Check a snapshot; the world stays as it is. See ``StructureCache.checked``.
-
-        Raises:
-            SnapshotMismatch: It is one of another task, or damaged.
-        """
-        if snapshot.world != self.identity:
-            raise SnapshotMismatch(
-                "the snapshot is one of another task, of other arguments of it or of other options"
-            )
-        engine, saved = snapshot.unpacked(self.structure), snapshot.base
-        try:
-            present = self._checked_base(snapshot, is_present=True)
-            base = None if saved is None else self._checked_base(saved, is_present=False)
-            if base and base.index != present.index and CONTROL_INDEX not in base.pending:
-                raise ValueError(f"its base is of control step {base.index}")
-            whole_number("steps taken", snapshot.index - snapshot.offset, least=0)
-            whole_number("seed", snapshot.seed, least=0)
-            whole_number("episode", snapshot.episode, least=0)
-        except Exception as error:
-            raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
-        return self.engine, engine, present, base
-
-    def _checked_base(self, saved: WorldSnapshot, *, is_present: bool) -> StepBase:
-        """Return what a snapshot holds of a control step.
-
-        Raises:
-            Exception: It is damaged.
-        """
-        arranged, absent = saved.plan
-        compiled = self.structures.compiled((arranged, frozenset()))
-        unknown = arranged is not None and not len(self.structures.head)
-        if unknown or not compiled.entity_names.issuperset(absent):
-            raise ValueError(f"there is no structure {saved.plan!r}")
-        compiled = self.structures.compiled(saved.plan)
-        model, state = compiled.model, compiled.empty_state()
-        vector = state.vector if is_present else saved.vector
-        shapes = {name: model.declared(name).shape for name in (*saved.kept, *saved.previous)}
-        parts = [(name, value, shapes[name]) for name, value in saved.kept.items()]
-        parts += [(name, value, shapes[name]) for name, value in saved.previous.items()]
-        parts += [("the state", vector, state.vector.shape)]
-        parts += [("the action", saved.action, (compiled.n_actions,))] if is_present else []
-        wrong = [name for name, value, shape in parts if not _numbers(value, shape)]
-        missing = {*saved.kept} ^ {*compiled.static_names}
-        if is_present:
-            missing |= {*saved.previous} ^ {*compiled.mechanisms.earlier}
-        if wrong or missing:
-            raise ValueError(f"no values of {', '.join(sorted([*wrong, *missing]))}")
-        if not isinstance(saved.at_start, bool) or not (is_present or saved.base is None):
-            raise ValueError("its base is no base")
-        for name, act in (*saved.interventions.items(), *saved.pending.values()):
-            if not isinstance(name, str) or not isinstance(act, _INTERVENTIONS):
-                raise ValueError(f"{name!r} holds no intervention: {act!r}")
-        return StepBase(
-            compiled,
-            model.with_interventions(saved.interventions),
-            saved.kept,
-            compiled.empty_state(vector.copy()),
-            whole_number("index", saved.index, least=0),
-            dict(saved.pending),
-            saved.at_start,
-            drawn={str(name): int(times) for name, times in saved.drawn.items()},
-        )
-
-    def _check_restored(self, present: StepBase) -> None:
-        """Refuse a backend's part that does not belong to the rest of a snapshot."""
-        if self.backend.structure != present.compiled.structure(present.static):
-            raise SnapshotMismatch("the snapshot is damaged: the engine has another structure")
-        keys = {key: name for name, key in present.compiled.parameter_keys.items()}
-        reported = self.backend.parameters(keys)
-        wrong = [n for key, n in keys.items() if not _close(present.static[n], reported[key])]
-        if wrong:
-            problem = f"the engine has other values of {', '.join(wrong)}"
-            raise SnapshotMismatch(f"the snapshot is damaged: {problem}")
-
     def close(self) -> None:
         """Free the engine. There is no episode any more."""
         self._closed |= self._started
@@ -852,23 +894,18 @@ class Simulation(WorldAttributes):
             raise NotReset(closed=self._closed)
 
     def _require_state(self) -> None:
-        """Refuse to continue from a state that the backend has lost.
-
-        Raises:
-            EngineFailure: It has; a reset or a snapshot is needed.
-            NotReset: There is no episode yet.
-        """
+        """Refuse to continue without an episode, or from a state that the backend has lost."""
         self._require_episode()
         if self._lost:
             advice = "reset the world, or restore a snapshot"
             raise EngineFailure(f"{self._lost}; {advice}", self.backend.name)
 
 
-def _numbers(value: Any, shape: tuple[int, ...]) -> bool:
-    """Tell whether something is an array of finite numbers of a shape."""
-    is_array = isinstance(value, np.ndarray | np.generic)
-    right = is_array and value.shape == shape and value.dtype.kind in "biuf"
-    return right and bool(np.isfinite(value).all())
+def _copied(kind: Any, task: Task, options: Mapping[str, Any], snapshot: Any) -> Any:
+    world = kind(task, **options)
+    if snapshot is not None:
+        world.restore(snapshot)
+    return world
 
 
 def _copies(values: Values) -> dict[str, Value]:
@@ -882,11 +919,7 @@ def _close(given: Floats, reported: Floats) -> bool:
 
 
 def _as_backend(backend: Any) -> Backend:
-    """Return a backend, or make the one of a name.
-
-    Raises:
-        UnknownOption: There is none of this name, or it is neither.
-    """
+    """Return a backend, or make the one of a name."""
     if isinstance(backend, Backend):
         return backend
     if isinstance(backend, str):

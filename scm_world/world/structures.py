@@ -11,16 +11,14 @@ from functools import cached_property
 from os import PathLike
 from types import MappingProxyType
 from typing import Any, final
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Values
-from scm_world.backends.base import EngineSnapshot
 from scm_world.errors import InterventionError, ModelError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM, NoiseKey
-from scm_world.models import Model, State
+from scm_world.models import Model
 from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.variables import Exogenous, Intervention, Measured, Mechanism, Null, Variable
 from scm_world.world.compiled_task import (
@@ -30,13 +28,10 @@ from scm_world.world.compiled_task import (
     StepBase,
     refuse_impossible,
 )
-from scm_world.world.snapshot import WorldSnapshot
+from scm_world.world.mechanisms import Row
 
 KEPT = 8
 """Compiled tasks that are kept for structures that come again."""
-
-CheckedSnapshot = tuple[str, EngineSnapshot, StepBase, StepBase | None]
-"""Name and version of the backend, its part, what holds, and the world before an intervention."""
 
 
 @final
@@ -50,8 +45,8 @@ class StructureCache:
     Attributes:
         task: Without a plan.
         head: The model of what decides which entities there are, on its own.
+        deciding: The names of its variables.
         steps: Length of an episode in control steps, by the structure without interventions.
-        checked: What is known of snapshots that were taken, or restored, in this process.
     """
 
     def __init__(self, task: Task, options: Options) -> None:
@@ -59,7 +54,7 @@ class StructureCache:
         self.task = task.at(None, options.conventions)
         with _refused(self.task):
             self.head = _head(self.task)
-        self.checked: WeakKeyDictionary[WorldSnapshot, CheckedSnapshot] = WeakKeyDictionary()
+        self.deciding = frozenset(self.head)
         self._compiled: OrderedDict[Plan, CompiledTask] = OrderedDict()
         first = self.task.at(self.plan(self.head.solve())[0], options.conventions)
         seconds = first.seconds
@@ -188,11 +183,7 @@ def _possible(variable: Variable, values: Values) -> bool:
 
 
 def _head(task: Task) -> SCM:
-    """Cut the model of what decides the structure out of what the task's entities share.
-
-    Raises:
-        ModelError: A deciding variable, or a cause of one, is not declared in ``shared``.
-    """
+    """Cut the model of what decides the structure out of what the task's entities share."""
     shared = {variable.name: variable for variable in task.shared()}
     wanted = _with_causes(task.decided_by, shared)
     missing = sorted(wanted - shared.keys())
@@ -238,17 +229,25 @@ def restructured(
     model = compiled.model.with_interventions(kept)
     held = {target for name in kept for target in model.targets(name)}
     known = {
-        v.name: base.static[v.name]
+        v.name: base.row[v.name]
         for v in model.variables
-        if isinstance(v, Exogenous) and v.name in base.static and v.name not in held
+        if isinstance(v, Exogenous) and v.name in present.static and v.name not in held
     }
+    row = Row(compiled.mechanisms, compiled.mechanisms.start.copy())
     solved = model.solve(known, key=key, only=compiled.static_names)
+    for name in compiled.static_names:
+        row[name] = solved[name]
+    for name in compiled.slices:
+        variable = compiled.model.declared(name)
+        if name in present.slices:
+            row[name] = base.row[name]
+        elif isinstance(variable, Measured) and variable.default is not None:
+            row[name] = variable.default
     return replace(
         base,
         compiled=compiled,
         model=model,
-        static={name: solved[name] for name in compiled.static_names},
-        state=_state(base, compiled),
+        row=row.following(base.row),
         fresh=frozenset(compiled.slices.keys() - present.slices.keys()),
     )
 
@@ -267,20 +266,8 @@ def asked_structure(
             if name in structures.head:
                 with suppress(InterventionError):  # what is wrong is reported later
                     acts[name] = present.model.accept(name, value)
-        after = structures.after(acts, base.model, base.static, key)
+        after = structures.after(acts, base.model, base.row, key)
     return (after or present.plan)[0], present.task.absent | gone
-
-
-def _state(base: StepBase, compiled: CompiledTask) -> State:
-    """Keep the states that both structures have; the others get their defaults."""
-    before, state = base.compiled.slices, compiled.empty_state()
-    for name, where in compiled.slices.items():
-        variable = compiled.model.declared(name)
-        if name in before:
-            state.vector[where] = base.state.vector[before[name]]
-        elif isinstance(variable, Measured) and variable.default is not None:
-            state.vector[where] = np.ravel(variable.array(variable.default))
-    return state
 
 
 def wrong_structure(

@@ -6,9 +6,10 @@ from typing import final
 
 import numpy as np
 
-from scm_world._types import Floats, Value, Values
+from scm_world._types import Floats, Value
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.compiled_task import CompiledTask
+from scm_world.world.mechanisms import Row
 
 _ROW = np.zeros(1, dtype=np.int64)  # the only one of a matrix of one row
 
@@ -23,47 +24,53 @@ class PresentValues:
     Attributes:
         compiled: The same.
         matrix: Shape (1, width); see ``Mechanisms``.
+        row: The values by name. Computed ones may be old; see ``compute``.
         state: Where everything is.
         action: The last action, shape (n_actions,).
-        now: By variable. Computed ones may be old; see ``compute``.
+        now: The values by variable: views of what moves, and arrays of what only interventions
+            decide, which stay the same objects until a value changes.
         before: Of one control step ago.
-        static: What physics does not move, as it was taken over.
     """
 
     def __init__(self, compiled: CompiledTask) -> None:
         self.compiled = compiled
-        self.static: Values = {}
         self._fresh = False  # what a step keeps has been computed
         self._view(compiled.mechanisms.start[None].copy())
+        self._decide(compiled.static_names)
 
     def move(self, matrix: Floats) -> None:
         """Keep the values in another matrix from now on, shape (1, width)."""
         matrix[...] = self.matrix
+        decided = {name: self.now[name] for name in self.compiled.static_names}
         self._view(matrix)
+        self.now |= decided
 
     def _view(self, matrix: Floats) -> None:
         self.matrix = matrix
-        row, mechanisms = matrix[0], self.compiled.mechanisms
-        self.state = self.compiled.empty_state(row[: mechanisms.state_size])
+        row, mechanisms, static = matrix[0], self.compiled.mechanisms, self.compiled.static
+        self.row = Row(mechanisms, row)
+        self.state = self.compiled.state_of(self.row)
         self.action, self._clock = row[mechanisms.actions], row[mechanisms.where[CONTROL_INDEX]]
         self.now: dict[str, Value] = {n: mechanisms.view(row, n) for n in mechanisms.where}
-        counted = {n: (self.now[n].astype(np.int64), self.now[n]) for n in mechanisms.whole}
+        counted = {
+            n: (self.now[n].astype(np.int64), self.now[n])
+            for n in mechanisms.where
+            if n in mechanisms.whole and n not in static
+        }
         self._counted = tuple(counted.values())
-        self.now |= {name: whole for name, (whole, _) in counted.items()} | dict(self.static)
+        self.now |= {name: whole for name, (whole, _) in counted.items()}
         self.before = {n: mechanisms.view(row, n, earlier=True) for n in mechanisms.earlier}
 
-    def take(self, static: Values) -> None:
-        """Take over values of everything that physics does not move."""
-        if static is self.static:
-            return
-        row, where = self.matrix[0], self.compiled.mechanisms.where
-        for name, value in static.items():
-            if value is not self.static.get(name):
-                if isinstance(value, np.ndarray):
-                    value.flags.writeable = False  # snapshots share it
-                row[where[name]] = np.ravel(value)
-        self.static = static
-        self.now.update(static)
+    def put(self, row: Row, changed: list[str]) -> None:
+        """Take over a row; ``changed``: what ``Row.differing`` lists."""
+        self.matrix[0] = row.numbers
+        self._decide(changed)
+        self.be_at(int(self._clock[0]))
+
+    def _decide(self, names: tuple[str, ...] | list[str]) -> None:
+        for name in names:
+            self.now[name] = value = np.array(self.row[name])
+            value.flags.writeable = False
 
     def be_at(self, index: int) -> None:
         """Be at a control step; where everything is has been written already."""

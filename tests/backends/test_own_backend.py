@@ -148,3 +148,7 @@ def test_installed_packages_declare_backends(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("scm_world.backends._declared", lambda: {"declared": entry})
     assert backends()[-1] == "declared"
     assert isinstance(make_backend("declared"), Twin)
+    wrong = EntryPoint("wrong", "math:pi", "scm_world.backends")
+    monkeypatch.setattr("scm_world.backends._declared", lambda: {"wrong": wrong})
+    with pytest.raises(ModelError, match=r"'wrong'.* does not make a Backend"):
+        make_backend("wrong")

@@ -14,13 +14,8 @@ from matplotlib.image import imread
 from robot_scenes import link_frames
 
 from scm_world._types import Floats
-from scm_world.backends.renderer import (
-    NOTHING,
-    RenderedImage,
-    body_names,
-    png,
-    render,
-)
+from scm_world.backends.renderer import RenderedImage, png, render
+from scm_world.backends.renderer.shapes import NOTHING
 from scm_world.errors import UnknownOption
 from scm_world.models import GoalRegion, ParameterKey, Scene
 from scm_world.models.camera import Camera
@@ -284,7 +279,7 @@ def test_segmentation_names(scene: Scene) -> None:
     image = render(scene, OVERVIEW)
     shown = {image.names[i] for i in np.unique(image.segmentation) if i != NOTHING}
 
-    assert image.names == body_names(scene.structure)
+    assert image.names == scene.structure.body_names
     assert {"floor", "stage", "robot", "tool_block"} <= shown
     assert {hardware.link_name(finger, 3) for finger in hardware.FINGERS} <= shown
 

@@ -9,9 +9,9 @@ import pytest
 from robot_scenes import box_hull, link_frames
 
 from scm_world._types import Floats
-from scm_world.backends.renderer import body_names, render
-from scm_world.geometry import from_rotation_vector, rotation_matrix
+from scm_world.backends.renderer import render
 from scm_world.geometry.hulls import Hull, hull_of
+from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
 from scm_world.models import GoalRegion, Light, Scene
 from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger import hardware
@@ -66,7 +66,7 @@ def test_every_body_has_a_number() -> None:
 
     expected = {"floor", "stage", "robot", *hardware.LINK_NAMES, "tool_block", "barrier"}
     assert expected <= set(image.names)
-    assert body_names(scene.structure) == image.names
+    assert scene.structure.body_names == image.names
     assert image.names[image.segmentation[int(row), int(column)]] == "barrier"
     assert image.shows("tool_block").any()
 

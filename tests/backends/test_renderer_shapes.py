@@ -11,10 +11,10 @@ import pytest
 from robot_scenes import box_hull
 
 from scm_world._types import Floats
+from scm_world.backends.renderer import automatic_camera, following_camera
 from scm_world.backends.renderer.kernels import Canvas
-from scm_world.backends.renderer.picture import automatic_camera, following_camera
 from scm_world.backends.renderer.shapes import SKY, draw_parts, goal_shapes, parted
-from scm_world.geometry import rotation_matrix
+from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models.camera import Camera
 from scm_world.models.scene import GoalRegion, Light
 from scm_world.models.shapes import KINDS, Mesh, Shapes, mesh_of

@@ -143,16 +143,16 @@ def test_an_interrupted_discovery_reports_what_it_has(
     finished: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ctrl-C is exit code 130, with a partial report; before anything is finished with none."""
-    from scm_world.queries.experiments.models import PairedEquations
+    from scm_world.queries.experiments.paired import Paired
 
-    run = PairedEquations.run
+    run = Paired.run
 
-    def interrupted(self: PairedEquations, number: int, probe: Any) -> None:
+    def interrupted(self: Paired, number: int, probe: Any) -> Any:
         if number == finished:
             raise KeyboardInterrupt
-        run(self, number, probe)
+        return run(self, number, probe)
 
-    monkeypatch.setattr(PairedEquations, "run", interrupted)
+    monkeypatch.setattr(Paired, "run", interrupted)
     Path("chain.py").write_text(CHAIN)
     result = call("discover", "chain.py:chain", "--probes", "3", "--out", "here")
 

@@ -134,7 +134,7 @@ WRONG = [
     ('{"format": "scm_world/curriculum/2"}', "expected the format"),
     ('{"format": "scm_world/curriculum/1", "part": {"kind": "sing"}}', "sing"),
     ('{"format": "scm_world/curriculum/1", "part": {"kind": "do"}}', "request"),
-    ('{"format": "scm_world/curriculum/1", "part": {"kind": "every", "part": {}}}', "steps"),
+    ('{"format": "scm_world/curriculum/1", "part": {"kind": "timed", "part": {}}}', "time"),
     ('{"format": "scm_world/curriculum/1", "part": {"kind": "goal", "space": "C"}}', "C"),
     ('{"format": "scm_world/curriculum/1", "part": {}, "more": 1}', "more"),
     (

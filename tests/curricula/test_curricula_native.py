@@ -25,8 +25,8 @@ from scm_world.curricula import (
     stages,
     together,
 )
-from scm_world.env.batched.loop import LoopExecutor
-from scm_world.env.batched.native import NativeExecutor
+from scm_world.env.native import NativeVectorEnv
+from scm_world.env.processes import ProcessVectorEnv
 from scm_world.errors import InterventionError, UnknownOption
 
 FRICTION, MASS = "floor_friction", "tool_block.mass"
@@ -62,7 +62,8 @@ def made(kind: str | None, part: Any, mode: AutoresetMode, n: int = 3, **options
     if kind == "sync":
         one = partial(single, part, options)
         return CurriculumVectorEnv(SyncVectorEnv([one] * n, autoreset_mode=mode), part)
-    return make_vec(PUSHING, n, part, vectorization_mode=kind, autoreset_mode=mode, **options)
+    how = {"workers": 2} if kind == "processes" else {}
+    return make_vec(PUSHING, n, part, autoreset_mode=mode, **how, **options)
 
 
 def same(mine: Any, other: Any, where: str = "") -> None:
@@ -110,10 +111,10 @@ def test_native_is_sync_value_by_value(name: str, mode: AutoresetMode) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"), [*((name, "loop") for name in CURRICULA), ("within episodes", "processes")]
+    ("name", "kind"), [*((name, "turns") for name in CURRICULA), ("within episodes", "processes")]
 )
-def test_other_executors_are_sync_value_by_value(name: str, kind: str) -> None:
-    """One after another in this process, or several in each of some processes."""
+def test_other_kinds_are_sync_value_by_value(name: str, kind: str) -> None:
+    """One after another in this process, or each in its process."""
     mode = AutoresetMode.SAME_STEP
     pair = [made(one, CURRICULA[name], mode, backend="fake") for one in (kind, "sync")]
     same(*(envs.reset(seed=3) for envs in pair))
@@ -153,9 +154,11 @@ def test_a_state_goes_on_in_the_other_kind(mode: AutoresetMode) -> None:
 def test_it_is_what_is_made_where_the_engine_has_it() -> None:
     """MuJoCo steps many in one call; others take turns; there may be a time limit."""
     part = goals("A")
-    assert type(make_vec(PUSHING, 2, part, backend="fake").env.executor) is LoopExecutor
+    processes = make_vec(PUSHING, 2, part, backend="fake", workers=2)
+    assert isinstance(processes.env, ProcessVectorEnv)
+    processes.close()
     native = make_vec(PUSHING, 2, part, disable_env_checker=True, threads=2)
-    assert isinstance(native.env.executor, NativeExecutor)
+    assert isinstance(native.env, NativeVectorEnv)
     assert [*native.env.get_attr("curriculum")] == [native.curriculum] * 2
     assert native.env.get_attr("where") == (None, None)
     limited = make_vec(PUSHING, 2, part, backend="fake", max_episode_steps=2)
@@ -194,11 +197,11 @@ def test_a_snapshot_goes_back_to_what_is_due() -> None:
 def test_members_that_are_left_alone_are_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where nothing is due within an episode, only resets ask an environment by itself."""
     envs = made("native", goals("A"), AutoresetMode.NEXT_STEP)
-    executor = envs.env.executor
+    many: Any = envs.env
     envs.reset(seed=0)
     asked: list[int] = []
-    bring = executor._bring
-    monkeypatch.setattr(executor, "_bring", lambda rows: asked.extend(rows) or bring(rows))
+    bring = many._bring
+    monkeypatch.setattr(many, "_bring", lambda row: asked.append(row) or bring(row))
     for _ in range(4):
         envs.step(np.zeros((3, 9), np.float32))
     assert asked == []

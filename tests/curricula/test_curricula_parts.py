@@ -13,17 +13,14 @@ from scm_world import Draw, Shift
 from scm_world.curricula import (
     A,
     B,
-    Curriculum,
     Do,
     Follow,
     NewGoal,
-    Resample,
     as_curriculum,
     at_reset,
     at_step,
     during,
     every,
-    everything,
     follow,
     goals,
     in_turn,
@@ -37,14 +34,14 @@ from scm_world.curricula import (
     together,
     weighted,
 )
-from scm_world.curricula.targets import GROUPS, matching
+from scm_world.curricula.targets import grouped
 from scm_world.errors import (
     InterventionError,
     OutOfBounds,
     ScmWorldError,
     UnknownOption,
     UnknownVariable,
-    WrongShape,
+    WrongValue,
 )
 from scm_world.geometry.rotations import angle_between, from_rotation_vector
 from scm_world.tasks import TASKS
@@ -97,10 +94,10 @@ def test_resample_knows_patterns_groups_and_exceptions() -> None:
 def test_groups_fit_every_task(task: str) -> None:
     """No group is refused anywhere; what is a look is no physics, and everything has all."""
     world = Simulation(task, backend="fake")
-    found = {group: set(matching(world.compiled, [f"@{group}"])) for group in GROUPS}
+    found = {group: set(names) for group, names in grouped(world.compiled).items()}
     assert not found["looks"] & found["physics"]
     assert not (found["looks"] | found["poses"]) - found["everything"]
-    for group in GROUPS:
+    for group in found:
         as_curriculum(resample(f"@{group}")).check(world)
     as_curriculum(goals("A|B")).check(world)
 
@@ -309,7 +306,7 @@ def test_nonsense_is_refused_with_what_is_allowed(make: Any) -> None:
 IMPOSSIBLE: list[tuple[Any, type[ScmWorldError]]] = [
     ({"tool_blok.mass": 0.05}, UnknownVariable),
     ({MASS: -1.0}, OutOfBounds),
-    ({MASS: [0.1, 0.2]}, WrongShape),
+    ({MASS: [0.1, 0.2]}, WrongValue),
     (resample("*.mas"), UnknownVariable),
     (resample("@weights"), UnknownVariable),
     (resample("*.mass", besides="*.mas"), UnknownVariable),
@@ -320,7 +317,7 @@ IMPOSSIBLE: list[tuple[Any, type[ScmWorldError]]] = [
     (NewGoal("A", besides=["gravity"]), UnknownVariable),
     (interpolate({"tool_blok.mass": 0.1}, episodes=5), UnknownVariable),
     (interpolate({MASS: -0.1}, episodes=5), OutOfBounds),
-    (interpolate({"gravity": [0.0, 0.0]}, episodes=5), WrongShape),
+    (interpolate({"gravity": [0.0, 0.0]}, episodes=5), WrongValue),
     (during(range(9, 10), at_step(3, resample("nothing"))), UnknownVariable),
 ]
 
@@ -342,15 +339,6 @@ def test_whole_numbers_are_drawn_from_whole_numbers() -> None:
     for space in (Integers(1, 2), Categories((1, 2))):
         env = under(resample(name, space), "scm_world/Towers-v0")
         assert {n for ns in series(env, name, 6) for n in ns} == {1, 2}
-
-
-def test_a_curriculum_knows_whether_it_acts_within_episodes() -> None:
-    """What acts at resets only costs nothing afterwards."""
-    assert not Curriculum(together(at_reset({}), everything())).may_act(1)
-    assert Curriculum(together(at_reset({}), during(range(3), at_step(1, {})))).may_act(1)
-    found = Curriculum(together(at_step(4, {}), in_turn(every(3, {}, first=5), {}), physics()))
-    assert [step for step in range(12) if found.may_act(step)] == [0, 4, 5, 8, 11]
-    assert Curriculum(Resample("*.mass")).part.kind == "resample"
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,7 @@ def test_what_is_refused_in_the_second_half_takes_the_first_back() -> None:
 
 def _wrong(situation: Any) -> dict[str, Any] | None:
     """Ask for a negative mass once the two levels are there."""
-    blocks = len(situation.world.composition.blocks)
+    blocks = len(situation.compiled.composition.blocks)
     return {"tool_level_1_col_0_row_0.mass": -1.0} if blocks == 2 else None
 
 

@@ -29,19 +29,19 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import UnknownOption, UnreadableFile
 
 MODES = list(AutoresetMode)
-KINDS = [*((mode, "loop") for mode in MODES), (AutoresetMode.SAME_STEP, "processes")]
+KINDS = [*((mode, 1) for mode in MODES), (AutoresetMode.SAME_STEP, 2)]
 FRICTION, MASS = "floor_friction", "tool_block.mass"
 COUNTER = interpolate({FRICTION: 1.0}, start={FRICTION: 0.0}, episodes=100)
 """Shows the number of the episode in hundredths."""
 
 
-def made(part: Any, mode: AutoresetMode, n: int = 3, kind: str = "loop", length: int = 3) -> Any:
+def made(part: Any, mode: AutoresetMode, n: int = 3, workers: int = 1, length: int = 3) -> Any:
     """Make environments without physics whose episodes are short."""
     return make_vec(
         PUSHING,
         n,
         part,
-        vectorization_mode=kind,
+        workers=workers,
         autoreset_mode=mode,
         backend="fake",
         max_episode_length=length,
@@ -70,10 +70,10 @@ def roll(envs: Any, steps: int, mode: AutoresetMode, seed: int | None = 0) -> li
     return found
 
 
-@pytest.mark.parametrize(("mode", "kind"), KINDS)
-def test_every_number_is_handed_out_once(mode: AutoresetMode, kind: str) -> None:
+@pytest.mark.parametrize(("mode", "workers"), KINDS)
+def test_every_number_is_handed_out_once(mode: AutoresetMode, workers: int) -> None:
     """Episodes have the numbers of one series, in the order in which they begin."""
-    envs = made(COUNTER, mode, kind=kind)
+    envs = made(COUNTER, mode, workers=workers)
     rows = roll(envs, 8, mode)
     envs.close()
     begun = [rows[0], *(b for a, b in pairwise(rows) if a != b)]
@@ -100,13 +100,13 @@ def test_some_may_begin_anew_alone(mode: AutoresetMode) -> None:
     assert seen == set(range(max(seen) + 1))
 
 
-@pytest.mark.parametrize(("mode", "kind"), KINDS)
-def test_stages_are_shared(mode: AutoresetMode, kind: str) -> None:
+@pytest.mark.parametrize(("mode", "workers"), KINDS)
+def test_stages_are_shared(mode: AutoresetMode, workers: int) -> None:
     """Successes of all members count together; the next stage holds in each of them."""
     solved = at_step(1, {"goal_block.cartesian_position": [0.0, 0.0, 0.0325]})
     solved = together(solved, at_step(1, {"tool_block.cartesian_position": [0.0, 0.0, 0.0325]}))
     part = together(stages({MASS: 0.02}, {MASS: 0.03}, up=1.0, window=3), during(range(3), solved))
-    envs = made(part, mode, kind=kind)
+    envs = made(part, mode, workers=workers)
     observations, _ = envs.reset(seed=0)
     masses = [sorted({round(mass, 3) for mass in observations[:, 1].tolist()})]
     for _ in range(12):
@@ -167,7 +167,7 @@ def test_wrong_vectors_are_refused() -> None:
     bare: Any = partial(gymnasium.make, PUSHING, backend="fake")
     with pytest.raises(UnknownOption, match="make_vec"):
         CurriculumVectorEnv(SyncVectorEnv([bare, bare]), goals())
-    for options in ({"vectorization_mode": "threads"}, {"num_envs": 0}):
+    for options in ({"workers": 0}, {"num_envs": 0}):
         with pytest.raises(UnknownOption):
             make_vec(PUSHING, **{"num_envs": 1, "curriculum": {}, **options}, backend="fake")
     envs = made(COUNTER, AutoresetMode.NEXT_STEP, n=2)

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 import pytest
-from curriculum_envs import ENGINES, PUSHING, STILL, follow_mass, series, under, value
+from curriculum_envs import ENGINES, PUSHING, STILL, along, follow_mass, series, under, value
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import (
     FlattenObservation,
@@ -34,18 +34,20 @@ from scm_world.curricula import (
     resample,
     stages,
     together,
+    when,
 )
 from scm_world.curricula.base import Part
 from scm_world.env.wrappers import MovingAverageAction
 from scm_world.errors import (
     FunctionFailure,
     Infeasible,
-    OutOfSpace,
+    OutOfBounds,
     UnknownOption,
     UnreadableFile,
 )
 from scm_world.models.scene import TOLERANCE
 from scm_world.tasks.trifinger.entities.block_world import overlaps
+from scm_world.variables import Hard, Reaches
 
 MASS, POSITION = "tool_block.mass", "tool_block.cartesian_position"
 
@@ -87,11 +89,11 @@ def test_pictures_keep_their_form() -> None:
 @pytest.mark.parametrize("backend", ["fake", *ENGINES])
 def test_an_intervention_gives_no_reward(backend: str) -> None:
     """A goal that moves to the block is success, and no progress of the robot."""
-    still, env = (
-        under({}, backend=backend),
-        under(at_step(1, follow(_goal_to_block)), backend=backend),
-    )
+    still = under({}, backend=backend)
     still.reset(seed=0)
+    names = ("cartesian_position", "orientation")
+    goal_to_block = {f"goal_block.{name}": value(still, f"tool_block.{name}") for name in names}
+    env = under(at_step(1, goal_to_block), backend=backend)
     env.reset(seed=0)
     before, after = still.step(STILL), env.step(STILL)
     assert (after[1], after[4]["reward_terms"]) == (before[1], before[4]["reward_terms"])
@@ -99,18 +101,6 @@ def test_an_intervention_gives_no_reward(backend: str) -> None:
     terms = env.step(STILL)[4]["reward_terms"]
     assert abs(terms["reward.block_to_goal"]) < 1e-3  # [m], though the goal came 8 cm nearer
     assert terms["fractional_success"] == pytest.approx(1.0, abs=0.01)
-
-
-def _goal_to_block(situation: Any) -> dict[str, Any]:
-    """Put the goal where the block is."""
-    where = situation.values()
-    names = ("cartesian_position", "orientation")
-    model = situation.world.model
-    return {
-        f"goal_block.{name}": where[f"tool_block.{name}"]
-        for name in names
-        if f"goal_block.{name}" in model
-    }
 
 
 @pytest.mark.parametrize("backend", ENGINES)
@@ -185,13 +175,13 @@ def test_a_refused_intervention_leaves_the_environment_usable() -> None:
 def test_a_curriculum_can_be_held_against_a_space() -> None:
     """What lies outside is refused, at the reset and within the episode."""
     env = under(Curriculum({MASS: 0.09}, space={"parts": [("*.mass", "A")]}))
-    with pytest.raises(OutOfSpace):
+    with pytest.raises(OutOfBounds):
         env.reset(seed=0)
     later = under(
         Curriculum(at_step(1, {"floor_friction": 0.4}), space={"parts": [("*.mass", "A")]})
     )
     later.reset(seed=0)
-    with pytest.raises(OutOfSpace, match="not to be set"):
+    with pytest.raises(OutOfBounds, match="not to be set"):
         later.step(STILL)
 
 
@@ -210,6 +200,22 @@ def test_two_wrappers_act_one_after_the_other() -> None:
         assert (value(env, MASS), value(env, "floor_friction")) == (0.04, 0.3)
     assert found == [0.02, 0.03, 0.03]
     assert env.memory.episode == inner.memory.episode == 2
+    env.reset(seed=7)
+    assert env.memory.episode == inner.memory.episode == 3
+    assert env.unwrapped.world.episode == 0
+
+
+def test_an_environment_that_has_begun_goes_on_in_its_noise() -> None:
+    """The first reset under a curriculum is the next episode of the same seed."""
+    masses = []
+    for _ in range(2):
+        env = under({})
+        env.env.reset(seed=5)
+        env = CurriculumEnv(env.env, resample(MASS))
+        env.reset()
+        masses.append(value(env, MASS))
+        assert (env.unwrapped.world.noise.seed, env.unwrapped.world.episode) == (5, 1)
+    assert masses[0] == masses[1]
 
 
 def test_wrappers_may_be_inside_and_outside() -> None:
@@ -340,7 +346,7 @@ def test_errors_of_a_user_are_named() -> None:
 
     for curriculum, words in (
         (follow(fragile), "fragile' of a curriculum raised KeyError: 'mass'"),
-        (Wild(), "control step 0 of episode 0, raised KeyError: 'mass'"),
+        (Wild(), "in episode 0, raised KeyError: 'mass'"),
     ):
         with pytest.raises(FunctionFailure, match=words) as refused:
             under(curriculum).reset(seed=0)
@@ -357,18 +363,41 @@ def test_options_of_a_reset_are_a_dictionary(given: Any) -> None:
 
 
 def test_functions_see_the_situation() -> None:
-    """A function is told the episode, the step, the world and its values."""
+    """A function is asked once for each episode: its number, its step, its structure."""
     seen: list[Any] = []
 
-    def watch(situation: Any) -> None:
-        mass = float(situation.values()[MASS])
-        seen.append((situation.episode, situation.step, situation.due, mass))
+    def watch(situation: Any) -> dict[str, Any]:
+        seen.append((situation.episode, situation.step, MASS in situation.model))
+        return {MASS: Hard(0.05, at=3)}
 
-    env = under(together(every(2, follow(watch))))
+    env = under(together({MASS: 0.03}, follow(watch)))
     for _ in range(2):
-        env.reset(options={"do": {MASS: 0.05}})
-        for _ in range(3):
-            env.step(STILL)
-    assert seen == [(0, 0, True, 0.05), (0, 2, True, 0.05), (1, 0, True, 0.05), (1, 2, True, 0.05)]
+        env.reset()
+        assert along(env, MASS, 4) == [0.03, 0.03, 0.05, 0.05]
+    assert seen == [(0, 0, True), (1, 0, True)]
     masses = series(under(follow(follow_mass)), MASS, 2)
     np.testing.assert_allclose(masses, [0.02, 0.03])
+
+
+def test_a_reset_is_one_transaction_and_one_observation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The curriculum, the caller and the environment's start are one intervention."""
+    env = under(physics("A"), start={MASS: 0.03})
+    asked: list[set[str]] = []
+    inner, do = env.unwrapped.world, env.unwrapped.world.do
+    monkeypatch.setattr(inner, "do", lambda acts, **more: asked.append({*acts}) or do(acts, **more))
+    looks: list[int] = []
+    look = env.unwrapped._look
+    monkeypatch.setattr(env.unwrapped, "_look", lambda: looks.append(1) or look())
+    env.reset(seed=0, options={"do": {"floor_friction": 0.4}})
+    assert len(asked) == len(looks) == 1
+    assert {MASS, "floor_friction", "gravity"} <= asked[0]
+    assert value(env, "floor_friction") == 0.4
+
+
+def test_an_event_within_the_episode_is_a_predicate_of_the_plan() -> None:
+    """It is waited for anew in every episode, and acts once in each."""
+    part = when(Reaches("control_index", above=1.5), {MASS: 0.05})
+    env = under(together({MASS: 0.02}, part))
+    for _ in range(2):
+        env.reset()
+        assert along(env, MASS, 4) == [0.02, 0.05, 0.05, 0.05]

@@ -19,7 +19,6 @@ from scm_world.curricula import AB, A, B, Curriculum, Subset, at_step, everythin
 from scm_world.errors import (
     InterventionError,
     OutOfBounds,
-    OutOfSpace,
     UnknownOption,
     UnknownVariable,
 )
@@ -101,7 +100,7 @@ def test_every_intervention_on_an_environment_is_held_against_it(spelled: Any) -
         {"gravity": [0.0, 0.0, -9.0]},
         {MASS: Draw("B")},
     ):
-        with pytest.raises(OutOfSpace):
+        with pytest.raises(OutOfBounds):
             env.unwrapped.do(request)
     assert (value(env, MASS), value(env, FRICTION)) == (0.03, 0.7)
     env.unwrapped.do({FRICTION: 0.65})
@@ -111,7 +110,7 @@ def test_every_intervention_on_an_environment_is_held_against_it(spelled: Any) -
 def test_a_curriculum_in_a_world_with_a_space_stays_inside() -> None:
     """The training space of an environment holds for curricula; their own counts more."""
     env = under(resample(MASS, "B"), variables_space={"*.mass": "A"})
-    with pytest.raises(OutOfSpace):
+    with pytest.raises(OutOfBounds):
         env.reset(seed=0)
     own = under(Curriculum(resample(MASS, "B"), space=B["*.mass"]), variables_space={"*.mass": "A"})
     own.reset(seed=0)

@@ -61,7 +61,7 @@ def test_going_on_gives_the_same(task: str, backend: str, tmp_path: Path) -> Non
     [
         ("{", "Expecting property name"),
         ('{"format": "something else"}', "expected the format"),
-        ('{"format": "scm_world/discovery-progress/3", "terms": {}}', "task"),
+        ('{"format": "scm_world/discovery-progress/4", "terms": {}}', "task"),
     ],
 )
 def test_damaged_checkpoints_are_refused(text: str, reason: str, tmp_path: Path) -> None:

@@ -260,8 +260,8 @@ def test_a_misspelled_option_is_refused_with_the_nearest_one(
     with pytest.raises(UnknownOption, match="'actionmode'; did you mean 'action_mode'"):
         make_one(id_, actionmode="joint_torques", **model)
     if make_one is gymnasium.make_vec:
-        with pytest.raises(UnknownOption, match="'executer'; did you mean 'executor'"):
-            make_one(id_, executer="loop", **model)
+        with pytest.raises(UnknownOption, match="'worker'; did you mean 'workers'"):
+            make_one(id_, worker=2, **model)
 
 
 @pytest.mark.parametrize("backend", ["fake", "mujoco"])

@@ -149,20 +149,3 @@ def test_pictures_for_people_have_the_camera_and_the_size_that_were_asked_for(si
         make(render_size=(10.5, 4))
     with pytest.raises(UnknownOption, match="render_size"):
         make(render_size=0)
-
-
-@pytest.mark.parametrize("conventions", ["scm_world", "causal_world"])
-def test_channels_of_all_pictures_are_one_image(conventions: str) -> None:
-    """The same pixels as one picture after another, in one environment and in many."""
-    options = {"observation_mode": "pixel", "image_size": 16, "conventions": conventions}
-    apart, together = (make(stack=stack, **options) for stack in ("cameras", "channels"))
-    pictures, channels = apart.reset(seed=0)[0], together.reset(seed=0)[0]
-    assert channels.shape == together.observation_space.shape
-    axis = -1 if conventions == "causal_world" else 0
-    np.testing.assert_array_equal(channels, np.concatenate(pictures, axis=axis))
-    envs = gymnasium.make_vec(REACHING, 2, backend="fake", stack="channels", **options)
-    assert envs.reset(seed=0)[0].shape == (2, *channels.shape)
-    with pytest.raises(UnknownOption, match="stack"):
-        make(stack="channels")
-    with pytest.raises(UnknownOption, match="did you mean 'channels'"):
-        make(stack="channel", **options)

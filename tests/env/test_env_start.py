@@ -9,12 +9,12 @@ from envs import PUSHING, REACHING, make
 
 from scm_world import Draw
 from scm_world.env.arguments import asked
-from scm_world.errors import Infeasible, InterventionError, OutOfSpace, UnknownOption
+from scm_world.errors import Infeasible, InterventionError, OutOfBounds, UnknownOption
 from scm_world.models.scene import TOLERANCE
 from scm_world.tasks import Pushing
 from scm_world.tasks.trifinger.entities.block_world import overlaps
 from scm_world.world import Simulation
-from scm_world.world.plan import merged
+from scm_world.world.interventions import merged
 
 
 def test_start_is_applied_at_every_reset() -> None:
@@ -72,7 +72,7 @@ def test_interventions_stay_in_the_space_that_is_asked_for() -> None:
     """With a space for variables, an intervention outside of it is refused."""
     env = make(variables_space="A")
     env.reset(seed=0, options={"do": {"tool_block.mass": 0.03}})
-    with pytest.raises(OutOfSpace):
+    with pytest.raises(OutOfBounds):
         env.unwrapped.do({"tool_block.mass": 0.09})
 
 
@@ -91,7 +91,7 @@ def test_impossible_draws_are_followed_by_another_episode_if_asked_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With attempts an impossible draw is followed by the next episode; without it is an error."""
-    monkeypatch.setattr("scm_world.world.feasibility.ATTEMPTS", 1)
+    monkeypatch.setattr("scm_world.world.interventions.ATTEMPTS", 1)
     start = {"tool_block.cylindrical_position": "B"}
     once, often = make(start=start), make(start=start, attempts=20)
     episodes = []

@@ -135,13 +135,10 @@ def test_an_episode_is_terminated_where_the_variable_says_so() -> None:
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("kind", [Balance, Falling, Scored])
-@pytest.mark.parametrize("executor", ["native", "loop"])
-def test_many_do_what_single_ones_do(kind: Any, mode: str, executor: str) -> None:
+def test_many_do_what_single_ones_do(kind: Any, mode: str) -> None:
     """Bit for bit, with compiled rewards and with functions of Python, in all modes of resets."""
     options = {"context": "observation"}
-    many = gymnasium.make_vec(
-        MODEL_ID, 3, model=kind(), autoreset_mode=mode, executor=executor, **options
-    )
+    many = gymnasium.make_vec(MODEL_ID, 3, model=kind(), autoreset_mode=mode, **options)
     single = SyncVectorEnv([lambda: make(kind(), **options)] * 3, autoreset_mode=mode)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (45, 3, 1)).astype(np.float32)
     actions[:, 1] = 1.0  # it drives off
@@ -162,10 +159,10 @@ def test_many_do_what_single_ones_do(kind: Any, mode: str, executor: str) -> Non
     single.close()
 
 
-@pytest.mark.parametrize("executor", ["native", "loop"])
-def test_many_worlds_of_a_function(executor: str) -> None:
+@pytest.mark.parametrize("workers", [1, 2])
+def test_many_worlds_of_a_function(workers: int) -> None:
     """Also where the physics is a function, and actions have two components."""
-    many = gymnasium.make_vec(MODEL_ID, 2, model=Decay(), backend="step", executor=executor)
+    many = gymnasium.make_vec(MODEL_ID, 2, model=Decay(), backend="step", workers=workers)
     one = make(Decay(), backend="step")
     seen, _ = many.reset(seed=0)
     np.testing.assert_array_equal(seen[0], one.reset(seed=0)[0])
@@ -344,13 +341,10 @@ def test_the_defaults_of_the_robot_are_what_they_were() -> None:
     assert wanted.items() <= made.items()
 
 
-@pytest.mark.parametrize(
-    ("executor", "task"),
-    [("loop", Fragile), ("native", Fragile), ("native", FragileTogether), ("processes", Fragile)],
-)
-def test_a_function_that_fails_in_one_world_stops_no_other(executor: str, task: Any) -> None:
+@pytest.mark.parametrize(("workers", "task"), [(1, Fragile), (1, FragileTogether), (2, Fragile)])
+def test_a_function_that_fails_in_one_world_stops_no_other(workers: int, task: Any) -> None:
     """Its world is as it was, and goes on; the others are one step further."""
-    many: Any = gymnasium.make_vec(MODEL_ID, 3, executor=executor, model=task())
+    many: Any = gymnasium.make_vec(MODEL_ID, 3, workers=workers, model=task())
     many.reset(seed=[0, 1, 2])
     asked = np.array([[0.5], [0.25], [-0.5]], dtype=np.float32)
     many.step(asked)

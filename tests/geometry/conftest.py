@@ -10,7 +10,7 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from scm_world._types import Floats
-from scm_world.geometry import rotation_matrix
+from scm_world.geometry.rotations import rotation_matrix
 
 Box = tuple[Floats, Floats, Floats]
 

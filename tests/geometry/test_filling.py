@@ -8,9 +8,10 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from scm_world import geometry
 from scm_world._types import ArrayLike, Floats
-from scm_world.geometry import aabb_overlap_fraction, rotation_matrix
+from scm_world.geometry import filling
+from scm_world.geometry.filling import aabb_overlap_fraction
+from scm_world.geometry.rotations import rotation_matrix
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
@@ -21,7 +22,7 @@ def overlap_fraction(*boxes: ArrayLike) -> float:
     """Call the compiled function with lists, too."""
     widths = (3, 3, 4, 3, 3, 4)
     rows = (np.array(numbers, dtype=float) for numbers in boxes)
-    return geometry.overlap_fraction(*(r.reshape(-1, w) for r, w in zip(rows, widths, strict=True)))
+    return filling.overlap_fraction(*(r.reshape(-1, w) for r, w in zip(rows, widths, strict=True)))
 
 
 def test_goals_are_filled_by_the_sum_of_their_blocks() -> None:

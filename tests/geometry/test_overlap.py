@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scm_world import geometry
 from scm_world._types import ArrayLike, Floats
-from scm_world.geometry import aabb_overlap_fraction
+from scm_world.geometry import filling
+from scm_world.geometry.filling import aabb_overlap_fraction
 from scm_world.geometry.rotations import (
     from_rotation_vector,
     quaternion_product,
@@ -29,7 +29,7 @@ def overlap_fraction(*boxes: ArrayLike) -> float:
     """Call the compiled function with lists, too."""
     widths = (3, 3, 4, 3, 3, 4)
     rows = (np.array(numbers, dtype=float) for numbers in boxes)
-    return geometry.overlap_fraction(*(r.reshape(-1, w) for r, w in zip(rows, widths, strict=True)))
+    return filling.overlap_fraction(*(r.reshape(-1, w) for r, w in zip(rows, widths, strict=True)))
 
 
 def overlap_volume(*boxes: ArrayLike) -> float:

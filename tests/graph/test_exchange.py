@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import re
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import networkx as nx
@@ -14,10 +11,10 @@ import numpy as np
 import pytest
 from graph_models import small
 
-from scm_world.errors import MissingExtra, ModelError, UnknownOption
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM, unrolled
-from scm_world.graph import exchange as ex
-from scm_world.graph.exchange import space_lines, to_digraph, write_graph
+from scm_world.graph.exchange import space_lines, to_digraph
+from scm_world.graph.views import slices_of, to_dag, window_of
 from scm_world.queries import identify
 from scm_world.tasks import TASKS, make_task
 from scm_world.variables import Affine, Box, Either, Exogenous, Measured, Parent, Switch
@@ -98,15 +95,6 @@ def test_any_directed_graph_of_networkx_will_do() -> None:
         to_digraph(nx.DiGraph([("x", "y", {"lag": "soon"})]))
 
 
-def test_a_summary_loses_lags() -> None:
-    """One edge per pair is left, with loops; its condition only if there is always one."""
-    found = to_digraph(awkward(), "summary")
-    assert set(found.edges()) == set(awkward().edges())
-    assert found.number_of_edges() == 3
-    conditions = [when for *_, when in found.edges(data="when") if when]
-    assert conditions == ['contact & "more" or set']
-
-
 def test_two_slices_are_those_of_the_model() -> None:
     """But for the unobserved past, they are those of ``scm_world.graph.unrolled``."""
     model = SCM(
@@ -119,7 +107,7 @@ def test_two_slices_are_those_of_the_model() -> None:
     names = {"gain": "gain@=-1", "x": "x@-1", "y": "y@-1"}
     graph = unrolled(model, 2)
     expected = nx.relabel_nodes(graph, {n: names[n[0]] if n[1] < 0 else n[0] for n in graph})
-    found = ex.to_dowhy(model)
+    found = to_dag(model)
     past = [name for name, seen in found.nodes(data="observed") if seen == "no"]
     assert [sorted(found.successors(name)) for name in past] == [["gain@=-1", "x@-1", "y@-1"]]
     found.remove_nodes_from(past)
@@ -138,8 +126,8 @@ def test_two_slices_separate_what_a_long_past_separates(seed: int) -> None:
     for cause, effect, lag in product(names, names, range(longest + 1)):
         if (lag or cause < effect) and rng.random() < 0.25:
             graph.add_edge(cause, effect, lag, lag=lag)
-    window = ex.window_of(graph)
-    long = ex.slices_of(graph, 60)
+    window = window_of(graph)
+    long = slices_of(graph, 60)
     nodes = [node for node in window if node[1] <= 0]
     for _ in range(30):
         x, y, *rest = (nodes[i] for i in rng.permutation(len(nodes)))
@@ -151,22 +139,14 @@ def test_two_slices_separate_what_a_long_past_separates(seed: int) -> None:
 def test_libraries_learn_of_the_unobserved_past() -> None:
     """Two effects of one cause two steps ago have it in common, unobserved, in every format."""
     model = nx.DiGraph([("z", "z", {"lag": 1}), ("z", "x", {"lag": 1}), ("z", "y", {"lag": 1})])
-    found = ex.to_dowhy(model)
+    found = to_dag(model)
     assert found.nodes["past_1@-2"] == {"observed": "no"}
     assert set(found.successors("past_1@-2")) == {"x@-1", "y@-1", "z@-1"}
     assert identify(model, "x@-1", "y").backdoor == ("z@-1",)
     assert identify(model, "x@-1", "y", observed=["x@-1", "y"]).backdoor is None
-    assert '"past_1@-2" [latent]' in write_graph(model, format="dagitty").splitlines()
-    general = pytest.importorskip("causallearn.graph.GeneralGraph")
-    made = ex.to_causal_learn(model)
-    assert isinstance(made, general.GeneralGraph)
-    assert str(made.get_node("past_1@-2").get_node_type()) == "LATENT"
 
 
-# --- text ----------------------------------------------------------------------------------------
-
-
-def test_formats_with_attributes_lose_nothing(graph: nx.MultiDiGraph) -> None:
+def test_formats_of_networkx_lose_nothing(graph: nx.MultiDiGraph) -> None:
     """What networkx reads back has the names, lags, conditions and attributes."""
 
     def facts(made: nx.MultiDiGraph) -> tuple[Any, Any]:
@@ -174,111 +154,38 @@ def test_formats_with_attributes_lose_nothing(graph: nx.MultiDiGraph) -> None:
         return dict(made.nodes(data=True)), edges
 
     if len(graph):
-        assert facts(nx.parse_gml(write_graph(graph, format="gml"))) == facts(graph)
-    assert facts(nx.parse_graphml(write_graph(graph, format="graphml"))) == facts(graph)
-    data = json.loads(write_graph(graph, format="node-link"))
-    assert facts(nx.node_link_graph(data, edges="edges")) == facts(graph)
+        assert facts(nx.parse_gml("\n".join(nx.generate_gml(graph)))) == facts(graph)
+    assert facts(nx.parse_graphml("\n".join(nx.generate_graphml(graph)))) == facts(graph)
+    data = nx.node_link_data(graph, edges="edges")
+    assert facts(nx.node_link_graph(json.loads(json.dumps(data)), edges="edges")) == facts(graph)
 
 
-def test_csv_is_a_matrix_of_slices(graph: nx.MultiDiGraph) -> None:
-    """A row per cause, a column per effect, 1 where there is an edge."""
-    (_, *names), *rows = csv.reader(write_graph(graph, format="csv").splitlines())
-    sliced = to_digraph(graph, "two_slice")
-    assert names == [row[0] for row in rows] == list(sliced)
-    edges = {
-        (row[0], e) for row in rows for e, cell in zip(names, row[1:], strict=True) if cell == "1"
-    }
-    assert edges == set(sliced.edges())
+def test_other_libraries_get_an_acyclic_graph(graph: nx.MultiDiGraph) -> None:
+    """Names of the present come first, and every edge that ends now is there."""
+    made = to_dag(graph)
+    assert nx.is_directed_acyclic_graph(made)
+    assert list(made)[: len(graph)] == list(graph)
+    assert all(set(made.predecessors(name)) for name in graph if graph.in_degree(name))
 
 
-def test_dagitty_gets_names_and_edges() -> None:
-    """A line for each node, and one for each edge."""
-    text = write_graph(nx.DiGraph([("x y", "z")]), format="dagitty")
-    assert text == 'dag {\n"x y"\n"z"\n"x y" -> "z"\n}'
-
-
-def test_the_file_is_the_text(tmp_path: Path) -> None:
-    """What is written to a path is what is returned."""
-    path = tmp_path / "graph.graphml"
-    text = write_graph(small(), path, format="graphml")
-    assert path.read_text() == text + "\n"
-
-
-def test_what_a_format_cannot_hold_is_refused() -> None:
-    """Cycles, names, views and formats: with what is possible."""
-    loop = nx.DiGraph([("x", "y"), ("y", "x", {"lag": 1})])
-    with pytest.raises(ModelError, match=r"x → y → x; try view='two_slice'"):
-        write_graph(loop, format="dagitty", view="summary")
-    with pytest.raises(ModelError, match="acyclic"):
-        ex.to_tigramite(to_digraph(loop, "summary"))
-    with pytest.raises(ModelError, match="dagitty cannot write the name"):
-        write_graph(nx.DiGraph([('a"b', "c")]), format="dagitty")
-    with pytest.raises(UnknownOption, match="no view is named 'lagged'"):
-        write_graph(loop, format="csv", view="lagged")
-    with pytest.raises(UnknownOption, match="no view is named 'lagged'"):
-        ex.to_dowhy(loop, view="lagged")
-    with pytest.raises(UnknownOption, match="no view is named 'unrolled'"):
-        to_digraph(loop, "unrolled")  # type: ignore[arg-type]
+def test_what_is_no_acyclic_graph_is_refused() -> None:
+    """Cycles within an instant, and what is no graph."""
+    loop = nx.DiGraph([("x", "y"), ("y", "x")])
+    with pytest.raises(ModelError, match=r"x → y → x; give edges their lag"):
+        to_dag(loop)
     for other in ("pushing", {"x": ["y"]}, None):
         with pytest.raises(UnknownOption, match="a directed graph of networkx"):
             to_digraph(other)  # type: ignore[arg-type] # that is the point
-    with pytest.raises(UnknownOption, match="did you mean 'graphml'"):
-        write_graph(loop, format="graphm")
 
 
-# --- other libraries -----------------------------------------------------------------------------
-
-
-def test_tigramite_keeps_names_and_lags(graph: nx.MultiDiGraph) -> None:
-    """The array marks the cause with an arrow, and lag 0 in both directions."""
-    made = ex.to_tigramite(graph)
-    at = np.argwhere(made.graph == "-->").tolist()
-    found = {(made.var_names[i], made.var_names[j], lag) for i, j, lag in at}
-    assert found == set(graph.edges(keys=True))
-    instant = sum(lag == 0 for *_, lag in graph.edges(keys=True))
-    assert (made.graph == "<--").sum() == instant
-
-
-def test_dowhy_gets_an_acyclic_networkx_graph(graph: nx.MultiDiGraph) -> None:
-    """Names and edges of the slices."""
-    made = ex.to_dowhy(graph)
-    assert nx.is_directed_acyclic_graph(made)
-    assert set(made.edges) == set(to_digraph(graph, "two_slice").edges())
-
-
-def test_causal_learn_has_the_same_edges(graph: nx.MultiDiGraph) -> None:
-    """causal-learn's graph has the same edges."""
-    pytest.importorskip("causallearn")
-    made = ex.to_causal_learn(graph)
+def test_causal_learn_takes_the_graph(graph: nx.MultiDiGraph) -> None:
+    """In the line of docs/graphs.md."""
+    general = pytest.importorskip("causallearn.graph.GeneralGraph").GeneralGraph
+    node = pytest.importorskip("causallearn.graph.GraphNode").GraphNode
+    dag = to_dag(graph)
+    nodes = {n: node(n) for n in dag}
+    made = general([*nodes.values()])
+    for a, b in dag.edges:
+        made.add_directed_edge(nodes[a], nodes[b])
     edges = {(e.get_node1().get_name(), e.get_node2().get_name()) for e in made.get_graph_edges()}
-    assert edges == set(ex.to_dowhy(graph).edges)
-
-
-def test_pgmpy_has_the_same_edges(graph: nx.MultiDiGraph) -> None:
-    """The DAG of pgmpy has the same edges."""
-    base = pytest.importorskip("pgmpy.base")
-    made = ex.to_pgmpy(graph)
-    assert isinstance(made, base.DAG)
-    assert set(made.edges) == set(ex.to_dowhy(graph).edges)
-    assert set(made) == set(ex.to_dowhy(graph))
-    assert made.latents == {name for name in made if name.startswith("past_")}
-
-
-@pytest.mark.parametrize(
-    ("module", "name", "write"),
-    [
-        ("causallearn", "causal-learn", ex.to_causal_learn),
-        ("pgmpy", "pgmpy", ex.to_pgmpy),
-    ],
-)
-def test_a_missing_library_is_named(
-    module: str, name: str, write: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The error says which extra brings it."""
-    import sys
-
-    for loaded in [key for key in sys.modules if key.partition(".")[0] == module]:
-        monkeypatch.delitem(sys.modules, loaded)
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(MissingExtra, match=re.escape(f"scm-world[{name}]")):
-        write(small())
+    assert edges == set(dag.edges)

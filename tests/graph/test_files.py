@@ -18,7 +18,6 @@ from scm_world.graph import (
     to_dict,
     to_json,
 )
-from scm_world.graph.exchange import write_graph
 from scm_world.tasks import TASKS
 from scm_world.variables import (
     Affine,
@@ -191,14 +190,3 @@ def test_what_is_no_model_is_refused(text: str) -> None:
     """Broken files give one kind of error."""
     with pytest.raises(ModelError):
         from_json(text)
-
-
-def test_dot_shows_kinds_units_lags_and_conditions() -> None:
-    """One line per node and edge; lagged edges are dashed."""
-    dot = write_graph(model(), format="dot")
-    assert dot.startswith("digraph scm {")
-    assert '"a" [shape=ellipse, label="a\\n[1]"' in dot
-    assert '"a" -> "c" [style=solid' in dot
-    assert '"b" -> "c" [style=dashed' in dot
-    assert '"a" -> "e" [style=dashed, label="contact"' in dot
-    assert dot.count("->") == len(model().edges)

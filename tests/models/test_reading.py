@@ -477,7 +477,7 @@ HINGE = (
     [
         (("l", "r"), (("a", "base", "l"), ("a", "l", "r")), "2 joints called 'a'"),
         (("l", "l"), (("a", "base", "l"),), "2 links called 'l'"),
-        (("l",), (("", "base", "l"),), "a joint without a name"),
+        (("l",), (("", "base", "l"),), "1 joints called ''"),
     ],
 )
 def test_names_of_a_urdf_that_are_not_unique_are_named(
@@ -530,9 +530,6 @@ def test_a_compiled_model_without_sense_is_refused() -> None:
 @pytest.mark.parametrize(
     ("declared", "encoding", "joint"),
     [
-        ("ISO-8859-1", "latin-1", "Gelenk_ä"),
-        ("Shift_JIS", "shift-jis", "関節"),
-        ("UTF-16", "utf-16", "Gelenk_ä"),
         ("UTF-16", "utf-8", "Gelenk_ä"),
         ("utf-8", "utf-8-sig", "Gelenk_ä"),
         ("no-such-encoding", "utf-8", "Gelenk_ä"),
@@ -540,7 +537,7 @@ def test_a_compiled_model_without_sense_is_refused() -> None:
     ],
 )
 @pytest.mark.parametrize("part", ["whole", "included"])
-def test_xml_is_read_in_the_encoding_that_it_declares(
+def test_xml_is_read_as_utf_8(
     declared: str, encoding: str, joint: str, part: str, tmp_path: Path
 ) -> None:
     """As well as with a byte order mark, or with stray bytes in a comment."""
@@ -581,8 +578,8 @@ def plate(mass: str, moments: str) -> str:
     ("mass", "moments", "notes"),
     [
         ("1", "0.01 0.01 0.01", ()),
-        ("1", "0.01 0.01 0.1", ("plate (0.01 0.01 0.1, now 0.04 0.04 0.04 kg m²)",)),
-        ("0", "0 0 0", ("plate (0, now 1e-06 kg)", "plate (0 0 0, now 1e-09 1e-09 1e-09 kg m²)")),
+        ("1", "0.01 0.01 0.1", ("plate (1; 0.01 0.01 0.1, now 1; 0.04 0.04 0.04)",)),
+        ("0", "0 0 0", ("plate (0; 0 0 0, now 1e-06; 1e-09 1e-09 1e-09)",)),
     ],
 )
 def test_a_mass_or_inertia_that_is_replaced_is_noted(
@@ -602,9 +599,11 @@ def test_a_note_tells_how_far_few_iterations_lead_away() -> None:
     for mj in (compiled(model), model.source.compile()):
         data = mujoco.MjData(mj)
         mujoco.mj_step(mj, data, 250)
-        ends.append(data.qpos.reshape(2, 7)[:, :3].copy())
+        ends.append(data.qpos.copy())
+    apart = np.empty(12)
+    mujoco.mj_differentiatePos(mj, apart, 1.0, *ends)
     (note,) = model.notes
-    assert f"{np.abs(ends[0] - ends[1]).max():.2g} m;" in note
+    assert f"{np.abs(apart).max():.2g} rad or m;" in note
     assert not read_model(pile(2, '<option iterations="40" integrator="implicitfast"/>')).notes
 
 
@@ -640,16 +639,6 @@ def test_plugins_are_refused_by_name() -> None:
     text = text.replace("<motor", '<plugin plugin="mujoco.pid" instance="p"')
     with pytest.raises(ModelError, match=r"uses 1 plugin\(s\) \(mujoco.pid\)"):
         read_model(text)
-
-
-def test_callbacks_are_refused() -> None:
-    """What a callback acts on is unknown."""
-    mujoco.set_mjcb_control(lambda mj, data: None)
-    try:
-        with pytest.raises(ModelError, match=r"call mujoco.set_mjcb_control\(None\)"):
-            read_model(PENDULUM)
-    finally:
-        mujoco.set_mjcb_control(None)
 
 
 def test_flexes_act_without_variables() -> None:

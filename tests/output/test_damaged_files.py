@@ -29,7 +29,6 @@ from scm_world.graph.files import from_dict, from_json
 from scm_world.output import reading
 from scm_world.policies import load_sb2
 from scm_world.queries import Plan, World, load_episode, save_episode
-from scm_world.queries.tables import read_protocol
 from scm_world.training.recipe import Recipe
 from scm_world.variables import Derived, Exogenous
 
@@ -50,7 +49,6 @@ def test_texts_of_something_else_are_refused(kind: str, text: str) -> None:
         TEXTS[kind](text)
 
 
-MESH = """<mujoco><asset><mesh name="it" file="{}"/></asset><worldbody/></mujoco>"""
 INCLUDE = """<mujoco><include file="{}"/><worldbody/></mujoco>"""
 
 
@@ -71,9 +69,7 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "curriculum": (".json", Curriculum.load),
     "recipe": (".json", Recipe.load),
     "dataset": ("", lambda path: dataset_of(path.parent)),
-    "settings": (".csv", lambda path: read_protocol(path, World("pushing", backend="fake").model)),
     "model": (".xml", read_model),
-    "mesh": (".stl", lambda path: _named_by(MESH, path)),
     "included": (".xml", lambda path: _named_by(INCLUDE, path)),
     "shape": (".stl", load_hull),
 }
@@ -144,22 +140,12 @@ def episode_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save_episode(episode, tmp_path_factory.mktemp("episodes") / "one.npz")
 
 
-@pytest.mark.parametrize("steps", [10**9, 2, -1, 1.5, True, "3", None])
-def test_an_episode_says_no_more_steps_than_it_holds(
-    episode_file: Path, tmp_path: Path, steps: Any
-) -> None:
-    """It is refused before a step is taken."""
-    with np.load(episode_file) as arrays:
-        found = dict(arrays)
-    found["about"] = np.array(json.dumps({**json.loads(str(found["about"])), "steps": steps}))
-    np.savez_compressed(tmp_path / "other.npz", **found)
-    with pytest.raises(UnreadableFile, match="control steps"):
-        load_episode(tmp_path / "other.npz")
-
-
 @pytest.mark.parametrize(
     "changed",
-    [{"layers": 3}, {"layers": [[0]]}, {"options": "x"}, {"task": {}}, {"arguments": [1]}],
+    [
+        *({"layers": 3}, {"layers": [[0]]}, {"options": "x"}, {"task": {}}, {"arguments": [1]}),
+        *({"instants": []}, {"instants": None}, {"format": "scm_world/episode/2"}),
+    ],
 )
 def test_an_episode_that_says_something_else_is_refused(
     episode_file: Path, tmp_path: Path, changed: dict[str, Any]

@@ -14,7 +14,7 @@ from scm_world.errors import (
     UnknownOption,
     UnknownVariable,
 )
-from scm_world.geometry import from_rotation_vector
+from scm_world.geometry.rotations import from_rotation_vector
 from scm_world.policies.planning import CrossEntropy, PlanningModel, Score, Search, nearness
 from scm_world.policies.planning.model import as_score
 from scm_world.policies.scripted import NAMED

@@ -11,7 +11,7 @@ import pytest
 from scm_world import SCM
 from scm_world.discovery.data import Design, as_frame, collect
 from scm_world.errors import ImpossibleObservation, ModelError, UnknownOption, UnknownVariable
-from scm_world.queries import At, Clamp, Counterfactuals
+from scm_world.queries import Counterfactuals
 from scm_world.variables import (
     Action,
     Bernoulli,
@@ -21,6 +21,7 @@ from scm_world.variables import (
     Derived,
     Draw,
     Exogenous,
+    Hard,
     Integers,
     Laplace,
     Linear,
@@ -76,8 +77,20 @@ def chain() -> SCM:
                 mechanism=Linear(weights=(2.0, 1.0)),
                 noise=Laplace(),
             ),
-            Derived(name="z", parents=("y",), mechanism=cubed, noise=Normal()),
-            Derived(name="w", parents=("x",), mechanism=scaled, noise=Normal(0.0, 0.5)),
+            Derived(
+                name="z",
+                parents=("y",),
+                mechanism=cubed,
+                noise=Normal(),
+                inverse_noise="monotone",
+            ),
+            Derived(
+                name="w",
+                parents=("x",),
+                mechanism=scaled,
+                noise=Normal(0.0, 0.5),
+                inverse_noise="monotone",
+            ),
         ]
     )
 
@@ -149,21 +162,23 @@ def test_bits_are_enumerated() -> None:
     np.testing.assert_allclose(posterior, wanted, atol=0.01)
 
 
-def test_two_noises_of_one_value_are_drawn_by_their_density() -> None:
-    """|e| = 1 has two solutions; a normal noise of mean 0.5 has them as e to 1."""
+def test_a_function_that_declares_nothing_is_sampled() -> None:
+    """|e| = 1 has two solutions: draws within the tolerance count, and say how many there are."""
     model = SCM(
         [
             Exogenous(name="x"),
             Derived(name="y", parents=("x",), mechanism=folded, noise=Normal(0.5, 1.0)),
-            Derived(name="e", parents=("x",), mechanism=folded, noise=Normal()),
         ]
     )
-    found = model.counterfactual({"x": 0.0, "y": 1.0, "e": 0.3}, do={"x": 2.0}, n=4_000)
+    seen: dict[str, Any] = {"observed": {"x": 0.0, "y": 1.0}, "do": {"x": 2.0}}
+    with pytest.raises(ModelError, match="declare inverse_noise, draw more"):
+        model.counterfactual(**seen)
+    found = model.counterfactual(**seen, n=20_000, tolerance=0.02)
     assert not found.exact
-    assert found["y"] == pytest.approx(3.0, abs=1e-9)
-    raised = model.do({"y": Mechanism(cubed, ["x"])})
-    seen = raised.counterfactual({"x": 0.0, "y": 1.0, "e": 0.3}, do={"x": 1.0})
-    assert seen["y"] == pytest.approx(2.0)
+    assert found["y"] == pytest.approx(3.0, abs=0.02)
+    assert 100 < found.effective[0] < 2_000
+    back = found.factual["y"][0][found.weights[0] > 0.0]
+    np.testing.assert_allclose(back, 1.0, atol=0.04)
 
 
 def test_a_table_keeps_the_category_that_is_most_likely_the_same() -> None:
@@ -197,7 +212,13 @@ def test_functions_of_one_unit_and_several_rows(together: bool) -> None:
     model = SCM(
         [
             Exogenous(name="x", distribution=Normal()),
-            Derived(name="y", parents=("x",), mechanism=added, noise=Normal()),
+            Derived(
+                name="y",
+                parents=("x",),
+                mechanism=added,
+                noise=Normal(),
+                inverse_noise="monotone",
+            ),
         ]
     )
     found = model.counterfactual({"x": [1.0, 2.0], "y": [0.5, 4.0]}, do={"x": Shift(1.0)})
@@ -260,11 +281,6 @@ def test_observed_under_an_intervention() -> None:
     np.testing.assert_allclose(found["z"], wanted["z"], atol=1e-6)
 
 
-def added(x: Any, noise: Any) -> Any:
-    """Add."""
-    return x + noise
-
-
 @pytest.mark.parametrize("together", [True, False])
 @pytest.mark.parametrize(
     "mechanism",
@@ -287,7 +303,13 @@ def test_a_rare_value_is_inverted_as_any_other(mechanism: Any, together: bool) -
     model = SCM(
         [
             Exogenous(name="x", distribution=Normal()),
-            Derived(name="y", parents=("x",), mechanism=function, noise=Normal()),
+            Derived(
+                name="y",
+                parents=("x",),
+                mechanism=function,
+                noise=Normal(),
+                inverse_noise="monotone",
+            ),
         ]
     )
     noise = np.array([-3.0, 0.5, 9.0, 20.0])
@@ -301,58 +323,17 @@ def test_a_value_beyond_bounded_noise_stays_impossible() -> None:
     """However far one looks; its ends are possible."""
     noise = Box(-1.0, 1.0)
     scaled = Derived(
-        name="y", parents=("x",), mechanism=lambda x, noise: x + np.exp(noise), noise=noise
+        name="y",
+        parents=("x",),
+        mechanism=lambda x, noise: x + np.exp(noise),
+        noise=noise,
+        inverse_noise="monotone",
     )
     model = SCM([Exogenous(name="x", distribution=Normal()), scaled])
     end = math.exp(1.0)
     assert model.counterfactual({"x": 0.0, "y": end}, do={"x": 1.0})["y"] == pytest.approx(1 + end)
     with pytest.raises(ImpossibleObservation, match="no value of its noise"):
         model.counterfactual({"x": 0.0, "y": end + 0.01}, do={"x": 1.0})
-
-
-@pytest.mark.parametrize("together", [True, False])
-@pytest.mark.parametrize("child", [lambda y: 2.0 * y + 1.0, lambda y: y**3])
-def test_what_was_not_observed_follows_from_a_child_without_noise(
-    child: Any, together: bool
-) -> None:
-    """Through another variable that was not observed either; exactly, if it is invertible."""
-    model = SCM(
-        [
-            Exogenous(name="x", distribution=Normal()),
-            Derived(
-                name="y",
-                parents=("x",),
-                mechanism=added if together else alone,
-                noise=Normal(),
-            ),
-            Derived(name="m", parents=("y",), mechanism=lambda y: -y),
-            Derived(name="z", parents=("m", "x"), mechanism=lambda m, x: child(m) + x),
-        ]
-    )
-    whole = model.sample(5, seed=2)
-    found = model.counterfactual({"x": whole["x"], "z": whole["z"]}, do={"x": 1.0})
-    assert found.exact
-    wanted = model.counterfactual(whole, do={"x": 1.0})
-    for name in model:
-        np.testing.assert_allclose(found[name], wanted[name], atol=1e-5)
-
-
-def test_hidden_causes_of_a_sum_have_their_posterior() -> None:
-    """Of two normal summands that make 1, each has mean 1/2 and variance 1/2."""
-    parts = [Exogenous(name=name, distribution=Normal()) for name in "ab"]
-    total = Derived(name="s", parents=("a", "b"), mechanism=lambda a, b: a + b)
-    model = SCM([*parts, total])
-    found = model.counterfactual({"s": 1.0}, do={"a": 2.0}, n=4000)
-    assert found["s"] == pytest.approx(2.5, abs=0.05)
-    assert not found.exact
-    weights, drawn = found.weights[0], found.factual["a"][0]
-    assert weights @ drawn == pytest.approx(0.5, abs=0.05)
-    assert weights @ (drawn - 0.5) ** 2 == pytest.approx(0.5, abs=0.05)
-    np.testing.assert_allclose(found.factual["a"] + found.factual["b"], 1.0)
-    square = Derived(name="q", parents=("a",), mechanism=lambda a: a**2)
-    both = SCM([parts[0], square]).counterfactual({"q": 4.0}, do={}, n=2000)
-    assert set(np.round(both.factual["a"].ravel(), 6)) == {-2.0, 2.0}
-    assert float(both["a"]) == pytest.approx(0.0, abs=0.2)
 
 
 def test_what_cannot_be_is_refused_by_name() -> None:
@@ -364,9 +345,10 @@ def test_what_cannot_be_is_refused_by_name() -> None:
     model = SCM([Exogenous(name="x", distribution=Normal()), double])
     with pytest.raises(ImpossibleObservation, match="'y'"):
         model.counterfactual({"x": 1.0, "y": 3.0}, do={"x": 0.0})
-    assert model.counterfactual({"y": 3.0}, do={})["x"] == 1.5
+    with pytest.raises(ModelError, match="observe its causes"):  # where it follows from x alone
+        model.counterfactual({"y": 3.0}, do={})
     pair = Derived(name="z", parents=("x",), mechanism=lambda x: np.stack([x, x], -1), shape=(2,))
-    with pytest.raises(ModelError, match="observe them") as unmet:
+    with pytest.raises(ModelError, match="observe its causes") as unmet:
         SCM([Exogenous(name="x", distribution=Normal()), pair]).counterfactual(
             {"z": [0.1, 0.1]}, do={}
         )
@@ -443,16 +425,6 @@ def line(*, weight: float = 2.0, mechanism: Any = None, **more: Any) -> SCM:
     return SCM([Exogenous(name="x", distribution=Normal()), y])
 
 
-def test_noise_that_is_added_on_one_side_only_is_not_unique() -> None:
-    """|e| + x e at x = 0: e is 1 or -1, so that y is 2 or 0 at x = 1."""
-    model = line(mechanism=lambda x, noise: np.abs(noise) + x * noise)
-    found = model.counterfactual({"x": 0.0, "y": 1.0}, do={"x": 1.0}, n=20_000)
-    assert not found.exact
-    assert found["y"] == pytest.approx(1.0, abs=0.03)
-    assert set(np.round(found.counterfactual["y"].ravel(), 6)) == {0.0, 2.0}
-    assert not model.counterfactual({"x": 0.0, "y": 1.0}, do={"x": 1.0}).exact
-
-
 def test_a_value_that_many_noises_give_has_their_range() -> None:
     """A floor at 0, a sign, a whole number far out: truncated normal distributions."""
     e = np.linspace(-9.0, 9.0, 400_001)
@@ -462,15 +434,16 @@ def test_a_value_that_many_noises_give_has_their_range() -> None:
         weight = density * told
         return float((weight * then).sum() / weight.sum())
 
-    floor = line(mechanism=lambda x, noise: np.maximum(x + noise, 0.0))
+    known: Any = {"inverse_noise": "monotone"}
+    floor = line(mechanism=lambda x, noise: np.maximum(x + noise, 0.0), **known)
     found = floor.counterfactual({"x": [0.0, 0.0], "y": [0.0, 0.7]}, do={"x": 1.0}, n=20_000)
     assert found["y"] == pytest.approx([wanted(e <= 0.0, np.maximum(1.0 + e, 0.0)), 1.7], abs=0.02)
     hidden = floor.counterfactual({"y": 0.0}, do={"x": 1.0}, n=40_000)
     assert believed(hidden, "x")[0] == pytest.approx(-1.0 / math.sqrt(math.pi), abs=0.03)
-    sign = line(mechanism=lambda x, noise: np.sign(x + noise) * 1.0)
+    sign = line(mechanism=lambda x, noise: np.sign(x + noise) * 1.0, **known)
     found = sign.counterfactual({"x": 0.5, "y": 1.0}, do={"x": -1.0}, n=20_000)
     assert found["y"] == pytest.approx(wanted(e > -0.5, np.sign(e - 1.0)), abs=0.03)
-    whole = line(mechanism=lambda x, noise: np.rint(x + noise), dtype="integer")
+    whole = line(mechanism=lambda x, noise: np.rint(x + noise), dtype="integer", **known)
     found = whole.counterfactual({"x": [0.0, 0.0], "y": [1, 6]}, do={"x": 0.3}, n=20_000)
     for row, seen in enumerate((1, 6)):
         there = np.abs(e - seen) < 0.5
@@ -548,6 +521,7 @@ def test_tables_of_this_package_are_observed() -> None:
                 parents=("v",),
                 mechanism=lambda v, noise: np.asarray(v).sum(axis=(-1, -2)) + noise,
                 noise=Normal(),
+                inverse_noise="additive",
             ),
         ]
     )
@@ -557,7 +531,7 @@ def test_tables_of_this_package_are_observed() -> None:
     for given in (table, frame, frame[frame.columns[::-1]]):
         found = model.counterfactual(given, do={"v": np.ones((2, 2))})
         assert found["s"].tobytes() == wanted["s"].tobytes()
-    with pytest.raises(ModelError, match=r"there is no 'v\[3\]'"):
+    with pytest.raises(ModelError, match="'v' was observed in part"):
         model.counterfactual(frame.drop(columns="v[3]"), do={"s": 0.0})
     partly = model.draw(2, seed=0)["v"].copy()
     partly[1, 0, 1] = np.nan
@@ -597,11 +571,11 @@ def lagged() -> SCM:
 @pytest.mark.parametrize(
     ("do", "replayed"),
     [
-        ({"a": At(2, 5.0)}, {"a": At(3, 5.0)}),
-        ({"a": Clamp(5.0, 2, 4)}, {"a": Clamp(5.0, 3, 5)}),
-        ({"a": Clamp(Shift(1.0), 2, 4)}, {"a": Clamp(Shift(1.0), 3, 5)}),
-        ({"k": Clamp(2.0, 3, 5)}, {"k": Clamp(2.0, 4, 6)}),
-        ({"a": (At(1, 0.0), At(4, 3.0))}, {"a": (At(2, 0.0), At(5, 3.0))}),
+        ({"a": Hard(5.0, at=2)}, {"a": Hard(5.0, at=3)}),
+        ({"a": Hard(5.0, during=(2, 4))}, {"a": Hard(5.0, during=(3, 5))}),
+        ({"a": Shift(1.0, during=(2, 4))}, {"a": Shift(1.0, during=(3, 5))}),
+        ({"k": Hard(2.0, during=(3, 5))}, {"k": Hard(2.0, during=(4, 6))}),
+        ({"a": (Hard(0.0, at=1), Hard(3.0, at=4))}, {"a": (Hard(0.0, at=2), Hard(3.0, at=5))}),
     ],
 )
 def test_interventions_with_times_are_those_of_a_replay(do: Any, replayed: Any) -> None:
@@ -614,7 +588,7 @@ def test_interventions_with_times_are_those_of_a_replay(do: Any, replayed: Any) 
         for name in model:
             np.testing.assert_allclose(found[name][episode], other[name][1:], atol=1e-12)
     with pytest.raises(UnknownOption, match="from control step 0 to 7"):
-        model.counterfactual(model.draw(2, seed=0, steps=8), do={"a": At(8, 1.0)})
+        model.counterfactual(model.draw(2, seed=0, steps=8), do={"a": Hard(1.0, at=8)})
 
 
 def test_a_hidden_series_has_the_posterior_of_the_smoother() -> None:
@@ -666,6 +640,11 @@ def test_another_noise_is_drawn_and_not_the_one_that_was_found() -> None:
     assert other["y"] == pytest.approx([7.0, 9.0], abs=0.02)
     same = model.counterfactual(seen, do={"y": Mechanism(lambda x, noise: 10 * x + noise, ["x"])})
     assert (same.exact, same["y"].tolist()) == (True, [11.0, 18.0])
+    cubic = model.do({"y": Mechanism(cubed, ["x"], inverse_noise="monotone")})
+    under = cubic.counterfactual({"x": 1.0, "y": 1.0 + 0.5**3 + 0.05}, do={"x": 2.0})
+    assert (under.exact, under["y"]) == (True, pytest.approx(2.175))
+    noisier = model.do({"y": Mechanism(noise=Normal(0.0, 9.0))}).counterfactual(seen, do={"x": 0.0})
+    assert (noisier.exact, noisier["y"].tolist()) == (True, [1.0, -2.0])
     drawn = model.counterfactual(seen, do={"x": Draw(Normal(10.0, 1.0))})
     assert not drawn.exact
     assert drawn["y"] == pytest.approx([21.0, 18.0], abs=0.3)
@@ -678,7 +657,7 @@ def test_vectors_that_are_roots_or_have_lags() -> None:
             Exogenous(name="w", shape=(2,), default=(0.0, 0.0), distribution=Normal()),
             Derived(name="a", shape=(2,), parents=(Parent("a", 2), Parent("w")),
                     mechanism=lambda a, w, noise: 0.5 * np.asarray(a) + w + noise, noise=Normal(),
-                    start=(1.0, 2.0)),
+                    inverse_noise="additive", start=(1.0, 2.0)),
         ]
     )  # fmt: skip
     for done in ({"w": (0.0, 1.0)}, {"a": (1.0, -1.0)}):
@@ -721,8 +700,8 @@ def test_effects_by_a_covariate_do_not_split_its_values() -> None:
     assert [ends[1] for ends, _ in quarters] == sorted(ends[1] for ends, _ in quarters)
 
 
-def test_hidden_categories_are_enumerated() -> None:
-    """Two roots and a table that nobody saw, one of them rare: the posterior to nine digits."""
+def test_hidden_categories_have_their_posterior() -> None:
+    """Two roots and a table that nobody saw, one of them rare: draws meet every value."""
     bit: dict[str, Any] = {"dtype": "integer", "bounds": Integers(0, 1)}
     kind: dict[str, Any] = {"dtype": "categorical", "bounds": Categories(labels=("a", "b", "c"))}
     table = np.array([[[0.99, 0.01], [0.5, 0.5], [0.2, 0.8]], [[0.1, 0.9], [0.3, 0.7], [0.0, 1.0]]])
@@ -736,18 +715,25 @@ def test_hidden_categories_are_enumerated() -> None:
             Exogenous(name="d", distribution=Bernoulli(0.001), **bit),
             Exogenous(name="c", distribution=Categorical(prior["c"]), **kind),
             Derived(name="e", parents=("d", "c"), mechanism=Table(table), **bit),
-            Derived(name="y", parents=("d", "c", "e"), mechanism=told, noise=Normal(0.0, 0.5)),
+            Derived(
+                name="y",
+                parents=("d", "c", "e"),
+                mechanism=told,
+                noise=Normal(0.0, 0.5),
+                inverse_noise="additive",
+            ),
         ]
     )
     each = list(np.ndindex(2, 3, 2))
     mass = np.array([prior["d"][d] * prior["c"][c] * table[d, c, e] for d, c, e in each])
     mass *= np.exp(-0.5 * ((3.3 - np.array([told(*k) for k in each])) / 0.5) ** 2)
     mass /= mass.sum()
-    found = model.counterfactual({"y": 3.3}, do={"e": 0})
+    found = model.counterfactual({"y": 3.3}, do={"e": 0}, n=20_000)
+    assert found.effective[0] > 1_000
     for place, name in enumerate(("d", "c", "e")):
         wanted = mass @ [k[place] for k in each]
-        assert believed(found, name)[0] == pytest.approx(wanted, rel=1e-9)
-    assert found["y"] == pytest.approx(mass @ [3.3 + 2 * e for *_, e in each], rel=1e-9)
+        assert believed(found, name)[0] == pytest.approx(wanted, rel=0.05)
+    assert found["y"] == pytest.approx(mass @ [3.3 + 2 * e for *_, e in each], rel=0.01)
     lines = Linear(weights=(1.0,))
     rare = [Exogenous(name="d", distribution=Bernoulli(1e-6), **bit)]
     seen = SCM([*rare, Derived(name="t", parents=("d",), mechanism=lines, **bit)])

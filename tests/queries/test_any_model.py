@@ -11,22 +11,16 @@ import pytest
 from scm_world.errors import ActionError, SnapshotMismatch, UnknownOption
 from scm_world.policies.planning import CrossEntropy
 from scm_world.queries import (
-    At,
-    Clamp,
-    Contact,
     Laboratory,
-    On,
     Outcome,
     Random,
-    Reaches,
     World,
     but_for,
     compare,
     load_episode,
     save_episode,
 )
-from scm_world.queries.local import local_graph
-from scm_world.variables import Box
+from scm_world.variables import Box, Contact, Hard, Reaches
 
 CART_POLE = """
 <mujoco model="tiny cart-pole">
@@ -118,15 +112,15 @@ def test_random_actions_need_no_range() -> None:
 
 def test_plans_happen_in_time(world: World) -> None:
     """At a step, over a window, on an event, and on a touch."""
-    late = world.rollout("random", steps=8, do={"pole.mass": At(5, 0.3)})
+    late = world.rollout("random", steps=8, do={"pole.mass": Hard(0.3, at=5)})
     assert late["pole.mass"].tolist() == [0.1] * 5 + [0.3] * 4
-    held = world.rollout("random", steps=8, do={"hinge.position": Clamp(0.1, 2, 5)})
+    held = world.rollout("random", steps=8, do={"hinge.position": Hard(0.1, during=(2, 5))})
     assert (held["hinge.position"] == 0.1).tolist() == [i in (2, 3, 4) for i in range(9)]
-    forced = world.rollout("random", steps=8, do={"push.control": Clamp(0.5, 2, 5)})
+    forced = world.rollout("random", steps=8, do={"push.control": Hard(0.5, during=(2, 5))})
     assert forced["push.control"][3:6].tolist() == [0.5] * 3
-    fallen = {"pole.mass": On(Reaches("hinge.position", above=1.0), 0.3)}
+    fallen = {"pole.mass": Hard(0.3, when=Reaches("hinge.position", above=1.0))}
     assert world.rollout([0.0, 1.0], steps=40, do=fallen).events["pole.mass"] > 1
-    touched = {"pole.mass": On(Contact("pole", "world"), 0.3)}
+    touched = {"pole.mass": Hard(0.3, when=Contact("pole", "world"))}
     assert world.rollout([0.0, 1.0], steps=40, do=touched).events["pole.mass"] > 1
 
 
@@ -194,11 +188,12 @@ def test_a_model_without_actuators_moves() -> None:
     assert episode["ball.cartesian_position"][3, 2] < 0.0
 
 
-def test_local_graphs_are_refused(world: World) -> None:
-    """They are those of fingers and blocks."""
+def test_local_graphs_are_those_of_any_model(world: World) -> None:
+    """All edges but those by contacts that are not there."""
     world.reset(seed=0)
-    with pytest.raises(UnknownOption, match="world of local graphs"):
-        local_graph(world, [0.0, 0.1])
+    graph = world.local_graph()
+    declared = {(e.cause, e.effect, e.lag) for e in world.model.edges if e.when is None}
+    assert {(a, b, lag) for a, b, lag in graph.edges(data="lag")} >= declared
 
 
 # --- files ----------------------------------------------------------------------------------------

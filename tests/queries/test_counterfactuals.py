@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from scm_world.errors import InterventionError
-from scm_world.queries import At, Clamp, Episode, World, do
+from scm_world.queries import Episode, World, do
 from scm_world.tasks import TASKS, make_task
-from scm_world.variables import Box, Derived, Draw
+from scm_world.variables import Box, Derived, Draw, Hard
 
 ENGINES = ["mujoco"] + (["bullet"] if importlib.util.find_spec("pybullet") else [])
 SMALL: dict[str, dict[str, Any]] = {
@@ -98,9 +98,9 @@ def test_a_thousand_counterfactuals_obey_their_axioms(task: str, backend: str) -
 def test_a_counterfactual_can_begin_anywhere(backend: str) -> None:
     """What was before stays, and branches of branches are exact too."""
     world = World("pushing", backend=backend)
-    plan = do({"tool_block.mass": Draw("A"), "floor_friction": At(12, 0.3)})
+    plan = do({"tool_block.mass": Draw("A"), "floor_friction": Hard(0.3, at=12)})
     episode = world.rollout(
-        "random", seed=3, steps=25, do=plan.do({"action": Clamp([0.1] * 9, 5, 9)})
+        "random", seed=3, steps=25, do=plan.do({"action": Hard([0.1] * 9, during=(5, 9))})
     )
     for at in (0, 7, 10, 12, 24):
         place = [0.1, 0.1, 0.0325]

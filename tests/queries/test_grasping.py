@@ -12,7 +12,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import ActionError
 from scm_world.evaluation.episodes import EpisodeRunner
 from scm_world.evaluation.protocols import chosen, protocols_of
-from scm_world.geometry import from_rotation_vector
+from scm_world.geometry.rotations import from_rotation_vector
 from scm_world.policies.scripted import as_policy
 from scm_world.queries import World
 from scm_world.tasks import Picking

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from itertools import combinations
 from typing import Any
 
@@ -9,9 +10,9 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from scm_world.errors import UnknownOption
+from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.graph import episode_outcome
-from scm_world.queries import SCM, Outcome, World, identify, nature_graph
+from scm_world.queries import SCM, Outcome, World, estimate, identify, nature_graph
 from scm_world.variables import Derived, Linear, Mechanism, Normal, Parent
 
 PLACE = "tool_block.cartesian_position"
@@ -152,3 +153,54 @@ def test_front_doors_are_found() -> None:
     graph.add_edge("u", "m")
     found = identify(graph, "x", "y", observed=["x", "m", "k", "y"], frontdoor=True)
     assert found.frontdoor == ()
+
+
+def confounded() -> nx.DiGraph:
+    """One with a back door, a front door and an instrument."""
+    edges = [("u", "x"), ("u", "y"), ("x", "m"), ("m", "y"), ("i", "x")]
+    return nx.DiGraph(edges)
+
+
+def test_instruments_are_found() -> None:
+    """Associated with the treatment, and with the outcome through it alone."""
+    graph = confounded()
+    assert identify(graph, "x", "y").instruments == ("i",)
+    found = identify(graph, "x", "y", observed=["x", "y", "i"])
+    assert (found.backdoor, found.variables) == (None, {"iv": ("i",)})
+    graph.add_edge("i", "y")
+    assert identify(graph, "x", "y").instruments == ()
+
+
+def test_what_cannot_be_estimated_is_refused() -> None:
+    """No criterion, no column, another criterion than the method's; and DoWhy is an extra."""
+    seen = {"x": [0.0], "y": [0.0]}
+    found = identify(confounded(), "x", "y", observed=["x", "y"])
+    pandas = pytest.importorskip("pandas")
+    table = pandas.DataFrame(seen)
+    with pytest.raises(ModelError, match="not identified: observe more"):
+        estimate(found, table, do=1.0, versus=0.0)
+    found = identify(confounded(), "x", "y")
+    with pytest.raises(UnknownOption, match="column of the table"):
+        estimate(found, table, do=1.0, versus=0.0)
+    with pytest.raises(UnknownOption, match="method"):
+        estimate(found, table, do=1.0, versus=0.0, method="frontdoor.two_stage_regression")
+
+
+@pytest.mark.parametrize("criterion", ["backdoor", "frontdoor", "iv"])
+def test_estimates_are_those_of_dowhy(criterion: str) -> None:
+    """Linear ones, within a tenth of the effect that the numbers were made with."""
+    pandas = pytest.importorskip("pandas")
+    rng = np.random.default_rng(0)
+    u, i, *noise = rng.normal(size=(5, 5000))
+    x = u + i + noise[0]
+    m = 2.0 * x + noise[1]
+    table = pandas.DataFrame({"x": x, "m": m, "y": 1.5 * m + 3.0 * u + noise[2], "u": u, "i": i})
+    seen = {"backdoor": ["u"], "frontdoor": ["m"], "iv": ["i"]}[criterion]
+    found = identify(confounded(), "x", "y", observed=["x", "y", *seen], frontdoor=True)
+    assert next(iter(found.variables)) == criterion
+    if importlib.util.find_spec("dowhy") is None:
+        with pytest.raises(MissingExtra, match=r"scm-world\[dowhy\]"):
+            estimate(found, table, do=1.0, versus=0.0)
+        return
+    made = estimate(found, table, do=1.0, versus=0.0)
+    assert made.value == pytest.approx(3.0, rel=0.1)

@@ -7,9 +7,19 @@ from collections.abc import Iterator
 import pytest
 
 from scm_world.errors import ActionError, InterventionError, UnknownOption
-from scm_world.queries import SCM, At, Clamp, Plan, World
+from scm_world.queries import SCM, Plan, World
 from scm_world.queries.live import LiveEpisode
-from scm_world.variables import Derived, Draw, Exogenous, Linear, Natural, Normal, Parent, Shift
+from scm_world.variables import (
+    Derived,
+    Draw,
+    Exogenous,
+    Hard,
+    Linear,
+    Natural,
+    Normal,
+    Parent,
+    Shift,
+)
 
 MASS, FRICTION, PLACE = "tool_block.mass", "floor_friction", "tool_block.cartesian_position"
 
@@ -33,7 +43,7 @@ def test_it_is_the_episode_of_its_plan(world: World) -> None:
     walked(live, 5)
     live.do({MASS: 0.05})
     walked(live, 4)
-    live.do({FRICTION: Clamp(0.2, 9, 12)})
+    live.do({FRICTION: Hard(0.2, during=(9, 12))})
     assert [*live.held] == [MASS, FRICTION]
     walked(live, 6)
     assert [*live.held] == [MASS]
@@ -41,7 +51,7 @@ def test_it_is_the_episode_of_its_plan(world: World) -> None:
     assert not live.held
     episode = live.episode()
     assert episode.steps == 15
-    plan = {MASS: [Clamp(0.05, 5, None)], FRICTION: Clamp(0.2, 9, 12)}
+    plan = {MASS: [Hard(0.05, during=(5, None))], FRICTION: Hard(0.2, during=(9, 12))}
     assert world.rollout("random", seed=3, do=plan, steps=15) == episode
     assert world.rollout(live.actions, seed=3, do=live.plan(), steps=15) == episode
     assert episode.counterfactual({}, at=10) == episode
@@ -73,12 +83,12 @@ def test_split_is_the_counterfactual(world: World) -> None:
 def test_the_plan_says_what_was_done(world: World) -> None:
     """Windows that were cut, releases and repeated values are in one plan."""
     live = world.live("random", seed=5, do={MASS: 0.03})
-    live.do({FRICTION: Clamp(0.2, 2, 30)})
+    live.do({FRICTION: Hard(0.2, during=(2, 30))})
     walked(live, 6)
     live.do({MASS: 0.06, FRICTION: 0.5})
     walked(live, 3)
     live.do({MASS: Natural()})
-    live.do({FRICTION: Clamp(0.4, 9, 11)})
+    live.do({FRICTION: Hard(0.4, during=(9, 11))})
     walked(live, 6)
     plan = Plan.from_json(live.plan().to_json())
     assert world.rollout("random", seed=5, do=plan, steps=15) == live.episode()
@@ -119,8 +129,8 @@ def test_what_is_refused_changes_nothing(world: World) -> None:
 def test_what_was_due_is_released_when_it_is_refused(world: World) -> None:
     """The step is taken, the error says why, and the episode can be repeated."""
     live = world.live("random", seed=0)
-    live.do({PLACE: Clamp(live.world[PLACE].tolist(), 0, 40)})
-    live.do({"tool_block.size": At(3, [0.08, 0.08, 0.08])})
+    live.do({PLACE: Hard(live.world[PLACE].tolist(), during=(0, 40))})
+    live.do({"tool_block.size": Hard([0.08, 0.08, 0.08], at=3)})
     walked(live, 2)
     with pytest.raises(InterventionError, match="lies"):
         live.step()

@@ -1,52 +1,42 @@
-"""Local causal graphs: which body acts on which in one control step."""
+"""Local causal graphs: which edges hold in one control step."""
 
 from __future__ import annotations
 
 import importlib.util
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from scm_world.backends.base import ContactPoint
 from scm_world.errors import NotReset
 from scm_world.queries import World
-from scm_world.queries.local import (
-    contact_terms,
-    contacts_of,
-    holds,
-    islands,
-    local_graph,
-    reached,
-)
+from scm_world.queries.local import contact_terms, contacts_of, holds
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.hardware import FINGERS as NAMES
 from scm_world.tasks.trifinger.kinematics import inverse
-from scm_world.world import Simulation
 
-FINGERS = tuple(f"robot_finger_{name}" for name in NAMES)
 NEEDS_BULLET = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="needs pybullet"
 )
 ENGINES = ["mujoco", pytest.param("bullet", marks=NEEDS_BULLET)]
-FINGER, ONE, TWO = FINGERS[0], "tool_block_1", "tool_block_2"
+ROBOT, ONE, TWO = "joint_velocities", "tool_block_1", "tool_block_2"
+STATES = {ROBOT: ROBOT, **{f"{one}.linear_velocity": one for one in (ONE, TWO)}}
 TIP = hardware.COLLISION["tip"].radius  # [m]
 HALF = 0.0325  # [m] of a block's edge
 
-_WORLDS: dict[str, Simulation] = {}
+_WORLDS: dict[str, World] = {}
 
 
-def begin(engine: str) -> Simulation:
+def begin(engine: str) -> World:
     """Give a world with two blocks at the start of an episode."""
     if engine not in _WORLDS:
         mode = "end_effector_positions"
-        _WORLDS[engine] = Simulation("stacking2", backend=engine, action_mode=mode)
+        _WORLDS[engine] = World("stacking2", backend=engine, action_mode=mode)
     _WORLDS[engine].reset(seed=0)
     return _WORLDS[engine]
 
 
-def place(world: Simulation, tip: np.ndarray, one: list[float], two: list[float]) -> np.ndarray:
+def place(world: World, tip: np.ndarray, one: list[float], two: list[float]) -> np.ndarray:
     """Put the first fingertip and both blocks somewhere, the other fingers out of the way.
 
     Returns:
@@ -70,27 +60,27 @@ def among(*bodies: str) -> set[tuple[str, str]]:
     return set(itertools.permutations(bodies, 2))
 
 
-def pushed(world: Simulation) -> np.ndarray:
+def pushed(world: World) -> np.ndarray:
     """Let the first finger push the first block; the other lies elsewhere."""
     near = np.array([0.0, HALF + TIP + 3e-4, HALF])
     return place(world, near, [0.0, 0.0, HALF], [0.0, -0.16, HALF])
 
 
-def stacked(world: Simulation) -> np.ndarray:
+def stacked(world: World) -> np.ndarray:
     """Stand one block on the other."""
     world.do({f"{ONE}.cartesian_position": [0, 0, HALF]})
     world.do({f"{TWO}.cartesian_position": [0, 0, 3 * HALF]})
     return world["end_effector_positions"]
 
 
-def alone(world: Simulation) -> np.ndarray:
+def alone(world: World) -> np.ndarray:
     """Let one block fall, while the other stands far from it."""
     away = {f"{ONE}.cartesian_position": [0.0, -0.14, HALF]}
     world.do({f"{TWO}.cartesian_position": [0.0, 0.0, 0.2], **away})
     return world["end_effector_positions"]
 
 
-def chained(world: Simulation) -> np.ndarray:
+def chained(world: World) -> np.ndarray:
     """Let the first finger push the first block, and that one the second."""
     near = np.array([0.0, HALF + TIP + 3e-4, HALF])
     return place(world, near, [0.0, 0.0, HALF], [0.0, -2 * HALF - 3e-4, HALF])
@@ -102,55 +92,25 @@ def onward(tips: np.ndarray, steps: int) -> list[np.ndarray]:
 
 
 SCENES = {
-    pushed: among(FINGER, ONE),
+    pushed: among(ROBOT, ONE),
     stacked: among(ONE, TWO),
     alone: set(),
-    chained: among(FINGER, ONE, TWO),
+    chained: among(ROBOT, ONE, TWO),
 }
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name__)
-def test_hand_made_scenes(engine: str, scene: Callable[[Simulation], np.ndarray]) -> None:
-    """Contacts say what anyone sees; what stands still is told apart."""
+def test_hand_made_scenes(engine: str, scene: Callable[[World], np.ndarray]) -> None:
+    """Contacts say what anyone sees; what stands still passes nothing on."""
     world = begin(engine)
     *actions, action = onward(scene(world), 4)
     for earlier in actions:
         world.step(earlier)
-    graph = local_graph(world, action)
-    fixed = {name for name, moves in graph.nodes(data="moves") if not moves}
-    assert fixed == {"floor"}
-    assert {edge for edge in graph.edges if edge[0] not in fixed} == SCENES[scene]
-
-
-def contact(first: str, second: str, force: float = 1.0) -> ContactPoint:
-    """Let two bodies touch."""
-    return ContactPoint((first, second), np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, force)
-
-
-def causes(names: Iterable[str], *steps: list[ContactPoint]) -> dict[str, str]:
-    """Say from which bodies each is reached, in short."""
-    found = reached(tuple(names), steps)
-    return {body: "".join(sorted(from_)) for body, from_ in found.items()}
-
-
-def test_what_passes_through_others_arrives_within_one_physics_step() -> None:
-    """An island is everything that touches, directly or through others."""
-    assert causes("abc", [contact("a", "b"), contact("b", "c")]) == dict.fromkeys("abc", "abc")
-
-
-def test_contacts_act_in_the_order_of_time() -> None:
-    """If b lets go of a before it meets c, then a acts on c, and c does not act on a."""
-    found = causes("abc", [contact("a", "b")], [contact("b", "c")])
-    assert found == {"a": "ab", "b": "abc", "c": "abc"}
-
-
-def test_what_stands_still_joins_no_island() -> None:
-    """Two blocks on one floor are apart, and links of one finger are one body."""
-    on_floor = [contact("a", "floor"), contact("floor", "b")]
-    assert causes("ab", on_floor) == {"a": "a", "b": "b"}
-    links = [contact(f"{FINGER}_link_3", "a"), contact("b", f"{FINGER}_link_2")]
-    assert islands((FINGER, "a", "b"), links) == [{FINGER, "a", "b"}]
+    graph = world.local_graph(action)
+    found = {(STATES[a], STATES[b]) for a, b in graph.edges() if {a, b} <= STATES.keys() and a != b}
+    assert found == SCENES[scene]
+    assert graph.has_edge("floor_friction", f"{TWO}.linear_velocity") == (scene is not alone)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -164,8 +124,8 @@ def test_asking_changes_nothing(engine: str) -> None:
         before = world.values()
         touching = [(c.bodies, c.depth, c.force) for c in world.backend.contacts()]
         if asked:
-            local_graph(world)
-            local_graph(world, action)
+            world.local_graph()
+            world.local_graph(action)
             now = world.values()
             assert all(before[name].tobytes() == now[name].tobytes() for name in now)
         world.do({f"{TWO}.mass": 0.05})
@@ -180,7 +140,7 @@ def test_asking_changes_nothing(engine: str) -> None:
 def test_what_cannot_be_asked() -> None:
     """There must be an episode."""
     with pytest.raises(NotReset):
-        local_graph(Simulation("pushing"))
+        World("pushing").local_graph()
 
 
 # --- conditions of edges --------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import pytest
 
 import scm_world  # noqa: F401 # registers the environments
 from scm_world.errors import InterventionError, UnknownOption, UnknownVariable
-from scm_world.queries import At, Clamp, Plan, World, compare, do, load_episode, save_episode
+from scm_world.queries import Plan, World, compare, do, load_episode, save_episode
 from scm_world.variables import Null
 
 ENGINES = ["mujoco", "bullet"]
@@ -71,7 +71,7 @@ def test_an_episode_without_it_is_exact(backend: str) -> None:
     largest = max((found.largest for found in apart.variables.values()), default=0.0)
     assert largest < {"mujoco": 1e-12, "bullet": 1e-4}[backend]
     assert (6, ("floor", GONE), 0) in apart.contacts
-    late = world.rollout(steps=12, do={GONE: At(5, Null())})
+    late = world.rollout(steps=12, do={GONE: Null(at=5)})
     np.testing.assert_array_equal(late.trace.vectors[-1], other.trace.vectors[-1])
 
 
@@ -118,8 +118,8 @@ def test_what_cannot_go_stays(request_: dict[str, Null], error: type[Exception])
     assert all(np.array_equal(before[name], value) for name, value in world.values().items())
     with pytest.raises(InterventionError, match="a body of a world can"):
         world.model.do({"tool_block.mass": Null()})
-    with pytest.raises(UnknownOption, match="Clamp"):
-        Clamp(Null())
+    with pytest.raises(UnknownOption, match="intervention of a window"):
+        Null(during=(0, None))
 
 
 def test_environments_keep_what_they_observe() -> None:

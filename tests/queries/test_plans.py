@@ -8,19 +8,32 @@ import numpy as np
 import pytest
 
 from scm_world.errors import InterventionError, ModelError, UnknownOption
-from scm_world.queries import At, Clamp, Contact, On, Plan, Reaches, World, do
-from scm_world.variables import Box, Draw, Function, Mechanism, Natural, Scale, Shift
+from scm_world.queries import Plan, World, do
+from scm_world.variables import (
+    Box,
+    Contact,
+    Draw,
+    Function,
+    Hard,
+    Mechanism,
+    Natural,
+    Reaches,
+    Scale,
+    Shift,
+)
 
 EVERYTHING = Plan(
     {
         "tool_block": {"mass": 0.05, "friction": Shift(0.1)},
-        "floor_friction": At(10, Scale(0.5)),
+        "floor_friction": Scale(0.5, at=10),
         "gravity": Draw("A"),
         "stage_friction": Draw(Box(0.1, 0.2)),
-        "action": (At(3, [0.1] * 9), Clamp([0.2] * 9, 5, 8)),
-        "joint_positions": Clamp([0.0, 0.9, -1.7] * 3, 20),
-        "tool_block.cartesian_position": On(Contact("robot", "tool_block"), [0.1, 0.0, 0.0325]),
-        "restitution": On(Reaches("reward", below=-1.0), Natural()),
+        "action": (Hard([0.1] * 9, at=3), Hard([0.2] * 9, during=(5, 8))),
+        "joint_positions": Hard([0.0, 0.9, -1.7] * 3, during=(20, None)),
+        "tool_block.cartesian_position": Hard(
+            [0.1, 0.0, 0.0325], when=Contact("robot", "tool_block")
+        ),
+        "restitution": Natural(when=Reaches("reward", below=-1.0)),
         "finger_friction": Mechanism(Function("numpy:mean"), ["floor_color"]),
     }
 )
@@ -42,7 +55,7 @@ def test_plans_go_to_json_and_back() -> None:
 
 def test_later_wins_and_nothing_changes() -> None:
     """do(a).do(b) == do({**a, **b}), in every order, and a stays a."""
-    a, b = {"floor_friction": 0.3, "gravity": Draw("A")}, {"floor_friction": At(3, 0.4)}
+    a, b = {"floor_friction": 0.3, "gravity": Draw("A")}, {"floor_friction": Hard(0.4, at=3)}
     first = do(a)
     assert first.do(b) == do({**a, **b})
     assert first == do(a)
@@ -55,9 +68,9 @@ def test_later_wins_and_nothing_changes() -> None:
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: At(-1, 0.1),
-        lambda: At(1.5, 0.1),
-        lambda: Clamp(0.1, 5, 5),
+        lambda: Hard(0.1, at=-1),
+        lambda: Hard(0.1, at=1.5),
+        lambda: Hard(0.1, during=(5, 5)),
         lambda: Reaches("reward"),
         lambda: do({"floor_friction": "much"}),
     ],
@@ -71,7 +84,7 @@ def test_what_is_no_plan_is_refused(make) -> None:  # type: ignore[no-untyped-de
 def test_a_parameter_is_held_for_a_window_and_handed_back() -> None:
     """After it, it is what it would have been."""
     world = World("pushing", backend="fake")
-    plan = {"floor_friction": Clamp(0.2, 2, 5), "block.size": At(3, [0.07] * 3)}
+    plan = {"floor_friction": Hard(0.2, during=(2, 5)), "block.size": Hard([0.07] * 3, at=3)}
     episode = world.rollout(steps=8, do=plan)
     assert episode["floor_friction"].tolist() == [0.5] * 2 + [0.2] * 3 + [0.5] * 4
     assert episode["tool_block.size"][:, 0].tolist() == [0.065] * 3 + [0.07] * 6
@@ -83,19 +96,34 @@ def test_a_state_is_held_for_a_window(backend: str) -> None:
     """At the beginning of every step it is where it should be; then it falls."""
     world = World("pushing", backend=backend)
     place = [0.0, -0.08, 0.2]
-    episode = world.rollout(steps=10, do={"tool_block.cartesian_position": Clamp(place, 2, 6)})
+    episode = world.rollout(
+        steps=10, do={"tool_block.cartesian_position": Hard(place, during=(2, 6))}
+    )
     found = episode["tool_block.cartesian_position"]
     np.testing.assert_array_equal(found[2:6], [place] * 4)
     assert found[6][2] < 0.2
     with pytest.raises(InterventionError, match="held at a value"):
-        world.rollout(steps=3, do={"tool_block.cartesian_position": Clamp(Shift(0.1))})
+        world.rollout(steps=3, do={"tool_block.cartesian_position": Shift(0.1, during=(0, None))})
 
 
 def test_an_action_is_replaced_for_a_window() -> None:
     """The policy acts before and after."""
     world = World("pushing", backend="fake")
-    episode = world.rollout([0.0] * 9, steps=6, do={"action": Clamp([0.2] * 9, 2, 4)})
+    episode = world.rollout([0.0] * 9, steps=6, do={"action": Hard([0.2] * 9, during=(2, 4))})
     assert episode["action"][1:, 0].tolist() == [0.0, 0.0, 0.2, 0.2, 0.0, 0.0]
+
+
+def test_an_intervention_is_repeated() -> None:
+    """Every few steps, each time from what the present is; in a counterfactual from there on."""
+    world = World("pushing", backend="fake")
+    episode = world.rollout(steps=9, do={"floor_friction": Draw("A", every=3, at=1)})
+    friction = episode["floor_friction"]
+    changes = np.flatnonzero(np.diff(friction))
+    assert changes.tolist() == [0, 3, 6]
+    other = episode.counterfactual({"floor_friction": Draw("B", every=2)}, at=5)
+    assert np.flatnonzero(np.diff(other["floor_friction"])).tolist() == [0, 3, 5, 7]
+    with pytest.raises(InterventionError, match="counts in the plan of an episode"):
+        world.model.do({"floor_friction": Hard(0.3, at=3)})
 
 
 @pytest.mark.parametrize("backend", ["mujoco", "bullet"])
@@ -103,8 +131,8 @@ def test_an_event_is_waited_for(backend: str) -> None:
     """At the first touch the block gets another place; it happens once, and the step is told."""
     world = World("pushing", backend=backend)
     place, fall = "tool_block.cartesian_position", [0.0, -0.08, 0.1]
-    touch = On(Contact("tool_block", "floor"), Shift(0.3))
-    plan = {place: At(0, fall), "tool_block.friction": touch}
+    touch = Shift(0.3, when=Contact("tool_block", "floor"))
+    plan = {place: Hard(fall, at=0), "tool_block.friction": touch}
     episode = world.rollout(steps=12, do=plan)
     step = episode.events["tool_block.friction"]
     assert 2 < step < 9
@@ -113,7 +141,8 @@ def test_an_event_is_waited_for(backend: str) -> None:
     assert episode[place][step][2] < 0.04
     assert episode.counterfactual({}, at=step) == episode
     low = world.rollout(
-        steps=12, do={place: fall, "restitution": On(Reaches(place, component=2, below=0.09), 0.2)}
+        steps=12,
+        do={place: fall, "restitution": Hard(0.2, when=Reaches(place, component=2, below=0.09))},
     )
     assert low.events["restitution"] == int(np.argmax(low[place][:, 2] < 0.09))
 
@@ -122,7 +151,7 @@ def test_plans_of_the_past_are_refused() -> None:
     """A counterfactual cannot do something before it begins."""
     episode = World("pushing", backend="fake").rollout(steps=6)
     with pytest.raises(InterventionError, match="is over"):
-        episode.counterfactual({"floor_friction": At(2, 0.1)}, at=4)
+        episode.counterfactual({"floor_friction": Hard(0.1, at=2)}, at=4)
     with pytest.raises(UnknownOption, match="at cannot be 6"):
         episode.counterfactual({}, at=6)
 
@@ -184,8 +213,8 @@ def test_worlds_are_given_more_and_more() -> None:
     """Each is another one; the last word counts; the first is as it was."""
     world = World("pushing", backend="fake")
     light = world.given({"tool_block.mass": 0.03})
-    late = light.given({"tool_block.mass": 0.04, "floor_friction": At(2, 0.1)})
-    assert late.plan == do({"tool_block.mass": 0.04, "floor_friction": At(2, 0.1)})
+    late = light.given({"tool_block.mass": 0.04, "floor_friction": Hard(0.1, at=2)})
+    assert late.plan == do({"tool_block.mass": 0.04, "floor_friction": Hard(0.1, at=2)})
     found = [w.rollout(seed=1, steps=4) for w in (world, light, late)]
     assert [float(e["tool_block.mass"][0]) for e in found] == pytest.approx([0.02, 0.03, 0.04])
     late.reset(seed=1)

@@ -12,18 +12,14 @@ import pytest
 from scm_world import (
     SCM,
     Action,
-    At,
     Box,
-    Clamp,
     Derived,
     Draw,
     Exogenous,
     Linear,
     Mechanism,
-    On,
     Outcome,
     Parent,
-    Reaches,
     Scale,
     Shift,
     World,
@@ -55,7 +51,7 @@ from scm_world.queries import (
     save_episode,
 )
 from scm_world.tasks import StepTask
-from scm_world.variables import Bernoulli, Categories, Measured, Normal, Table
+from scm_world.variables import Bernoulli, Categories, Hard, Measured, Normal, Reaches, Table
 
 RATE = Exogenous(name="rate", default=0.3, bounds=Box(0.0, 2.0), a=Box(0.2, 0.4))
 PUSH = Action(name="push", bounds=Box(-1.0, 1.0))
@@ -125,12 +121,12 @@ PLANS: tuple[dict[str, Any], ...] = (
     {},
     {"rate": 1.5},
     {"rate": Scale(2.0)},
-    {"rate": At(3, 1.5)},
-    {"rate": Clamp(1.5, 2, 5)},
-    {"rate": On(Reaches("prey", above=0.55), 0.0)},
-    {"rate": (At(2, 1.0), At(4, Shift(0.5)))},
+    {"rate": Hard(1.5, at=3)},
+    {"rate": Hard(1.5, during=(2, 5))},
+    {"rate": Hard(0.0, when=Reaches("prey", above=0.55))},
+    {"rate": (Hard(1.0, at=2), Shift(0.5, at=4))},
     {"push": 1.0},
-    {"push": At(2, Mechanism(np.negative, parents=("prey",)))},
+    {"push": Mechanism(np.negative, parents=("prey",), at=2)},
 )
 
 
@@ -432,8 +428,8 @@ def test_a_lagged_model_has_as_many_steps_as_is_usual() -> None:
             )
         ]
     )
-    found = model.effect("z", do={"z": At(24, 1.0)}, n=30)
-    assert found.mean == model.effect("z", do={"z": At(24, 1.0)}, n=30, steps=25).mean
+    found = model.effect("z", do={"z": Hard(1.0, at=24)}, n=30)
+    assert found.mean == model.effect("z", do={"z": Hard(1.0, at=24)}, n=30, steps=25).mean
     with pytest.raises(ModelError, match="say how many steps"):
         model.effect("z", do={"z": 1.0}, n=3, steps=None)
 
@@ -471,7 +467,7 @@ def noisy() -> SCM:
 def test_a_later_intervention_leaves_the_noise_as_it_is() -> None:
     """Before it everything is the same, after it all that does not follow."""
     episode = noisy().rollout(seed=3, steps=30)
-    branch = episode.counterfactual({"x": At(20, 9.0)}, at=12)
+    branch = episode.counterfactual({"x": Hard(9.0, at=20)}, at=12)
     assert branch["y"][:21].tobytes() == episode["y"][:21].tobytes()
     shifted = (branch["y"] - branch["x"][[0, *range(30)]]) - (
         episode["y"] - episode["x"][[0, *range(30)]]
@@ -529,7 +525,7 @@ def test_errors_of_a_model_are_those_of_its_unit() -> None:
     with pytest.raises(ValueError, match="too large"):
         model.sample(100, seed=0)
     with pytest.raises(ScmWorldError, match="component of y"):
-        noisy().rollout(steps=2, do={"x": On(Reaches("y", above=0.0, component=4), 1.0)})
+        noisy().rollout(steps=2, do={"x": Hard(1.0, when=Reaches("y", above=0.0, component=4))})
 
 
 def copied(model: SCM) -> Any:

@@ -15,13 +15,13 @@ from scm_world.backends.mujoco.batch import MujocoBatch
 from scm_world.discovery.data import Design
 from scm_world.discovery.data.collect import source_of
 from scm_world.errors import EngineFailure, OutOfBounds, UnknownVariable
-from scm_world.queries import At, Clamp, Contact, On, Outcome, Reaches, World, parallel
+from scm_world.queries import Outcome, World, parallel
 from scm_world.queries.episodes import Episode
 from scm_world.queries.parallel import is_known, run_together
 from scm_world.queries.rollouts import Trace, Unit
 from scm_world.queries.samples import Setting
 from scm_world.queries.twins import Twins, twins_of
-from scm_world.variables import Mechanism, Null
+from scm_world.variables import Contact, Hard, Mechanism, Null, Reaches
 
 BULLET = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="Bullet is not installed"
@@ -39,17 +39,17 @@ FALLS = Reaches("tool_block.linear_velocity", below=-0.01, component=2)
 PLANS: tuple[Mapping[str, Any], ...] = (
     {},
     {"tool_block.mass": 0.05},
-    {"floor_friction": At(5, 0.3)},
-    {"tool_block.cartesian_position": Clamp([0, 0, 0.1], 3, 7)},
-    {"gravity": Clamp([0, 0, -5.0], 3, 9)},
-    {"tool_block.mass": On(Contact("robot", "tool_block"), 0.03)},
-    {"tool_block.cartesian_position": [0, 0, 0.1], "tool_block.mass": On(FALLS, 0.03)},
-    {"tool_block": At(8, Null())},
+    {"floor_friction": Hard(0.3, at=5)},
+    {"tool_block.cartesian_position": Hard([0, 0, 0.1], during=(3, 7))},
+    {"gravity": Hard([0, 0, -5.0], during=(3, 9))},
+    {"tool_block.mass": Hard(0.03, when=Contact("robot", "tool_block"))},
+    {"tool_block.cartesian_position": [0, 0, 0.1], "tool_block.mass": Hard(0.03, when=FALLS)},
+    {"tool_block": Null(at=8)},
     {"actuator_noise": 0.1},
     {"control_index": 5},
     {"preset": 1},
     {"tool_block.size": [0.07, 0.07, 0.07]},
-    {"tool_block.mass": At(10, -1.0)},
+    {"tool_block.mass": Hard(-1.0, at=10)},
     {"tool_block.mass": -1.0},
     {"nothing": 3},
 )
@@ -146,8 +146,8 @@ def test_branches_together_are_those_alone(at: int) -> None:
     world = World("pushing")
     twins = twins_of(world)
     event = {
-        "floor_friction": On(Contact("robot", "tool_block"), 0.3),
-        "gravity": At(12, [0, 0, -5]),
+        "floor_friction": Hard(0.3, when=Contact("robot", "tool_block")),
+        "gravity": Hard([0, 0, -5], at=12),
     }
     (unit,) = units_of(world, [event], steps=24, policy="across")
     (ending,) = together(twins, [unit])
@@ -211,7 +211,7 @@ def test_one_refusal_among_many_is_the_one_that_is_told() -> None:
     world = World("pushing")
     episode = world.rollout("random", steps=30)
     dos: list[dict[str, Any]] = [{"tool_block.mass": 0.03}] * 22
-    dos[3], dos[7] = {"tool_block.mass": At(20, -1.0)}, {"nothing": 1}
+    dos[3], dos[7] = {"tool_block.mass": Hard(-1.0, at=20)}, {"nothing": 1}
     with pytest.raises(OutOfBounds, match=r"tool_block\.mass"):
         episode.worlds(dos)
     with pytest.raises(UnknownVariable, match="nothing"):
@@ -264,7 +264,7 @@ def test_processes_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World("pushing", backend="bullet")
     episode = world.rollout("random", steps=12)
     others = set(multiprocessing.active_children())
-    dos: list[dict[str, Any]] = [{"tool_block": At(8, Null())}, {"tool_block.mass": 0.04}, {}]
+    dos: list[dict[str, Any]] = [{"tool_block": Null(at=8)}, {"tool_block.mass": 0.04}, {}]
     for at in (0, 5):
         one, two = (episode.worlds(dos, at=at, record=["reward"], workers=w) for w in (1, 2))
         assert len(set(multiprocessing.active_children()) - others) == 2

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.sabotage import HONEST, SABOTAGES, Sabotage, caught, complaints, equations
+from benchmarks.sabotage import HONEST, SABOTAGES, Sabotage, caught, complaints
 from scm_world.queries import verify
-from scm_world.queries.experiments.noise import shared_noise
 
 BY_NAME = {one.name: one for one in SABOTAGES}
 QUICK = [
@@ -16,8 +15,6 @@ QUICK = [
     "a mechanism mixes in what it was last asked",
     "the motor echoes after three steps",
     "noise is keyed by another state",
-    "two tanks have one noise",
-    "two variables are drawn from one stream",
     "label and paint act together only",
 ]
 
@@ -51,7 +48,7 @@ def test_a_cut_edge_is_named_where_the_honest_system_shows_it() -> None:
 
 def test_two_colors_together_are_named_together() -> None:
     """Neither of them acts alone: the effect has both as its cause, and no smaller set."""
-    report = verify(BY_NAME["label and paint act together only"].make(), probes=8, held_out=0)
+    report = verify(BY_NAME["label and paint act together only"].make(), probes=8)
     causes = {edge.cause for edge in report.undeclared if edge.effect == "lower"}
     assert causes & {"paint & label", "label & paint", "paint", "label"}
     assert all(" & " in cause or cause in ("paint", "label") for cause in causes)
@@ -59,14 +56,8 @@ def test_two_colors_together_are_named_together() -> None:
 
 def test_memory_has_a_lag() -> None:
     """What is put back after one step acts three steps later."""
-    report = verify(BY_NAME["the motor echoes after three steps"].make(), probes=2, held_out=0)
+    report = verify(BY_NAME["the motor echoes after three steps"].make(), probes=2, held_out=2)
     assert {edge.lag for edge in report.undeclared if edge.cause == "push.control"} == {4}
-
-
-def test_own_noise_is_not_shared() -> None:
-    """Two variables with noise of their own have no noise in common."""
-    model = equations()
-    assert shared_noise(model, model.solve(), {}) == set()
 
 
 def test_every_system_is_known_and_every_class_has_sabotages() -> None:

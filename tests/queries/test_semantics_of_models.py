@@ -11,7 +11,7 @@ from scipy import stats
 from scm_world import SCM, World
 from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import NoiseKey, d_separated, from_json, to_json
-from scm_world.queries import At, Clamp, verify
+from scm_world.queries import verify
 from scm_world.variables import (
     Bernoulli,
     Box,
@@ -26,6 +26,7 @@ from scm_world.variables import (
     Exponential,
     Gamma,
     Gumbel,
+    Hard,
     Laplace,
     Linear,
     Measured,
@@ -253,12 +254,14 @@ def test_direct_effects_leave_the_mediators_out() -> None:
 
 
 def test_effects_of_models_in_time_take_windows() -> None:
-    """At and Clamp in both arms; the label names them; natural effects are refused."""
+    """Times in both arms; the label names them; natural effects are refused."""
     level = Derived(
         name="s", parents=(Parent("s", 1), Parent("k")), mechanism=Linear(weights=(0.5, 1.0))
     )
     model = SCM([Exogenous(name="k", distribution=Normal()), level])
-    found = model.effect("s", do={"k": At(3, 1.0)}, versus={"k": Clamp(0.0, 0, 2)}, n=20, steps=6)
+    found = model.effect(
+        "s", do={"k": Hard(1.0, at=3)}, versus={"k": Hard(0.0, during=(0, 2))}, n=20, steps=6
+    )
     assert "do(k = 1. at 3) versus do(k = 0. from 0 to 2)" in str(found)
     with pytest.raises(UnknownOption, match="controlled effect"):
         model.direct_effect("s", do={"k": 1.0}, mediators=["k"], steps=4)
@@ -376,10 +379,15 @@ def test_an_intervention_after_the_end_is_refused() -> None:
             )
         ]
     )  # fmt: skip
-    for late in (At(5, 1.0), Clamp(1.0, 7)):
+    for late in (Hard(1.0, at=5), Hard(1.0, during=(7, None))):
         with pytest.raises(UnknownOption, match="before 5, where episodes end"):
             model.effect("s", do={"s": late}, n=4, steps=5)
-    assert model.effect("s", do={"s": At(4, 1.0)}, versus={"s": At(4, 0.0)}, n=4, steps=5).mean == 1
+    assert (
+        model.effect(
+            "s", do={"s": Hard(1.0, at=4)}, versus={"s": Hard(0.0, at=4)}, n=4, steps=5
+        ).mean
+        == 1
+    )
 
 
 def test_whole_numbers_stay_whole() -> None:

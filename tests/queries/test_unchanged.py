@@ -12,9 +12,8 @@ import pytest
 
 from scm_world.discovery import Design, collect, discover
 from scm_world.errors import EngineFailure, InterventionError, NotReset
-from scm_world.queries import At, Clamp, On, Reaches, World, consequences, verify
-from scm_world.queries.local import local_graph
-from scm_world.variables import Action, Box, Exogenous, Measured, Normal
+from scm_world.queries import World, consequences, verify
+from scm_world.variables import Action, Box, Exogenous, Hard, Measured, Normal, Reaches
 
 HAS_BULLET = importlib.util.find_spec("pybullet") is not None
 
@@ -71,8 +70,8 @@ def in_the_middle(make: Callable[[], World], name: str, value: float) -> World:
     """Go into an episode in which windows are open and pending, and something is waited for."""
     state = "level" if "level" in make().model else "joint_positions"
     world = make().given({
-        name: Clamp(value, 3, 6),
-        "control_index": On(Reaches(state, below=-1e9), 0),
+        name: Hard(value, during=(3, 6)),
+        "control_index": Hard(0, when=Reaches(state, below=-1e9)),
     })  # fmt: skip
     world.reset(seed=5)
     world.step(0.1 * world.action_high)
@@ -98,11 +97,11 @@ def test_a_question_changes_nothing(system: str, question: str) -> None:
     assert moment(asked) == moment(other)
 
 
-@pytest.mark.parametrize("ask", [verify, discover])
-def test_a_world_without_an_episode_has_none_afterwards(ask: Any) -> None:
+@pytest.mark.parametrize("question", ["verify", "discover"])
+def test_a_world_without_an_episode_has_none_afterwards(question: str) -> None:
     """It has no values, and its first episode is the one that it would have had."""
     asked, other = World("pushing", backend="fake"), World("pushing", backend="fake")
-    ask(asked, probes=1)
+    QUESTIONS[question](asked, "tool_block.mass", 0.1)
     with pytest.raises(NotReset):
         asked.values()
     for world in (asked, other):
@@ -171,8 +170,8 @@ def test_an_environment_goes_on_after_its_world_was_verified() -> None:
 
 def test_a_local_graph_is_read_without_a_trace() -> None:
     """The control step that is simulated for it is undone."""
-    world = World("pushing").given({"floor_friction": At(2, 0.2)})
+    world = World("pushing").given({"floor_friction": Hard(0.2, at=2)})
     world.reset(seed=5)
     before = moment(world)
-    local_graph(world, world["joint_positions"])
+    world.local_graph(world["joint_positions"])
     assert moment(world) == before

@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
 from typer.testing import CliRunner
 
-from scm_world.backends import make_backend
-from scm_world.backends.base import BackendWrapper
 from scm_world.cli import app
 from scm_world.cli.arguments import load_task
 from scm_world.cli.discovery import SMALL
 from scm_world.discovery.plots import draw_verification
 from scm_world.errors import UnknownOption, UnreadableFile
-from scm_world.models import Difference
-from scm_world.queries.agreement import Agreement, Sign
+from scm_world.queries.comparison import Comparison
 from scm_world.queries.verification import Verification
-from scm_world.queries.verify import verify, verify_engines
+from scm_world.queries.verify import verify
 from scm_world.queries.world import World
 from scm_world.tasks import TASKS
 from scm_world.tasks.trifinger.entities.block_world import BlockWorld
@@ -39,32 +35,28 @@ needs_both = pytest.mark.skipif(not HAS_BULLET, reason="Bullet is not installed"
 @pytest.fixture(scope="module", params=ENGINES)
 def pushing(request: pytest.FixtureRequest) -> Verification:
     """Verify pushing with few probe states."""
-    return verify("pushing", backend=request.param, probes=4)
+    return verify("pushing", backend=request.param, probes=4, held_out=2)
 
 
 def test_pushing_has_no_undeclared_effect(pushing: Verification) -> None:
     """Four probe states see nine tenths of the edges, nothing else, and leave no trace."""
     assert pushing.undeclared == ()
-    assert pushing.colors == ()
     assert pushing.floor == 0.0
-    assert pushing.untried == ()
     assert pushing.share > 0.9
     assert pushing.outcome == ("not refuted" if pushing.never_fired else "confirmed")
 
 
 def test_coverage_ends_with_what_was_seen(pushing: Verification) -> None:
     """The curve has one number per probe state, never falls, and ends with all that fired."""
-    assert (pushing.probes, pushing.held_out) == (4, 8)
-    assert len(pushing.coverage) == 12
+    assert (pushing.probes, pushing.held_out) == (4, 2)
+    assert len(pushing.coverage) == 6
     assert list(pushing.coverage) == sorted(pushing.coverage)
     assert pushing.coverage[-1] == len(pushing.fired)
     assert len(pushing.fired) + len(pushing.never_fired) == len(pushing.declared)
 
 
-def test_the_graph_shows_without_scenarios(pushing: Verification) -> None:
-    """Random states of the model see more than half of the edges; kinds are counted apart."""
-    assert pushing.seen_held_out is not None
-    assert pushing.seen_held_out > 0.5 * len(pushing.declared)
+def test_kinds_of_edges_are_counted_apart(pushing: Verification) -> None:
+    """The engine decides most effects; readouts and definitions have their own counts."""
     engine, readout, definition = (
         pushing.provenance[by] for by in ("engine", "readout", "definition")
     )
@@ -85,16 +77,20 @@ def test_a_report_survives_json(pushing: Verification) -> None:
 def test_a_report_prints_its_numbers(pushing: Verification) -> None:
     """The table names the engine, the floor, and what was seen."""
     text = str(pushing)
-    for words in ("floor (do and undo)", f"of {len(pushing.declared)}", f"on {pushing.backend}"):
+    for words in (
+        "noise floor (run twice)",
+        f"of {len(pushing.declared)}",
+        f"on {pushing.backend}",
+    ):
         assert words in text
 
 
 @pytest.mark.slow
 def test_pushing_on_one_engine_is_verified() -> None:
-    """Every declared edge is seen before the probe states run out, and then it ends."""
+    """Every declared edge is seen before the probe states run out, and then the search ends."""
     found = verify("pushing")
     assert found.outcome == "confirmed", str(found)
-    assert 16 <= found.probes < 40
+    assert found.probes < 40
 
 
 def tampered(monkeypatch: pytest.MonkeyPatch, name: str, change: Callable[..., Any]) -> Simulation:
@@ -127,7 +123,7 @@ def test_a_missing_edge_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_superfluous_edge_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An edge that physics does not have never fires; one from a color is wrong anyway."""
+    """An edge that physics does not have never fires."""
     name = "tool_block.linear_velocity"
     extra = Parent("tool_block.color", 1)
     found = verify(
@@ -135,9 +131,8 @@ def test_a_superfluous_edge_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     edge = ("tool_block.color", name, 1)
     assert edge in found.never_fired
-    assert found.colors == (edge,)
-    assert found.outcome == "refuted"
-    assert "tool_block.color -> tool_block.linear_velocity (lag 1)" in str(found)
+    assert found.outcome == "not refuted"
+    assert "tool_block.color -> tool_block.linear_velocity: no difference" in str(found)
 
 
 # --- what was never seen -------------------------------------------------------------------------
@@ -200,7 +195,6 @@ def test_a_cause_that_could_not_be_changed_is_told_from_one_without_effect() -> 
     assert (edge.key, edge.states) == (("kind", "x", 1), 0)
     assert "no probe state had another value of kind" in edge.reason
     assert found.unresponsive == ()
-    assert found.untried == ("kind",)
 
 
 BALLS = """
@@ -262,64 +256,31 @@ def test_a_servo_whose_every_command_saturates_is_named_as_such() -> None:
     assert reasons["two.kp"].startswith("no command of two.control acted: each was cut to a limit")
 
 
-FLOOR, GRAVITY = ("floor", "friction"), ("world", "gravity")
-
-
-class _Wearing(BackendWrapper):
-    """Loses friction of the floor with every step."""
-
-    name: ClassVar[str] = "wearing"
-
-    def step(self, command: Any, substeps: int) -> None:
-        super().step(command, substeps)
-        self.apply(Difference(parameters={FLOOR: 0.99 * self.parameters([FLOOR])[FLOOR]}))
-
-
-class _Spilling(BackendWrapper):
-    """Changes the friction of the floor together with gravity."""
-
-    name: ClassVar[str] = "spilling"
-
-    def apply(self, difference: Difference) -> None:
-        given = dict(difference.parameters)
-        if GRAVITY in given:
-            size = float(np.linalg.norm(given[GRAVITY]))
-            given[FLOOR] = np.asarray(0.5 + 0.001 * (size - 9.81))
-        super().apply(replace(difference, parameters=given))
-
-
-def test_a_parameter_that_wears_is_no_parameter() -> None:
-    """What the engine has after a step is read: it changes though nobody has changed it."""
-    world = Simulation("pushing", backend=_Wearing(make_backend("fake")))
-    found = verify(world, probes=1, held_out=0)
-    assert found.floor > 1e-3
-    assert found.outcome == "refuted"
-
-
-def test_a_write_that_changes_two_parameters_is_caught() -> None:
-    """The engine has another value of what the world says is the same."""
-    world = Simulation("pushing", backend=_Spilling(make_backend("fake")))
-    found = verify(world, probes=1, held_out=0)
-    assert ("gravity", "floor_friction", 0) in {edge.key for edge in found.undeclared}
-
-
 def test_results_depend_on_the_seed_alone() -> None:
     """Two runs with one seed agree in everything but the time."""
-    one, two = (verify("reaching", probes=2, held_out=1, seed=5) for _ in range(2))
+    one, two = (verify("reaching", probes=1, held_out=1, seed=5) for _ in range(2))
     same = {"seconds": 0.0}
     assert one.model_copy(update=same) == two.model_copy(update=same)
 
 
-def test_it_ends_early_but_not_too_early() -> None:
-    """With everything seen it ends at the least number of probe states."""
+PENDULUM = """
+<mujoco><worldbody><body>
+  <joint name="hinge" axis="0 1 0" damping=".1"/>
+  <geom name="rod" type="capsule" size=".02" fromto="0 0 0 0 0 -.5" mass="1"/>
+</body></worldbody></mujoco>
+"""
+
+
+def test_it_ends_when_all_is_seen() -> None:
+    """With every edge seen the search ends, and held-out states follow."""
     told: list[tuple[int, int]] = []
-    found = verify(
-        "reaching", probes=60, least=14, held_out=0, progress=lambda *at: told.append(at)
-    )
+    world = World.from_mjcf(PENDULUM)
+    found = verify(world, probes=60, held_out=2, progress=lambda *at: told.append(at))
     assert found.never_fired == ()
-    assert (found.probes, found.planned, found.interrupted) == (14, 60, False)
-    assert told[0] == (1, 60)
-    assert told[-1] == (14, 14)
+    assert (found.planned, found.held_out, found.interrupted) == (60, 2, False)
+    assert found.probes < 60
+    assert told[0] == (1, 62)
+    assert told[-1] == (found.probes + 2, found.probes + 2)
 
 
 def test_interruption_keeps_what_was_found() -> None:
@@ -331,14 +292,9 @@ def test_interruption_keeps_what_was_found() -> None:
 
     found = verify("reaching", backend="fake", probes=5, progress=stop)
     assert (found.probes, found.interrupted, found.outcome) == (2, True, "not refuted")
-    both = verify_engines(
-        "reaching", backends=("fake", "fake"), probes=5, progress=lambda name: stop
-    )
-    assert (len(both.verifications), both.interrupted, both.outcome) == (1, True, "not refuted")
-    assert both.only == {}
 
 
-@pytest.mark.parametrize("wrong", [{"probes": 0}, {"least": 0}, {"probes": 1.5}])
+@pytest.mark.parametrize("wrong", [{"probes": 0}, {"probes": 1.5}])
 def test_numbers_must_be_positive(wrong: dict[str, Any]) -> None:
     """A number of probe states below one is refused."""
     with pytest.raises(UnknownOption, match="number of probes"):
@@ -351,111 +307,42 @@ def test_a_world_takes_no_options() -> None:
         verify(Simulation("reaching", backend="fake"), backend="mujoco", probes=1)
 
 
-# --- two engines ---------------------------------------------------------------------------------
+# --- two backends ---------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def agreement() -> Agreement:
-    """Verify pushing on both engines with few probe states."""
-    if not HAS_BULLET:
-        pytest.skip("Bullet is not installed")
-    return verify_engines("pushing", probes=2, held_out=0)
+@needs_both
+def test_backends_agree_on_the_sign_of_clear_effects() -> None:
+    """What lies well above the difference of the backends has one sign on both."""
+    world = World("pushing")
+    world.reset(seed=5)
+    before = world.vector.tobytes()
+    found = world.compare("bullet", probes=6)
+    assert world.vector.tobytes() == before
+    assert found.outcome == "confirmed"
+    assert len(found.effects) > 3
+    assert all(0 < one.low <= one.ratio <= one.high < 3 for one in found.effects)
+    assert Comparison.from_json(found.to_json()) == found
+    assert "Comparison of mujoco and bullet on pushing: confirmed" in str(found)
 
 
-def test_engines_agree_on_the_sign_of_clear_effects(agreement: Agreement) -> None:
-    """What lies well above the floor between the engines has one sign on both."""
-    found = agreement.at(10.0)
-    assert found.edges > 10
-    assert agreement.share >= 0.95
-    assert agreement.at(0.0).edges > found.edges
+def test_a_backend_agrees_with_itself() -> None:
+    """The same backend twice: every effect is clear, with the same sign and size."""
+    found = World("reaching").compare("mujoco", probes=1)
+    assert found.share == 1.0
+    assert {one.ratio for one in found.effects} == {1.0}
+    assert len(found.effects) > 10
 
 
-def test_the_table_of_edges_counts_every_comparison(agreement: Agreement) -> None:
-    """Per edge: compared, of which clear, of which equal; gravity pulls down on both."""
-    edges = agreement.edges()
-    assert sum(edge.compared for edge in edges) == len(agreement.signs)
-    assert all(edge.equal <= edge.clear <= edge.compared for edge in edges)
-    falls = [
-        sign
-        for sign in agreement.signs
-        if sign.key == ("gravity", "tool_block.cartesian_position", 1) and sign.clear()
-    ]
-    assert all(sign.equal for sign in falls)
-
-
-def test_an_agreement_survives_json_and_prints(agreement: Agreement) -> None:
-    """Written and read back, it is the same; the text has both engines."""
-    assert Agreement.from_json(agreement.to_json()) == agreement
-    assert "Agreement of mujoco and bullet on pushing" in str(agreement)
-
-
-def test_an_engine_agrees_with_itself() -> None:
-    """The same engine twice: every edge on both, every sign the same, no floor between them."""
-    found = verify_engines("reaching", backends=("mujoco", "mujoco"), probes=2, held_out=0, seeds=2)
-    share = found.at(10.0)
-    assert all(edges == () for edges in found.only.values())
-    assert all(sign.apart == 0.0 for sign in found.signs)
-    assert share.edges_equal == share.edges > 0
-
-
-def test_clear_effects_lie_above_what_engines_differ_by() -> None:
-    """An effect of 3 with engines 0.2 apart is clear; with 0.4 it is not."""
-    about: dict[str, Any] = {"cause": "a", "effect": "b", "lag": 1, "probe": 0, "component": 0}
-    near = Sign(**about, moves=True, answers=(3.0, -4.0), apart=0.2)
-    far = Sign(**about, moves=True, answers=(3.0, 4.0), apart=0.4)
-    assert (near.clear(), near.equal) == (True, False)
-    assert (far.clear(), far.equal) == (False, True)
-
-
-def _agreement(equal: Sequence[Sequence[bool]], ratio: float = 1.0) -> Agreement:
-    """Make one of clear comparisons: for each seed, whether edges have one sign."""
-    signs = tuple(
-        Sign(
-            cause=f"cause{edge}",
-            effect="y",
-            lag=1,
-            probe=0,
-            seed=seed,
-            component=0,
-            moves=True,
-            answers=(1.0, ratio if same else -ratio),
-            apart=0.0,
-        )
-        for seed, each in enumerate(equal)
-        for edge, same in enumerate(each)
+def test_what_shows_nothing_confirms_nothing() -> None:
+    """Where no parameter acts there is no effect to compare."""
+    world = World.from_step(
+        lambda p, s, a, n: {"x": s["x"]},
+        parameters=[Exogenous(name="idle", default=1.0)],
+        states=[Measured(name="x", default=0.0, parents=("x",))],
+        control_dt=0.1,
     )
-    return Agreement(
-        task="x",
-        backends=("mujoco", "bullet"),
-        verifications=(),
-        interrupted=False,
-        probes=len(equal),
-        seeds=len(equal),
-        signs=signs,
-        seconds=0.0,
-    )
-
-
-def test_one_seed_says_nothing_about_others_and_few_edges_little() -> None:
-    """The lower bound is that of Clopper and Pearson where seeds do not differ, else lower."""
-    assert _agreement([[True] * 30]).surely == 0.0
-    assert _agreement([[False] * 5] * 3).surely == 0.0
-    alike = _agreement([[True] * 3] * 10)
-    assert alike.surely == pytest.approx(0.05 ** (1 / 30))
-    assert alike.share == 1.0
-    assert _agreement([[True] * 1] * 10).outcome == "not refuted"  # 0.74
-    assert _agreement([[True] * 30] * 10).outcome == "confirmed"
-    assert _agreement([[True] * 9 + [False]] * 10).outcome == "refuted"
-    spread = _agreement([[True] * 19 + [False]] * 10)
-    bunched = _agreement([[True] * 20] * 9 + [[True] * 10 + [False] * 10])
-    assert spread.surely > bunched.surely
-    assert spread.surely > 0.9
-
-
-def test_magnitudes_are_medians_of_one_engine_by_the_other() -> None:
-    """Effects of opposite sign are left out."""
-    (found, *_) = _agreement([[True, True], [True, False], [False, True]], 3.0).magnitudes()
-    assert (found.cause, found.compared, found.ratio) == ("cause0", 2, 3.0)
+    found = world.compare("step", probes=1)
+    assert (found.effects, found.outcome) == ((), "not refuted")
 
 
 # --- pictures and commands -----------------------------------------------------------------------
@@ -467,12 +354,6 @@ def test_verifications_are_drawn(tmp_path: Path, pushing: Verification) -> None:
     picture = imread(tmp_path / "verify.png")
     assert picture.shape[:2] == (900, 1600)
     assert np.ptp(picture) > 0.5
-
-
-def test_agreements_are_drawn(tmp_path: Path, agreement: Agreement) -> None:
-    """So are two."""
-    draw_verification(agreement, tmp_path / "verify.png")
-    assert imread(tmp_path / "verify.png").shape[:2] == (900, 1600)
 
 
 @pytest.fixture
@@ -496,27 +377,33 @@ def test_the_command_writes_a_report_and_a_picture() -> None:
 
 @pytest.mark.usefixtures("_elsewhere")
 def test_strictly_the_command_exits_0_where_the_graph_is_confirmed() -> None:
-    """With --strict a task whose edges are all seen exits 0, and 1 where some are not."""
-    reaching = ["verify", "reaching", "--strict"]
-    result = CliRunner().invoke(app, [*reaching, "--probes", "14", "--out", "here"])
+    """With --strict a system whose edges are all seen exits 0, and 1 where some are not."""
+    Path("pendulum.xml").write_text(PENDULUM)
+    seen = ["verify", "pendulum.xml", "--strict", "--probes", "6", "--out", "here"]
+    result = CliRunner().invoke(app, seen)
     assert result.exit_code == 0, result.output
     found = Verification.from_json(Path("here/report.json").read_text())
     assert found.outcome == "confirmed"
     few = ["--backend", "fake", "--probes", "1", "--held-out", "0"]
-    assert CliRunner().invoke(app, [*reaching, *few]).exit_code == 1
+    assert CliRunner().invoke(app, ["verify", "reaching", "--strict", *few]).exit_code == 1
 
 
 @needs_both
 @pytest.mark.usefixtures("_elsewhere")
 def test_the_command_compares_engines() -> None:
     """With --both the report is that of two engines."""
+    Path("pendulum.xml").write_text(PENDULUM)
     limits = ("--probes", "2", "--held-out", "1")
-    result = CliRunner().invoke(app, ("verify", "reaching", "--both", *limits))
-    report = Path("scm-world-results/verify-reaching-both-seed0/report.json")
-    found = Agreement.from_json(report.read_text())
-    assert found.backends == ("mujoco", "bullet")
-    assert result.exit_code == int(found.outcome == "refuted")
-    assert "Agreement of mujoco and bullet" in result.stdout
+    result = CliRunner().invoke(app, ("verify", "pendulum.xml", "--both", *limits))
+    folder = Path("scm-world-results/verify-pendulum-both-seed0")
+    found = Comparison.from_json((folder / "comparison/report.json").read_text())
+    each = [
+        Verification.from_json((folder / name / "report.json").read_text())
+        for name in ("mujoco", "bullet")
+    ]
+    assert found.backends == tuple(one.backend for one in each) == ("mujoco", "bullet")
+    assert result.exit_code == int("refuted" in {one.outcome for one in (found, *each)})
+    assert "Comparison of mujoco and bullet" in result.stdout
 
 
 @pytest.mark.usefixtures("_elsewhere")
@@ -528,12 +415,12 @@ def test_the_command_verifies_all_tasks_and_keeps_what_is_finished(
 
     run = Paired.run
 
-    def interrupted(self: Paired, number: int, probe: Any) -> None:
-        if self.targets and "goal_block.cartesian_position" in self.targets:
+    def interrupted(self: Paired, number: int, probe: Any, wanted: Any = None) -> Any:
+        if "goal_block.cartesian_position" in self.targets:
             seen.add(id(self))
         if len(seen) == 2:
             raise KeyboardInterrupt
-        run(self, number, probe)
+        return run(self, number, probe, wanted)
 
     seen: set[int] = set()
     monkeypatch.setattr(Paired, "run", interrupted)
@@ -549,11 +436,9 @@ def test_the_command_verifies_all_tasks_and_keeps_what_is_finished(
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_is_verified_on_both_engines(task: str) -> None:
-    """Two hundred probe states see 99 % of the edges, nothing undeclared, and equal signs."""
-    found = verify_engines(load_task(task, SMALL.get(task, ())))
-    for report in found.verifications:
+    """Two hundred probe states see 99 % of the edges, and nothing undeclared, on both backends."""
+    for backend in ENGINES:
+        report = verify(load_task(task, SMALL.get(task, ())), backend=backend)
         assert report.undeclared == ()
-        assert report.colors == ()
         assert report.floor == 0.0
         assert report.share >= 0.99, report.never_fired
-    assert found.share >= 0.95, found.opposite

@@ -166,7 +166,7 @@ def test_what_is_dragged_is_one_line() -> None:
         "live.do({'tool_block.mass': 0.05})"
     ]
     assert sum("sw.Draw('B')" in line for line in lines) == 2
-    assert "live.do({'stage_friction': sw.Clamp(sw.Shift(0.1), 3, 5)})" in lines
+    assert "live.do({'stage_friction': sw.Shift(0.1, during=(3, 5))})" in lines
     assert ask.code()["live"].episode() == ask.session._lanes[0].live.episode()
 
 

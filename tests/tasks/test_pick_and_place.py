@@ -19,7 +19,7 @@ from published import (
 )
 
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import Infeasible, InterventionError, OutOfSpace, UnknownOption
+from scm_world.errors import Infeasible, InterventionError, OutOfBounds, UnknownOption
 from scm_world.tasks import PickAndPlace
 from scm_world.tasks.trifinger import hardware
 from scm_world.variables import Draw
@@ -136,7 +136,7 @@ def test_the_spaces_follow_the_side() -> None:
     """A goal on the side of the block is in no space; on the other side it is."""
     world = crossing()
     near, far = ([0.1, angle, 0.0325] for angle in (-np.pi / 2, np.pi / 2))
-    with pytest.raises(OutOfSpace):
+    with pytest.raises(OutOfBounds):
         world.do({"goal_block.cylindrical_position": near}, space="A")
     world.do({"goal_block.cylindrical_position": far}, space="A")
     world.reset(do={"wall_side": 1})

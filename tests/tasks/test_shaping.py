@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import scm_world  # noqa: F401 # registers the environments
 from scm_world.errors import UnknownOption
-from scm_world.geometry import from_rotation_vector, rotation_matrix
+from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
 from scm_world.tasks import TASKS
 from scm_world.tasks.trifinger import kernels
 

@@ -10,7 +10,7 @@ import pytest
 from published import OBSERVATIONS, Instant, evaluate, instants, norm, speed_change, tips_from
 
 from scm_world.env import ScmWorldEnv
-from scm_world.geometry import angle_between
+from scm_world.geometry.rotations import angle_between
 from scm_world.tasks import Stacking2
 from scm_world.variables import Draw
 from scm_world.world import Simulation

@@ -10,7 +10,7 @@ import pytest
 from scm_world.env import ScmWorldEnv, ScmWorldVectorEnv
 from scm_world.errors import Infeasible, InterventionError, ModelError, UnknownOption
 from scm_world.evaluation import evaluate
-from scm_world.geometry import rotation_matrix
+from scm_world.geometry.rotations import rotation_matrix
 from scm_world.tasks import TASKS, term
 from scm_world.tasks.trifinger.single import Pushing
 from scm_world.variables import Box, Draw, Function, Measured

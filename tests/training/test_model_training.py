@@ -64,7 +64,7 @@ def test_a_task_has_one_recipe_however_it_is_named(monkeypatch: pytest.MonkeyPat
 def test_a_class_says_what_its_recipe_has(monkeypatch: pytest.MonkeyPatch) -> None:
     """For all algorithms or for one; what is wrong in it is said."""
     monkeypatch.setattr("scm_world.tasks._REGISTERED", {})
-    given = {"steps": 4_096, "env": {"stack": "cameras"}, "sac": {"worlds": 4}}
+    given = {"steps": 4_096, "env": {"context": "none"}, "sac": {"worlds": 4}}
     register(type("Own", (Balance,), {"name": "own", "training": given}))
     assert (recipe("own").steps, recipe("own").worlds) == (4_096, 64)
     assert recipe("own", "sac").worlds == 4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scm_world.geometry import rotation_matrix
+from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models.camera import Camera, camera_from
 from scm_world.tasks.trifinger.cameras import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW, POSES
 from scm_world.tasks.trifinger.hardware import TABLE_OFFSET

@@ -9,8 +9,8 @@ import pytest
 from robot_scenes import box_hull, link_frames, octahedron
 
 from scm_world._types import ArrayLike
-from scm_world.geometry import from_rotation_vector
 from scm_world.geometry.hulls import Hull
+from scm_world.geometry.rotations import from_rotation_vector
 from scm_world.models import Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.entities.block_world import overlaps

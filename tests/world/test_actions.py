@@ -14,7 +14,7 @@ from scm_world.errors import (
     MissingEngine,
     UnknownOption,
     UnknownVariable,
-    WrongType,
+    WrongValue,
 )
 from scm_world.tasks import Pushing
 from scm_world.tasks.trifinger.kinematics import forward
@@ -250,7 +250,7 @@ def test_what_is_no_intervention_is_refused_at_once(make: Any) -> None:
 def test_a_space_is_drawn_from_by_name_and_a_box_has_to_fit() -> None:
     """The errors say how to draw, and that the numbers are too many."""
     world = begin("fake", "pushing")
-    with pytest.raises(WrongType, match='Draw\\("A"\\)'):
+    with pytest.raises(WrongValue, match='Draw\\("A"\\)'):
         world.do({"tool_block.mass": "A"})
     with pytest.raises(InterventionError, match="does not fit its shape"):
         world.do({"tool_block.mass": Draw(Box((0.0, 0.0), (1.0, 1.0)))})

@@ -18,7 +18,7 @@ from scm_world.errors import (
     InterventionError,
     SeveralProblems,
     SnapshotMismatch,
-    WrongType,
+    WrongValue,
 )
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables import Exogenous, Hard, Measured, Mechanism
@@ -41,13 +41,13 @@ def test_the_log_keeps_what_was_asked_for() -> None:
 
 @pytest.mark.parametrize(("backend", "task"), PUSHING)
 def test_what_a_world_hands_out_can_be_written_into(backend: str, task: str) -> None:
-    """Audits, scenes and snapshots are copies: the world and its future stay as they are."""
+    """Audits and scenes are copies: the world and its future stay as they are."""
     world = begin(backend, task)
     audit = world.do({"block.size": [0.06, 0.06, 0.06]})
     snapshot, values = world.snapshot(), world.values()
     scene = world.scene()
     changed = [value for pair in audit.followed.values() for value in pair]
-    changed += [*scene.parameters.values(), *snapshot.static.values(), scene.state.vector]
+    changed += [*scene.parameters.values(), scene.state.vector]
     for entry in audit.targets.values():
         changed += [v for v in (entry.applied, entry.read_back) if v is not None]
     for value in changed:
@@ -107,36 +107,20 @@ def test_a_damaged_snapshot_leaves_the_world_as_it_was(backend: str, task: str) 
     """Whatever part of it is wrong, the world goes on bit for bit."""
     world = begin(backend, task)
     world.do({"tool_block.mass": 0.1})
-    good = world.snapshot()
+    good = pickle.loads(pickle.dumps(world.snapshot()))  # noqa: S301 # our own
     play(world, [REST] * 2)
     there, values = world.snapshot(), world.values()
     future = play(world, [REST] * 5)
     world.restore(there)
-    assert good.base is not None
-    nan, name, first = np.array(np.nan), "tool_block.mass", next(iter(good.previous))
-    few = {other: value for other, value in good.kept.items() if other != name}
-    unknown = {"no_such": Hard(1.0)}
-    masses = (np.zeros(2), nan, 0.1, np.array("x"), np.array(1j), np.array(0.2))
+    cut = replace(good.present, numbers=good.present.numbers[:-1])
+    unknown = replace(good.present, interventions={"no_such": Hard(1.0)})
     changes: list[dict[str, Any]] = [
-        *({"kept": {**good.kept, name: mass}} for mass in masses),
-        *({"kept": kept} for kept in (few, {**good.kept, "no_such": nan}, None)),
-        *({"previous": {**good.previous, other: nan}} for other in (first, "no_such")),
-        *({"previous": previous} for previous in ({}, None)),
-        *({"action": action} for action in (np.zeros(2), good.action * nan, None, "x")),
-        *({"index": index} for index in (-1, 1.5, "x")),
-        *({"seed": -1}, {"seed": "x"}, {"episode": -1}, {"episode": None}, {"world": ()}),
-        *({"plan": plan} for plan in (None, (None, frozenset({"no_such"})))),
-        *({"interventions": acts} for acts in (unknown, {name: 1.0}, None)),
-        *({"engine": engine} for engine in (b"no pickle", None)),
-        {"engine": replace(good.engine, payload=None)},
-        {"engine": replace(good.engine, engine="another engine")},
-        *({"base": replace(good.base, vector=v)} for v in (np.zeros(2), good.base.vector * nan)),
-        *({"base": replace(good.base, pending=p)} for p in ({"x": 1}, {name: (name, 1.0)})),
-        {"base": replace(good.base, index=7)},
-        {"base": replace(good.base, kept=few)},
-        {"base": replace(good.base, at_start="x")},
-        {"base": good},
-        {"base": "x"},
+        {"world": ()},
+        {"engine": b"no pickle"},
+        {"engine": good.engine[:-20]},
+        *({"present": present} for present in (cut, unknown, None)),
+        *({"base": base} for base in (cut, "x")),
+        {"engine": replace(there.engine, engine="another engine")},
     ]
     damaged = [replace(good, **change) for change in changes]
     for snapshot in damaged:
@@ -152,11 +136,11 @@ class _Failing(BackendWrapper):
     name: ClassVar[str] = "failing"
     fails: type[BaseException] | None = None
 
-    def read(self, into: Any) -> None:
+    def restore(self, snapshot: Any) -> None:
+        super().restore(snapshot)
         error, self.fails = self.fails, None
         if error is not None:
             raise error("no luck")
-        super().read(into)
 
 
 @pytest.mark.parametrize("fails", [ValueError, KeyboardInterrupt])
@@ -195,22 +179,10 @@ def test_a_world_that_was_left_between_two_instants_says_so() -> None:
     world.step(REST)
 
 
-def test_a_pickled_snapshot_has_a_checksum() -> None:
-    """A number that was changed in the file is noticed."""
-    world = begin("fake", "pushing")
-    written = pickle.dumps(world.snapshot())
-    number = world.snapshot().static["gravity"].tobytes()
-    assert number in written
-    with pytest.raises(SnapshotMismatch, match="checksum"):
-        pickle.loads(  # noqa: S301 # our own
-            written.replace(number, np.array([0.0, 0.0, -1.0]).tobytes())
-        )
-
-
 def test_masked_arrays_are_refused() -> None:
     """What lies under a mask is not applied."""
     world = begin("fake", "pushing")
-    with pytest.raises(WrongType):
+    with pytest.raises(WrongValue):
         world.do({"gravity": np.ma.masked_array([0.0, 0.0, -5.0], mask=[0, 0, 1])})
 
 
@@ -219,7 +191,7 @@ def test_mechanisms_give_numbers(given: Any) -> None:
     """What a mechanism of a user gives is checked like a value, and named."""
     world = begin("fake", "pushing")
     values = world.values()
-    with pytest.raises(WrongType, match="floor_color"):
+    with pytest.raises(WrongValue, match="floor_color"):
         world.do({"floor_color": Mechanism(lambda friction: given, ["floor_friction"])})
     assert same(world.values(), values)
 

@@ -466,6 +466,7 @@ PLACE = Measured(name="place", shape=(2,))
             "has a mechanism",
         ),
         ({"states": [Measured(name="place", parents=("wind",))]}, "'wind', a parent of 'place'"),
+        ({"noise": 3}, "noise=3 is not a dict"),
         ({"noise": {"place": 0.1}}, "'place' is no distribution: 0.1"),
         (
             {"noise": {"place": Box(0.0, Affine(parent="drift", scale=1.0))}},
@@ -486,6 +487,7 @@ def test_what_does_not_exist_is_refused() -> None:
     for options, message in (
         ({"states": [Exogenous(name="x")]}, "it can be: Measured"),
         ({"parameters": [PLACE]}, "it can be: Exogenous, Derived, Fixed"),
+        ({"control_dt": "x"}, "any finite number"),
         ({"start": {"velocity": 1.0}}, "no start is named 'velocity'"),
     ):
         with pytest.raises(UnknownOption, match=message):

@@ -23,7 +23,6 @@ from worlds import (
 from scm_world.errors import (
     Infeasible,
     OutOfBounds,
-    OutOfSpace,
 )
 from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.rotations import from_rotation_vector
@@ -238,13 +237,13 @@ def test_the_asked_space_is_checked() -> None:
         ("goal_block.cylindrical_position", [0.05, 0.0, 0.2], "A"),
         ("block.size", [0.06, 0.06, 0.08], "B"),
     ):
-        with pytest.raises(OutOfSpace) as caught:
+        with pytest.raises(OutOfBounds) as caught:
             world.do({name: value}, space=space)
         assert caught.value.space == space
         world.do({name: caught.value.nearest}, space=space)
     for name in ("joint_velocities", "action"):
         value = np.zeros(9)
-        with pytest.raises(OutOfSpace, match="none is declared"):
+        with pytest.raises(OutOfBounds, match="none is declared"):
             world.do({name: value}, space="A")
 
 

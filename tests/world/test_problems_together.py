@@ -15,14 +15,11 @@ from scm_world.errors import (
     Infeasible,
     InterventionError,
     ModelError,
-    NotFinite,
     NotIntervenable,
     OutOfBounds,
-    OutOfSpace,
     SeveralProblems,
     UnknownVariable,
-    WrongShape,
-    WrongType,
+    WrongValue,
 )
 from scm_world.graph import SCM
 from scm_world.variables import Derived, Draw, Exogenous, Linear, Mechanism, Null, Scale, Shift
@@ -49,10 +46,10 @@ Mistake = tuple[dict[str, Any], type[InterventionError], str]
 
 MISTAKES: dict[str, Mistake] = {
     "unknown": ({"tool_blok.mass": 1.0}, UnknownVariable, "tool_blok.mass"),
-    "type": ({"gravity": "down"}, WrongType, "gravity"),
-    "shape": ({"block.size": 0.1}, WrongShape, "block.size"),
-    "nan": ({"floor_friction": NAN}, NotFinite, "floor_friction"),
-    "nan of a scale": ({"stage_friction": Scale(NAN)}, NotFinite, "stage_friction"),
+    "type": ({"gravity": "down"}, WrongValue, "gravity"),
+    "shape": ({"block.size": 0.1}, WrongValue, "block.size"),
+    "nan": ({"floor_friction": NAN}, WrongValue, "floor_friction"),
+    "nan of a scale": ({"stage_friction": Scale(NAN)}, WrongValue, "stage_friction"),
     "bounds": ({"tool_block.mass": 50.0}, OutOfBounds, "tool_block.mass"),
     "bounds of a shift": ({"finger_friction": Shift(7.0)}, OutOfBounds, "finger_friction"),
     "bounds of a state": ({"joint_velocities": Shift(1e3)}, OutOfBounds, "joint_velocities"),
@@ -83,22 +80,22 @@ MISTAKES: dict[str, Mistake] = {
     ),
     "function of wrong shape": (
         {"robot_height": Mechanism(three, ["robot_finger_60_link_1.mass"])},
-        WrongShape,
+        WrongValue,
         "robot_height",
     ),
     "function of one number": (
         {"goal_block.color": Mechanism(first, ["stage_friction"])},
-        WrongShape,
+        WrongValue,
         "goal_block.color",
     ),
     "function of a text": (
         {"floor_color": Mechanism(text, ["stage_friction"])},
-        WrongType,
+        WrongValue,
         "floor_color",
     ),
     "state of wrong shape": (
         {"tool_block.angular_velocity": Mechanism(first, ["robot_finger_60_link_1.mass"])},
-        WrongShape,
+        WrongValue,
         "tool_block.angular_velocity",
     ),
     "cycle": (
@@ -109,7 +106,7 @@ MISTAKES: dict[str, Mistake] = {
         ClosesCycle,
         "robot_finger_60_link_2.mass",
     ),
-    "space": ({"restitution": 0.79}, OutOfSpace, "restitution"),
+    "space": ({"restitution": 0.79}, OutOfBounds, "restitution"),
 }
 
 
@@ -183,8 +180,8 @@ MODEL = SCM(
 )
 IN_MODEL: dict[str, Mistake] = {
     "unknown": ({"a.z": 1.0}, UnknownVariable, "a.z"),
-    "type": ({"a.x": "one"}, WrongType, "a.x"),
-    "nan": ({"a.y": NAN}, NotFinite, "a.y"),
+    "type": ({"a.x": "one"}, WrongValue, "a.x"),
+    "nan": ({"a.y": NAN}, WrongValue, "a.y"),
     "twice": ({"b": {"x": 1.0}, "b.x": 2.0}, ConflictingTargets, "b.x"),
     "removed variable": ({"b.y": Null()}, InterventionError, "b.y"),
     "cycle": (

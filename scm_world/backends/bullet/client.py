@@ -15,15 +15,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import ContactPoint
-from scm_world.backends.bullet.build import (
-    BALL,
-    FREE,
-    EngineBody,
-    custom,
-    renewed,
-    solid,
-    takes_armature,
-)
+from scm_world.backends.bullet.build import BALL, FREE, EngineBody, custom, renewed
 from scm_world.backends.bullet.engine import Connection
 from scm_world.backends.bullet.honoured import realized, rebuilt
 from scm_world.backends.bullet.joints import Free, JointSet, parts
@@ -67,43 +59,16 @@ class Instant:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Step:
-    """A control step, and through ``before`` all those since the last canonical world.
+class Past:
+    """A canonical world, and the control steps since.
 
     Attributes:
-        before: The world that it started from.
-        parameters: All that were in force.
-        command: That was held.
-        substeps: For how many physics steps.
-        total: How many there were since the canonical world.
+        start: The canonical world.
+        steps: For each, all parameters in force, the command, and for how many physics steps.
     """
 
-    before: Step | Instant
-    parameters: Parameters
-    command: list[float]
-    substeps: int
-    total: int
-
-    def __reduce__(self) -> Any:
-        first, steps = since(self)
-        return _chain, (first, [(one.parameters, one.command, one.substeps) for one in steps])
-
-
-def since(world: Step | Instant) -> tuple[Instant, list[Step]]:
-    """Return the last canonical world, and the steps since."""
-    steps = []
-    while isinstance(world, Step):
-        steps.append(world)
-        world = world.before
-    return world, steps[::-1]
-
-
-def _chain(world: Any, rows: list[tuple[Parameters, list[float], int]]) -> Any:
-    total = 0
-    for parameters, command, substeps in rows:
-        total += substeps
-        world = Step(world, parameters, command, substeps, total)
-    return world
+    start: Instant
+    steps: tuple[tuple[Parameters, list[float], int], ...] = ()
 
 
 @final
@@ -130,14 +95,6 @@ def shares(mj: mujoco.MjModel, shapes: list[int], usual: float) -> Floats:
     coefficient and the other at least that, if the floor has no more than it. The number of a
     moving shape depends on its own coefficient and on that of the first fixed shape alone, so
     that shapes which never touch leave one another alone to the last bit.
-
-    Args:
-        mj: With the coefficients in force.
-        shapes: Their numbers.
-        usual: See ``usual_friction``.
-
-    Returns:
-        The number of each shape.
     """
     still = mj.body_treeid[mj.geom_bodyid[shapes]] < 0
     found: Floats = np.where(mj.geom_condim[shapes] == 1, 0.0, mj.geom_friction[shapes, 0])
@@ -188,9 +145,6 @@ class Client:
     concerns the engine is set in the engine when it differs from its last setting.
     After an error other than ``Infeasible`` a client is of no use.
 
-    Args:
-        engine: The module ``pybullet``.
-
     Attributes:
         engine: Its functions for this client.
         holds: The world that it is in, with the parameters in force.
@@ -202,7 +156,7 @@ class Client:
 
     def __init__(self, engine: Any) -> None:
         self.engine = engine = Connection(engine)
-        self.holds: Step | Instant | None = None
+        self.holds: Past | None = None
         self._model: Model | None = None
         self._parameters: Parameters = {}  # in force
         self._in_force: list[Floats] = []  # rows of settings that are in force
@@ -215,13 +169,13 @@ class Client:
 
     # --- bodies ----------------------------------------------------------------------------------
 
-    def replay(self, world: Step | Instant) -> None:
+    def replay(self, world: Past) -> None:
         """Bring about a world, independently of what was here before.
 
         Bodies stay where all their shapes stay; all else that depends on the past, the contact
         caches, is cleared by entering the collision objects again, always in one order.
         """
-        self.holds, (first, steps) = None, since(world)
+        self.holds, first = None, world.start
         self._free(self._saved)  # beyond a canonical world they are not exact
         self._construct(realized(first.structure), first.parameters)
         self.twin.reset()  # what the last step left there must not matter
@@ -230,9 +184,9 @@ class Client:
             part.put()
         for place in self.geoms.values():  # pairs decide what touches
             self.engine.setCollisionFilterGroupMask(*place, 0, 0)
-        for one in steps:
-            self.edit(one.parameters)
-            self.step(one.command, one.substeps)
+        for parameters, command, substeps in world.steps:
+            self.edit(parameters)
+            self.step(command, substeps)
         self.holds = world
 
     def _construct(self, model: Model, parameters: Parameters) -> None:
@@ -265,8 +219,6 @@ class Client:
         self._enabled = enabled
         self._parts = parts(self.engine, self.twin.data, self.joints, range(mj.ntree))
         self._scalar = [joint for joint in self.joints if mj.jnt_type[joint] not in (FREE, BALL)]
-        armed = [(r, body) for r, body in enumerate(self.bodies) if takes_armature(mj, body)]
-        self._moments = {row: solid(mj, body)[0].copy() for row, body in armed}
         self._in_force, self._trees, self._driven = [], set[int](), list[JointSet]()
         self._set_all()
 
@@ -289,11 +241,7 @@ class Client:
     # --- parameters ------------------------------------------------------------------------------
 
     def edit(self, parameters: Parameters) -> None:
-        """Change parameters that need no new bodies. What is in force already is left alone.
-
-        Raises:
-            Infeasible: Nothing can move with them. Nothing has changed.
-        """
+        """Change parameters that need no new bodies. What is in force already is left alone."""
         if parameters is self._parameters:
             return
         fresh = {k: v for k, v in parameters.items() if self._parameters.get(k) is not v}
@@ -344,8 +292,6 @@ class Client:
         yield engine.setPhysicsEngineParameter, {0: ()}, [0], names, rows
         bodies = list(self.bodies)
         rows = np.column_stack([mj.body_mass[bodies], mj.body_inertia[bodies]])
-        for row, moments in self._moments.items():
-            rows[row, 1:] = moments
         yield inertia, self.bodies, bodies, ("mass", "x", "y", "z"), rows
         scalar = self._scalar
         rigid = not disabled(mj, _OFF.mjDSBL_CONSTRAINT)
@@ -384,22 +330,6 @@ class Client:
             np.flatnonzero(mj.body_gravcomp),
         )
         return self._pulled.union(mj.body_treeid[np.concatenate(bodies)].tolist())
-
-    def remarks(self, before: Parameters) -> tuple[str, ...]:
-        """List which frictions were changed without an effect; see ``shares``."""
-        twin, found = self.twin, list[str]()
-        now = shares(twin.model, self._dynamic, self._usual)
-        for key, old in before.items():
-            if key[1] == "friction":
-                present = twin.kept[key]
-                twin.edit({key: old})
-                if np.array_equal(shares(twin.model, self._dynamic, self._usual), now):
-                    found.append(
-                        f"{'.'.join(key)} has no effect: the larger coefficient of two shapes "
-                        "counts, and those of the others are larger"
-                    )
-                twin.edit({key: present})
-        return tuple(found)
 
     def _needs_joints_alone(self) -> bool:
         """Return whether forces follow from coordinates of joints, and no damper is implicit."""

@@ -22,9 +22,6 @@ def load() -> tuple[Any, str]:
     """Import pybullet; return the module and its version.
 
     The import writes to the C library's streams, past ``sys.stdout``; nothing of it gets through.
-
-    Raises:
-        MissingEngine: It is not installed.
     """
     try:
         with nullcontext() if sys.modules.get("pybullet") else silence():
@@ -38,12 +35,7 @@ def load() -> tuple[Any, str]:
 class Connection:
     """The functions and constants of the engine, for a physics client of its own.
 
-    Args:
-        engine: The module ``pybullet``.
-
-    Attributes:
-        handle: The number of the client.
-        close: Disconnects it, once; so does the end of this object.
+    ``handle`` is the number of the client, ``close`` disconnects it; so does the end of this.
     """
 
     def __init__(self, engine: Any) -> None:

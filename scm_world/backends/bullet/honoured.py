@@ -13,16 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.backends.bullet.build import (
-    BALL,
-    FREE,
-    MOST_LINKS,
-    SHAPES,
-    coupled,
-    links,
-    takes_armature,
-    unit_of,
-)
+from scm_world.backends.bullet.build import BALL, FREE, MOST_LINKS, SHAPES, coupled, links, unit_of
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.trees import Couplings, works
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
@@ -57,12 +48,7 @@ def unsupported(model: Model) -> tuple[str, ...]:
     one, other = (mj.body_treeid[mj.jnt_bodyid[e[follows]]] for e in (mj.eq_obj1id, mj.eq_obj2id))
     follows[follows] = one == other
     tables: list[tuple[str, Any, str]] = [
-        (
-            "joint",
-            armature & ~_hinged(mj)[mj.jnt_bodyid],
-            "armature of the joint {!r}, which is not a hinge that alone carries a body on the "
-            "world",
-        ),
+        ("joint", armature, "armature of the joint {!r}"),
         ("joint", ball & (mj.jnt_limited != 0), "limits of the ball joint {!r}"),
         ("joint", (ball | free) & loss, "frictionloss of the joint {!r}, no hinge or slide"),
         ("tendon", tendons, "frictionloss, armature or limits of the tendon {!r}"),
@@ -104,28 +90,8 @@ def _multiplied(mj: mujoco.MjModel) -> NDArray[np.bool_]:
     return found
 
 
-def _hinged(mj: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Return which bodies take the armature of their joint, shape (nbody,)."""
-    return np.array([takes_armature(mj, body) for body in range(mj.nbody)], dtype=np.bool_)
-
-
 def accepted(structure: Any, given: Parameters, known: Parameters) -> Parameters:
-    """Check what is to be built, before anything is made.
-
-    Args:
-        structure: The bodies.
-        given: All parameters.
-        known: Those in force, if the structure stays.
-
-    Returns:
-        The parameters; those that do not change are the same arrays.
-
-    Raises:
-        ModelError: The engine cannot honour the structure; all of it that it cannot.
-        UnknownOption: There is no such parameter, or there is one that is not given.
-        NotIntervenable: A parameter that the engine lacks is not as in the model.
-        EngineFailure: A number is not finite, or a rotation has no direction.
-    """
+    """Check all parameters before anything is made; return them, as known where they stay."""
     if not isinstance(structure, Model):
         name = type(structure).__name__
         raise ModelError([f"Bullet cannot realise a {name}; it takes models"])
@@ -163,15 +129,8 @@ def _check(row: Parameter, honoured: bool, value: Floats) -> None:
 
 
 def settle(model: Model, given: State, last: State | None = None) -> Floats:
-    """Return the vector of a state with unit quaternions; what cannot be set is as it was last.
-
-    Raises:
-        ValueError: It is a state of another structure.
-        EngineFailure: A number is not finite.
-    """
+    """Return the vector of a state with unit quaternions; what cannot be set is as it was last."""
     layout, vector = model.layout, given.vector.copy()
-    if vector.size != layout.size:
-        raise ValueError(f"expected a state of {layout.size} numbers, got {given!r}")
     for name in layout.reported:
         there = last is not None and name in last.layout.slices
         vector[layout.slices[name]] = last[name] if last is not None and there else 0.0
@@ -199,7 +158,7 @@ FORCES = (
     "opt.viscosity",
 )  # fmt: skip
 """What acts by smooth forces alone: they come from MuJoCo."""
-LIVE = (*FORCES, "opt.gravity", "opt.timestep", "body_mass", "pair_solref")
+LIVE = (*FORCES, "opt.gravity", "opt.timestep", "body_mass", "body_inertia", "pair_solref")
 """What bodies that are there take on."""
 REBUILT = (
     "body_pos", "body_quat", "body_ipos", "jnt_pos", "jnt_axis", "qpos0", "geom_pos", "geom_quat",
@@ -239,21 +198,16 @@ def changes(model: Model) -> Mapping[ParameterKey, bool]:
     but what it honours, or if only pictures have it.
     """
     mj = copy.copy(reading.compiled(realized(model)))
-    hinged, scalar = _hinged(mj), ~np.isin(mj.jnt_type, (FREE, BALL))
+    scalar = ~np.isin(mj.jnt_type, (FREE, BALL))
     dynamic = Couplings(mj).dynamic.any(axis=1)
     live = {
         **dict.fromkeys(LIVE, True),
-        "body_inertia": ~hinged[:, None],
         "jnt_range": scalar[:, None],
         "dof_frictionloss": scalar[mj.dof_jntid],
         "geom_friction": np.stack([dynamic | True, ~dynamic, ~dynamic], axis=1),
         "pair_friction": np.arange(5) < 3,
     }
-    new = {
-        **dict.fromkeys(REBUILT, True),
-        "body_inertia": hinged[:, None],
-        "dof_armature": hinged[mj.dof_bodyid],
-    }
+    new = dict.fromkeys(REBUILT, True)
     before, taken, built = _saved(mj), _bytes(mj, live), _bytes(mj, new)
     slots = realized(model).slots(mj, mujoco.MjData(mj))
     needs = dict[ParameterKey, bool]()

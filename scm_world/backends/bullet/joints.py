@@ -26,8 +26,8 @@ class Scalars:
             engine.setJointMotorControlArray, multibody, links, engine.TORQUE_CONTROL
         )
         self._put, self._qpos, self._qvel = engine.resetJointState, data.qpos, data.qvel
-        places_of = mj.jnt_qposadr[joints], mj.jnt_dofadr[joints]
-        self._positions, self._velocities = map(_run, places_of)
+        self._positions = _run(mj.jnt_qposadr[joints])
+        self._velocities = _run(mj.jnt_dofadr[joints])
         self._references = mj.qpos0[self._positions]
         self._shifted = bool(self._references.any())
 
@@ -196,13 +196,9 @@ def _to_centers(
 ) -> None:
     """Compute the motion of the centers of free bodies, and of their principal axes.
 
-    Args:
-        positions: ``qpos``.
-        velocities: ``qvel``.
-        starts: Where each body begins in the two, shape (n, 2).
-        centers: Centers of mass in the frames of the bodies, shape (n, 3) [m].
-        axes: From principal axes to those frames, quaternions (w, x, y, z), shape (n, 4).
-        into: Position, quaternion (x, y, z, w), velocity and spin in the world, shape (n, 13).
+    Bodies begin at ``starts`` in ``qpos`` and ``qvel``, shape (n, 2). In their frames they have
+    centers of mass (n, 3) [m] and principal axes, quaternions (w, x, y, z). Written are position,
+    quaternion (x, y, z, w), velocity and spin in the world, shape (n, 13).
     """
     for i in range(len(into)):
         q, v = starts[i, 0], starts[i, 1]

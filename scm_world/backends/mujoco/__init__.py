@@ -11,31 +11,23 @@ import re
 from contextlib import suppress
 from importlib import metadata
 
-from scm_world.errors import MissingEngine, MixedInstallation
+from scm_world.errors import MissingEngine
 
-OLDEST = (3, 17)
 REQUIREMENT = "mujoco>=3.17,<5"
 REPAIR = f"pip uninstall -y mujoco mujoco-core mujoco-studio && pip install '{REQUIREMENT}'"
 DISTRIBUTIONS = ("mujoco", "mujoco-core", "mujoco-studio")
 
 
 def check_installation() -> None:
-    """Compare the versions of the installed distributions, without importing MuJoCo.
-
-    Raises:
-        MissingEngine: It is not installed, or older than 3.17.
-        MixedInstallation: Versions differ.
-    """
+    """Compare the versions of the installed distributions, without importing MuJoCo."""
     found = {}
     for name in DISTRIBUTIONS:
         with suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
     versions = {tuple(map(int, re.findall(r"\d+", text)[:3])) for text in found.values()}
     if len(versions) > 1:
-        raise MixedInstallation("mujoco", found, REPAIR)
-    if not versions or min(versions) < OLDEST:
-        old = f"{found.popitem()[1]} is too old" if found else ""
-        raise MissingEngine("mujoco", f"pip install '{REQUIREMENT}'", old)
+        mixed = ", ".join(f"{name} {version}" for name, version in found.items())
+        raise MissingEngine("mujoco", REPAIR, f"versions are mixed: {mixed}")
 
 
 check_installation()

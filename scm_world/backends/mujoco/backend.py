@@ -8,25 +8,12 @@ from typing import Any, ClassVar, final
 import mujoco
 
 from scm_world._types import Floats
-from scm_world.backends.base import (
-    Backend,
-    Capabilities,
-    ContactPoint,
-    EngineBatch,
-    EngineSnapshot,
-)
+from scm_world.backends.base import Backend, Capabilities, ContactPoint, EngineBatch, EngineSnapshot
 from scm_world.backends.mujoco.batch import MujocoBatch, Slot
-from scm_world.backends.mujoco.contacts import Touches
-from scm_world.backends.mujoco.reading import callbacks
+from scm_world.backends.mujoco.contacts import Touches, named
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.errors import EngineFailure
-from scm_world.models.scene import (
-    Difference,
-    ParameterKey,
-    Parameters,
-    Scene,
-    complete,
-)
+from scm_world.models.scene import Difference, ParameterKey, Parameters, Scene, complete
 
 
 @final
@@ -64,12 +51,7 @@ class MujocoBackend(Backend):
         self.realization, self.slot, self._touches = now, None, None
 
     def apply(self, difference: Difference) -> None:
-        """Change structure, parameters and state without advancing time.
-
-        Raises:
-            UnknownOption: There is no such parameter. Nothing has changed.
-            Infeasible: MuJoCo could not continue with these parameters. Nothing has changed.
-        """
+        """Change structure, parameters and state without advancing time."""
         self._return()
         now, structure = self.realization, difference.structure
         if now.replay is not None and (difference.parameters or structure is not None):
@@ -100,25 +82,16 @@ class MujocoBackend(Backend):
         return into
 
     def step(self, command: Floats, substeps: int) -> None:
-        """Hold a command for some physics steps.
-
-        Raises:
-            EngineFailure: Also where memory did not suffice, or a callback of the user is in use.
-        """
+        """Hold a command for some physics steps."""
         if self.slot is not None:
             self._return()
-        if found := callbacks():
-            raise EngineFailure("; ".join(found), self.name)
         self._touches = None
         if problem := self.realization.step(command, substeps):
             raise EngineFailure(problem, self.name)
 
     def contacts(self) -> tuple[ContactPoint, ...]:
-        """List the contact points of the last physics step.
-
-        Of a Runge-Kutta step MuJoCo keeps those of the last stage alone: ``Model.staged`` says so.
-        """
-        return self._last_touches().contacts()
+        """List the contact points of the last physics step; see ``Model.staged``."""
+        return named(self._last_touches())
 
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""
@@ -130,11 +103,7 @@ class MujocoBackend(Backend):
         return EngineSnapshot.of(self, (*scene, now.numbers(), now.memory(), touches, replay))
 
     def restore(self, snapshot: EngineSnapshot) -> None:
-        """Go back to a snapshot.
-
-        Raises:
-            SnapshotMismatch: It was taken by another engine, or another version of this one.
-        """
+        """Go back to a snapshot."""
         structure, parameters, revision, numbers, memory, touches, replay = snapshot.opened(self)
         now: Realization | None = vars(self).get("realization")
         if now is None or now.revision is not revision:

@@ -13,7 +13,6 @@ from mujoco.batch import Batch, SimulationError
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import EngineBatch
-from scm_world.backends.mujoco.reading import callbacks
 from scm_world.backends.mujoco.realization import FULL, STATE, Realization, lost
 from scm_world.errors import EngineFailure
 
@@ -32,13 +31,7 @@ _LEFT_BEHIND: list[Any] = []
 
 @final
 class Simulations:
-    """The simulations of all scenes of one structure.
-
-    Args:
-        scene: Any of them.
-        n: How many scenes there could be.
-        threads: That step them.
-    """
+    """The simulations of all scenes of one structure, of which there could be n."""
 
     def __init__(self, scene: Realization, n: int, threads: int) -> None:
         self.structure = scene.structure
@@ -98,11 +91,7 @@ class MujocoBatch(EngineBatch):
     """Scenes of MuJoCo, each with its own parameters, stepped by C threads.
 
     While a scene is stepped here, its state is in a slot. Any other call of its backend copies the
-    state back. Results are bit-identical to those of single scenes.
-
-    Args:
-        backends: Of the scenes.
-        threads: That step them; the results do not depend on how many.
+    state back. Results are bit-identical to those of single scenes, with any number of threads.
     """
 
     def __init__(self, backends: Sequence[MujocoBackend], threads: int = 1) -> None:
@@ -118,7 +107,7 @@ class MujocoBatch(EngineBatch):
 
         Raises:
             EngineFailure: A number is not finite afterwards, or memory did not suffice; all were
-                stepped. Or a callback of the user is in use; none was.
+                stepped.
         """
         if self._process != os.getpid():
             # Threads do not survive a fork, so all simulations are made again. The old ones cannot
@@ -126,8 +115,6 @@ class MujocoBatch(EngineBatch):
             _LEFT_BEHIND.append((self._groups, self._slots))
             self._groups, self._slots = {}, [None] * len(self._backends)
             self._process, self._last = os.getpid(), None
-        if found := callbacks():
-            raise EngineFailure("; ".join(found), "mujoco")
         everyone = len(which) == len(self._backends)
         slots = [backend.slot for backend in self._backends] if everyone else None
         if self._last is not None and slots == self._slots:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import final
-
 import mujoco
 import numpy as np
 
@@ -14,29 +11,19 @@ from scm_world.backends.base import ContactPoint
 _PYRAMID = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
 
 
-@final
-@dataclass(frozen=True)
-class Touches:
-    """Contact points as arrays, before they get names.
+Touches = tuple[tuple[str, ...], Integers, Floats]
+"""Contact points before they get names: the owners of all shapes, the geoms, then the flexes; two
+shapes of each point, (k, 2); position [m], normal from the first shape to the second, distance [m],
+negative where they intersect, and normal force [N] of each, (k, 8)."""
 
-    Attributes:
-        owners: Name of the body of each shape: the geoms, then the flexes.
-        shapes: Shape (k, 2).
-        numbers: Of each: position [m], normal from the first shape to the second, distance [m],
-            negative where they intersect, and normal force [N], shape (k, 8).
-    """
 
-    owners: tuple[str, ...]
-    shapes: Integers
-    numbers: Floats
-
-    def contacts(self) -> tuple[ContactPoint, ...]:
-        """Name the bodies."""
-        found = []
-        for (one, other), row in zip(self.shapes, self.numbers, strict=True):
-            names, (distance, force) = (self.owners[one], self.owners[other]), row[6:].tolist()
-            found.append(ContactPoint(names, row[:3].copy(), row[3:6].copy(), -distance, force))
-        return tuple(found)
+def named(found: Touches) -> tuple[ContactPoint, ...]:
+    """Name the bodies of contact points."""
+    owners, points = found[0], list[ContactPoint]()
+    for (one, other), row in zip(*found[1:], strict=True):
+        names, (distance, force) = (owners[one], owners[other]), row[6:].tolist()
+        points.append(ContactPoint(names, row[:3].copy(), row[3:6].copy(), -distance, force))
+    return tuple(points)
 
 
 def shapes_of(model: mujoco.MjModel, data: mujoco.MjData) -> Integers:
@@ -61,4 +48,4 @@ def touches(model: mujoco.MjModel, data: mujoco.MjData, owners: tuple[str, ...])
     if model.opt.cone == _PYRAMID:
         for i in np.flatnonzero(listed & (size > 1)).tolist():
             forces[i] = data.efc_force[address[i] : address[i] + 2 * (size[i] - 1)].sum()
-    return Touches(owners, shapes, numbers)
+    return owners, shapes, numbers

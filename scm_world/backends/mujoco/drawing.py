@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
+from scm_world.backends.mujoco.fields import SHOWN
 from scm_world.backends.mujoco.realization import Realization
+from scm_world.backends.mujoco.slots import GRAY
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Scene
 from scm_world.models.shapes import (
@@ -36,9 +38,6 @@ from scm_world.models.shapes import (
 
 MOST_SHAPES = 10_000  # of the abstract scene
 MOST_STAGES = 16  # models that are kept compiled
-SHOWN_GROUPS = 3  # Source: MuJoCo, mjv_defaultOption
-UNCOLORED = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
-"""The color of what has none of its own, so that its material decides. Source: MuJoCo, XML."""
 SHARP = 0.75  # the cosine between the normals of a corner and of its triangle that shows an edge
 FAR = 100.0  # times the height of the picture of an orthographic camera: it is drawn from there
 
@@ -63,12 +62,6 @@ class VisibleModel:
 
     Where a model says of a body how it looks besides how it collides, in groups of geoms that are
     both shown, only how it looks is.
-
-    Args:
-        structure: A model that MuJoCo can realise.
-
-    Attributes:
-        names: Of the bodies, by number.
     """
 
     def __init__(self, structure: Any) -> None:
@@ -76,7 +69,6 @@ class VisibleModel:
         self._given: tuple[Any, bytes] = ((), b"")  # the parameters that were written last
         self.model, self.data = now.model, now.data
         model = now.model
-        self.names: tuple[str, ...] = structure.body_names
         mocap = model.body_mocapid[model.body_rootid] >= 0
         self._moves: NDArray[np.bool_] = (model.body_weldid != 0) | mocap
         self._rows = rows = np.flatnonzero(np.isin(model.geom_type, list(_KINDS)) & _looks(model))
@@ -88,7 +80,7 @@ class VisibleModel:
         self._bodies = model.geom_bodyid[rows].astype(np.int64)
         self._meshes = _meshes(model, rows.tolist())
         self._textures = [_texture(model, i) for i in range(model.nmat)]
-        sites = (model.site_group < SHOWN_GROUPS).any()
+        sites = (model.site_group < SHOWN).any()
         self._more = bool(sites or model.ntendon or model.nflex or model.nskin)
 
     def place(self, scene: Scene) -> None:
@@ -109,7 +101,7 @@ class VisibleModel:
         colors, tiles = model.geom_rgba[rows], np.empty((len(rows), 5))
         tiles[:] = PLAIN
         if self._textures:
-            plain = (colors == UNCOLORED).all(axis=1) & (self._materials >= 0)
+            plain = (colors == GRAY).all(axis=1) & (self._materials >= 0)
             colors[plain] = model.mat_rgba[self._materials[plain]]
         colors = colors.astype(np.float64)
         for row, material in enumerate(self._materials.tolist() if self._textures else ()):
@@ -135,12 +127,7 @@ class VisibleModel:
         return tuple(name for name in names if name)
 
     def camera(self, name: str, size: tuple[int, int]) -> Camera:
-        """Return one of the model's own cameras, where it stands now.
-
-        Args:
-            name: One of ``cameras``.
-            size: Height and width of its picture [pixels].
-        """
+        """Return one of the model's own cameras, where it stands now."""
         model, data, i = self.model, self.data, self.model.camera(name).id
         mujoco.mj_comPos(model, data)
         mujoco.mj_camlight(model, data)
@@ -234,16 +221,9 @@ def _stage(structure: Any, thread: int) -> VisibleModel:
 
 
 def visible(scene: Scene) -> VisibleModel:
-    """Put a scene into MuJoCo; where its structure was seen before, that costs little.
+    """Put a scene into MuJoCo, until the next call in this thread.
 
-    Args:
-        scene: Of any backend.
-
-    Returns:
-        The scene, until the next call in this thread.
-
-    Raises:
-        ModelError: MuJoCo cannot realise the structure, so that there are no pictures of it.
+    Where its structure was seen before, that costs little.
     """
     shown = _stage(scene.structure, threading.get_ident())
     shown.place(scene)
@@ -252,7 +232,7 @@ def visible(scene: Scene) -> VisibleModel:
 
 def _looks(model: mujoco.MjModel) -> NDArray[np.bool_]:
     """Return which geoms are shown, shape (ngeom,)."""
-    shown: NDArray[np.bool_] = model.geom_group < SHOWN_GROUPS
+    shown: NDArray[np.bool_] = model.geom_group < SHOWN
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     for body in range(1, model.nbody):
         mine = shown & (model.geom_bodyid == body)

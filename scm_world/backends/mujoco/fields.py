@@ -247,8 +247,8 @@ class Element:
 
 _UNLIMITED = "is not in force: it has no limits"
 _SIMPLE = "is fixed by the compiler; write simple='false' at the body"
-_SHOWN = 3
-"""MuJoCo draws the first groups of shapes unless it is asked for others."""
+SHOWN = 3
+"""MuJoCo draws the first groups of shapes unless asked for others. Source: mjv_defaultOption."""
 
 _SIZES = {
     int(_GEOM.mjGEOM_SPHERE): (1, "Radius"),
@@ -375,7 +375,7 @@ def _shape(e: Element) -> Rows:
     else:
         yield e.row("size", "m", "", reason="belongs to a shape that only another file can change")
     yield e.row("color", "1", "Red, green, blue and opacity of the shape.",
-        partial(color, e.i, int(e["matid"])), low=0.0, high=1.0, usual=e["group"] < _SHOWN,
+        partial(color, e.i, int(e["matid"])), low=0.0, high=1.0, usual=e["group"] < SHOWN,
         visual=True, effect=NOTHING)
     yield from e.pose()
     whole = "is a whole number that only another file can change"
@@ -533,12 +533,7 @@ def table(mj: mujoco.MjModel, data: mujoco.MjData, trees: Couplings) -> list[Par
 
 
 def clean(name: str) -> str:
-    """Replace what may not stand in the name of an element.
-
-    Example:
-        >>> clean("arm/joint.1"), clean("left hand")
-        ('arm_joint_1', 'left_hand')
-    """
+    """Replace what may not stand in the name of an element."""
     return re.sub(r"[^\w-]", "_", name)
 
 

@@ -71,26 +71,11 @@ def overlaps(
     besides: Set[Shapes] = frozenset(),
     enough: float = np.inf,
 ) -> tuple[Overlap, ...]:
-    """List all pairs of bodies that lie deeper in one another than a tolerance.
+    """List all pairs of bodies that lie deeper in one another than a tolerance [m].
 
-    Args:
-        scene: With complete parameters.
-        tolerance: How deep is too deep [m].
-        besides: Pairs of shapes that may lie in one another.
-        enough: Where some lie deeper than this in one another, the deepest alone are listed [m].
-
-    Returns:
-        One entry for each pair of names, with its greatest depth. First come bodies that move
-        freely, last those that never move; in a pair, too.
-
-    Example:
-        >>> from scm_world.tasks.trifinger.system import trifinger
-        >>> scene = trifinger(("tool_block",)).default_scene()
-        >>> overlaps(scene, 1e-4)
-        ()
-        >>> scene.state.positions[0, 2] = 0.03
-        >>> print(*overlaps(scene, 1e-4))
-        'tool_block' lies 2.5 mm deep in 'floor'
+    There is one entry for each pair of names, with its greatest depth. First come bodies that move
+    freely, last those that never move; in a pair, too. Pairs of shapes ``besides`` these count.
+    Where some lie deeper than ``enough`` [m] in one another, the deepest alone are listed.
     """
     scratch = _Scratch(scene.structure, threading.get_ident())
     shapes, depths = scratch.contacts(scene)

@@ -147,11 +147,7 @@ def find_readouts(
     parameters: Sequence[Parameter],
     wanted: Sequence[str],
 ) -> Iterator[Readout]:
-    """Describe what was asked for: ``"tip.position"``, ``"body:tip.position"``, ``"imu.value"``.
-
-    Raises:
-        ModelError: All names that cannot be computed, with the reasons.
-    """
+    """Describe what was asked for: ``"tip.position"``, ``"body:tip.position"``, ``"imu.value"``."""
     finder = _Finder(mj, source, states, [row for row in parameters if not row.visual])
     problems = []
     for name in wanted:

@@ -15,22 +15,11 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.contacts import Touches, touches
-from scm_world.backends.mujoco.states import (
-    MOTION,
-    LastStep,
-    into_bodies,
-    read_rows,
-    turned_bodies,
-)
+from scm_world.backends.mujoco.states import MOTION, LastStep, into_bodies, read_rows, turned_bodies
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import Infeasible, ModelError, UnknownOption
 from scm_world.models.model import REPORTED, Model
-from scm_world.models.scene import (
-    REVERSED,
-    ParameterKey,
-    Parameters,
-    reversed_ranges,
-)
+from scm_world.models.scene import REVERSED, ParameterKey, Parameters, reversed_ranges
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Everything that decides the future of a simulation of MuJoCo."""
@@ -58,12 +47,7 @@ def lost(structure: Any, vector: Floats, time: float) -> str:
 class Realization:
     """A compiled model with parameters and a state of its own.
 
-    Args:
-        structure: The description of the model.
-        parameters: All that differ from it, and all that are compared later.
-
-    Raises:
-        ModelError: It is not a model.
+    The parameters that it is made with are all that differ from it, and all that are compared.
 
     Attributes:
         structure: What was compiled.
@@ -292,12 +276,7 @@ class Realization:
         return wrong or keys
 
     def edit(self, parameters: Parameters) -> None:
-        """Write parameters, then all numbers that follow from them; unchanged ones cost nothing.
-
-        Raises:
-            UnknownOption: There is no such parameter. Nothing has changed.
-            Infeasible: The model could not move with them. Nothing has changed.
-        """
+        """Write parameters, then all numbers that follow; refuse them, or change all of them."""
         self.check(parameters)
         kept, slots = self.kept, self._slots
         before: dict[ParameterKey, Floats | None] = {}

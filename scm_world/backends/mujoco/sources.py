@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import copy
 import hashlib
 import os
@@ -22,7 +21,7 @@ import numpy as np
 
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.output.reading import read_bytes, regular
+from scm_world.output.reading import read_bytes
 
 _UNNAMED = "MuJoCo Model"
 _CHOICES = ("integrator", "solver", "cone", "jacobian")
@@ -48,11 +47,7 @@ class Source:
         return hashlib.sha256(self.binary).hexdigest()
 
     def compile(self) -> mujoco.MjModel:
-        """Return the model, in arrays of its own.
-
-        Raises:
-            ModelError: Another version of MuJoCo compiled it.
-        """
+        """Return the model, in arrays of its own."""
         if self.version != mujoco.__version__:
             versions = f"{self.version}, and MuJoCo {mujoco.__version__}"
             what = f"the model was compiled by MuJoCo {versions} does not read it"
@@ -67,10 +62,8 @@ def realized(source: Source) -> tuple[mujoco.MjModel, tuple[str, ...]]:
     The causes of leaks, as measured: one solve for all constraints instead of one for each island,
     a warm start that is chosen for all, sleep, the reset of everything after a number that is not
     finite, Euler's implicit damping, which begins for all trees with the first damped joint, and
-    the dense inverse inertia of all constraints, which PGS and the noslip solver work with.
-
-    Returns:
-        The model, and what is different from the file.
+    the dense inverse inertia of all constraints, which PGS and the noslip solver work with. What is
+    different from the file is returned, too.
     """
     mj, notes, off = source.compile(), list[str](), mujoco.mjtDisableBit
     options = mj.opt
@@ -103,8 +96,7 @@ def read_source(
 ) -> tuple[Source, str, str, tuple[str, ...]]:
     """Read and compile a model; see ``reading.read_model``.
 
-    Returns:
-        The source, a name for the model, how to call it in errors, and what its compiler replaces.
+    The result is the source, a name, how to call it in errors, and what its compiler replaces.
     """
     notes, plugins = tuple[str, ...](), ""
     if isinstance(source, mujoco.MjModel):
@@ -113,7 +105,6 @@ def read_source(
         spec, where, stem, urdf = _specified(source)
         if urdf:
             _complete(spec, where, fixed_base=fixed_base)
-        _refuse_endless(spec)
         with understood(where):
             mj = spec.compile()
         notes = tuple(_replaced_inertia(spec, mj))
@@ -128,22 +119,6 @@ def read_source(
     name = mj.names.split(b"\0", 1)[0].decode()
     name = stem if name in ("", _UNNAMED) else name
     return Source(binary.tobytes(), mujoco.__version__), name, where, notes
-
-
-def _refuse_endless(spec: mujoco.MjSpec) -> None:
-    """Refuse files that MuJoCo would read without an end."""
-    named = [(spec.meshdir, part.file) for part in (*spec.meshes, *spec.hfields, *spec.skins)]
-    for texture in spec.textures:
-        named += [(spec.texturedir, name) for name in (texture.file, *texture.cubefiles)]
-    for folder, name in named:
-        inner = os.path.basename(name) if spec.strippath else name
-        path = Path(spec.modelfiledir, folder, inner)
-        if name and path.exists() and not path.is_dir():
-            try:
-                regular(path)
-            except OSError as error:
-                advice = "correct the path that the model names"
-                raise UnreadableFile(str(path), str(error), advice) from None
 
 
 def _set_option(options: mujoco.MjOption, name: str, value: Any) -> None:
@@ -189,32 +164,15 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
 
 
 def _contents(path: Path) -> str:
-    """Read a model file, and decode it by its byte order mark or declaration; else as UTF-8.
-
-    Bytes without a meaning become U+FFFD, because they count in names alone.
-
-    Source:
-        *Extensible Markup Language (XML) 1.0*, appendix F.
-    """
-    advice = "give the path of an MJCF (.xml, .mjcf) or URDF (.urdf) file, or XML text"
+    """Read a model file as UTF-8, as MuJoCo does; other bytes become U+FFFD, and count in names."""
+    advice = "give the path of an MJCF (.xml, .mjcf) or URDF (.urdf) file in UTF-8, or XML text"
     try:
-        data = read_bytes(path)
+        text = read_bytes(path).decode("utf-8-sig", "replace").rstrip("\0")
     except OSError as error:
         raise UnreadableFile(str(path), (error.strerror or str(error)).lower(), advice) from error
-    declared = re.match(rb"\s*<\?xml[^>]*?\bencoding\s*=\s*[\"']([\w.:-]+)", data)
-    encoding = declared[1].decode("ascii", "replace") if declared else "utf-8"
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        encoding = "utf-16"
-    elif encoding.lower().startswith("utf"):  # what declares UTF-16 in ASCII is not in UTF-16
-        encoding = "utf-8-sig"
-    try:
-        text = data.decode(encoding, "replace")
-    except LookupError:  # MuJoCo reads it as UTF-8, too
-        text = data.decode("utf-8-sig", "replace")
-    text = text.replace("\r\n", "\n").rstrip("\0")
     if "\0" in text:
         raise UnreadableFile(str(path), "it is no text", advice)
-    return text
+    return text.replace("\r\n", "\n")
 
 
 def _included(text: str, folder: Path) -> dict[str, bytes]:
@@ -231,11 +189,7 @@ def _included(text: str, folder: Path) -> dict[str, bytes]:
 
 @contextmanager
 def understood(where: str) -> Iterator[None]:
-    """Turn MuJoCo's complaints about a model into one error, and keep its warnings.
-
-    Raises:
-        ModelError: With what MuJoCo said.
-    """
+    """Turn MuJoCo's complaints about a model into one error, and drop its warnings."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -262,16 +216,14 @@ def _complete(spec: mujoco.MjSpec, where: str, *, fixed_base: bool) -> None:
         if path is not None:
             mesh.file = f"{number}/{path.name}"
             spec.assets = {**spec.assets, mesh.file: path.read_bytes()}
-    for repair in ({"balanceinertia": True}, {"boundmass": 1e-6, "boundinertia": 1e-9}):
-        try:
-            with understood(where):
-                spec.copy().compile()
-            break
-        except ModelError as error:
-            if "inertia" not in str(error):
-                raise
-        for name, value in repair.items():
-            setattr(spec.compiler, name, value)
+    spec.compiler.balanceinertia = True
+    try:
+        with understood(where):
+            spec.copy().compile()
+    except ModelError as error:
+        if "inertia" not in str(error):
+            raise
+        spec.compiler.boundmass, spec.compiler.boundinertia = 1e-6, 1e-9
     _add_motors(spec)
 
 
@@ -289,48 +241,39 @@ def _check_names(text: str, where: str) -> None:
         root = ElementTree.fromstring(text)  # noqa: S314 # expat bounds what entities become
     except ElementTree.ParseError:  # MuJoCo minds less, or says what is wrong
         return
-    problems = []
-    for kind in ("link", "joint"):
-        found = [one.get("name", "") for one in root.findall(kind) if one.get("type") != "fixed"]
-        for name, n in Counter(found).items():
-            if not name:
-                problems.append(f"{where} has a {kind} without a name; give it one")
-            elif n > 1:
-                problems.append(f"{where} has {n} {kind}s called {name!r}; give each its own name")
+    parts = [(part.tag, part.get("name")) for part in root if part.get("type") != "fixed"]
+    problems = [
+        f"{where} has {n} {kind}s called {name!r}; give each its own name"
+        for (kind, name), n in Counter(parts).items()
+        if kind in ("link", "joint") and (n > 1 or not name)
+    ]
     if problems:
         raise ModelError(problems)
 
 
 def _replaced_inertia(spec: mujoco.MjSpec, mj: mujoco.MjModel) -> Iterator[str]:
-    """List which masses and moments of inertia of a file its compiler replaces."""
-    compiler = spec.compiler
-    if not (compiler.balanceinertia or compiler.boundmass or compiler.boundinertia):
-        return
-    masses, moments = list[str](), list[str]()
-    for body in spec.bodies[1:]:
+    """List which masses [kg] and moments of inertia [kg m²] of a file its compiler replaces."""
+    compiler, found = spec.compiler, list[str]()
+    for body in spec.bodies[1:] if compiler.balanceinertia or compiler.boundmass else ():
         number = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_BODY, body.name)
-        if number < 1:
-            continue  # it is part of its parent
-        if body.mass < mj.body_mass[number] == compiler.boundmass:
-            masses.append(f"{body.name} ({body.mass:g}, now {compiler.boundmass:g} kg)")
-        if not body.explicitinertial:
-            continue
-        given, now = np.sort(body.inertia), np.sort(mj.body_inertia[number])
+        mass, now = body.mass, float(mj.body_mass[number])
+        if number < 1 or now not in (mass, compiler.boundmass):
+            continue  # it is part of its parent, or has the mass of its shapes or of its parts
+        given, moments = np.sort(body.inertia), np.sort(mj.body_inertia[number])
         if not np.isnan(body.fullinertia[0]):
             xx, yy, zz, xy, xz, yz = body.fullinertia
             given = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-        bounds = given.mean(), compiler.boundinertia
-        replaced = any(np.allclose(now, bound, 1e-9, 0.0) for bound in bounds)
-        if replaced and not np.allclose(now, given, 1e-9, 0.0):
-            triples = ("{:.3g} {:.3g} {:.3g}".format(*part) for part in (given, now))
-            moments.append(f"{body.name} ({', now '.join(triples)} kg m²)")
-    for found, why in (
-        (masses, "Nothing moves without a mass, so that the compiler gave one to"),
-        (moments, "No body has such moments of inertia, so that the compiler replaced those of"),
-    ):
-        more = f" and {len(found) - 4} more" if len(found) > 4 else ""
-        if found:
-            yield f"{why} {', '.join(found[:4])}{more}."
+        if now != mass or (body.explicitinertial and not np.allclose(moments, given, 1e-9, 0.0)):
+            old, new = (
+                "{:.3g}; {:.3g} {:.3g} {:.3g}".format(*n) for n in ((mass, *given), (now, *moments))
+            )
+            found.append(f"{body.name} ({old}, now {new})")
+    more = f" and {len(found) - 4} more" if len(found) > 4 else ""
+    if found:
+        yield (
+            "No body has such a mass or such moments of inertia, so that the compiler replaced "
+            f"those [kg; kg m²] of {', '.join(found[:4])}{more}."
+        )
 
 
 def _add_motors(spec: mujoco.MjSpec) -> None:

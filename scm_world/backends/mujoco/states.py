@@ -103,9 +103,8 @@ def into_bodies(
 def turned_bodies(model: Model, mj: mujoco.MjModel) -> tuple[tuple[str, ...], Integers, Integers]:
     """Find the bodies that are given in the world.
 
-    Returns:
-        Their names, and the places of their quaternions and angular velocities in the state vector
-        and in the motion, shape (n, 7) each.
+    Returned are their names, and the places of their quaternions and angular velocities in the
+    state vector and in the motion, shape (n, 7) each.
     """
     spins = {
         number

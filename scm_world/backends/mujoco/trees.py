@@ -63,14 +63,11 @@ class TreeLink(NamedTuple):
 class Couplings:
     """The trees of a compiled model, and what reaches them.
 
-    A method with the name of a kind of elements returns the effect of an element of it.
-
-    Args:
-        mj: The model. It is only read.
-        fluid: Whether a medium acts, or may be made to act; it acts in any case if it is dense.
+    A method with the name of a kind of elements returns the effect of an element of it. The model
+    is only read.
 
     Attributes:
-        fluid: Whether a medium acts.
+        fluid: Whether a medium acts, or may be made to act; it acts in any case if it is dense.
         roots: Number of the body at the root of each tree.
         every: All trees.
         links: What joins trees, by kind and number.

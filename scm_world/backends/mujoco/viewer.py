@@ -10,8 +10,8 @@ import numpy as np
 
 from scm_world.backends.mujoco.backend import MujocoBackend
 from scm_world.backends.mujoco.realization import Realization
-from scm_world.geometry import rotation_matrix
-from scm_world.models.scene import GoalRegion, Scene
+from scm_world.geometry.rotations import rotation_matrix
+from scm_world.models.scene import Scene
 from scm_world.models.shapes import GOAL_OPACITY
 
 
@@ -45,10 +45,18 @@ class Viewer:
         handle = self._handle
         if not handle.is_running():
             return
+        shown, kinds = handle.user_scn, mujoco.mjtGeom
         with handle.lock():
-            handle.user_scn.ngeom = 0
-            for goal in scene.goals[: handle.user_scn.maxgeom]:
-                _add_goal(handle.user_scn, goal)
+            shown.ngeom = min(len(scene.goals), shown.maxgeom)
+            for geom, goal in zip(shown.geoms, scene.goals, strict=False):
+                mujoco.mjv_initGeom(  # a silhouette; of a hull, the box around it
+                    geom,
+                    kinds.mjGEOM_SPHERE if goal.shape == "sphere" else kinds.mjGEOM_BOX,
+                    np.asarray(goal.size, dtype=np.float64) / 2.0,
+                    np.asarray(goal.position, dtype=np.float64),
+                    rotation_matrix(goal.orientation).ravel(),
+                    np.array([*goal.color, GOAL_OPACITY], dtype=np.float32),
+                )
         handle.sync()
 
     def close(self) -> None:
@@ -56,17 +64,3 @@ class Viewer:
         if self._handle is not None:
             self._handle.close()
         self._handle = None
-
-
-def _add_goal(scene: mujoco.MjvScene, goal: GoalRegion) -> None:
-    """Add a goal to an abstract scene as a silhouette; of a hull, the box around it."""
-    sphere, box = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_BOX
-    mujoco.mjv_initGeom(
-        scene.geoms[scene.ngeom],
-        sphere if goal.shape == "sphere" else box,
-        np.asarray(goal.size, dtype=np.float64) / 2.0,
-        np.asarray(goal.position, dtype=np.float64),
-        rotation_matrix(goal.orientation).ravel(),
-        np.array([*goal.color, GOAL_OPACITY], dtype=np.float32),
-    )
-    scene.ngeom += 1

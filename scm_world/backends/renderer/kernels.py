@@ -153,23 +153,10 @@ def _to_frame(center: Floats, rotation: Floats, rays: Floats, scale: Floats) -> 
 def _ray(rays: Floats, row: int, u: float, v: float) -> Triple:
     """Compute the origin (row 0) or the direction (row 3) of the ray of a pixel."""
     return (
-        rays[row, 0] + u * rays[row + 1, 0] + v * rays[row + 2, 0],
-        rays[row, 1] + u * rays[row + 1, 1] + v * rays[row + 2, 1],
-        rays[row, 2] + u * rays[row + 1, 2] + v * rays[row + 2, 2],
+        rays[row, 0] + v * rays[row + 2, 0] + u * rays[row + 1, 0],
+        rays[row, 1] + v * rays[row + 2, 1] + u * rays[row + 1, 1],
+        rays[row, 2] + v * rays[row + 2, 2] + u * rays[row + 1, 2],
     )
-
-
-@njit(cache=True, error_model="numpy")
-def _along_row(rays: Floats, v: int) -> tuple[Triple, Triple, Triple, Triple]:
-    """Compute origin and direction of the first ray of a row, and how they grow per column."""
-    o, d = _ray(rays, 0, 0.0, v), _ray(rays, 3, 0.0, v)
-    return o, d, (rays[1, 0], rays[1, 1], rays[1, 2]), (rays[4, 0], rays[4, 1], rays[4, 2])
-
-
-@njit(cache=True, error_model="numpy")
-def _at(first: Triple, step: Triple, u: float) -> Triple:
-    """Step along a row."""
-    return first[0] + u * step[0], first[1] + u * step[1], first[2] + u * step[2]
 
 
 @njit(cache=True, error_model="numpy")
@@ -185,7 +172,8 @@ def _round_span(rays: Floats, v: int, third: float, left: int, right: int) -> tu
     Both have radius 1, the cylinder lies along z. The discriminant of the intersection is a
     quadratic in the column; one more column on either side makes up for rounding.
     """
-    o, d, step_o, step_d = _along_row(rays, v)
+    o, d = _ray(rays, 0, 0.0, v), _ray(rays, 3, 0.0, v)
+    step_o, step_d = (rays[1, 0], rays[1, 1], rays[1, 2]), (rays[4, 0], rays[4, 1], rays[4, 2])
     a0, a1, a2 = _dot(d, d, third), 2.0 * _dot(d, step_d, third), _dot(step_d, step_d, third)
     b0, b1 = _dot(o, d, third), _dot(o, step_d, third) + _dot(step_o, d, third)
     c0, c1 = _dot(o, o, third) - 1.0, 2.0 * _dot(o, step_o, third)
@@ -215,7 +203,7 @@ def _brightness(cosine: float, ambient: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _shadow_at(shadow: Shadow, hit: Floats) -> float:
+def _shadow_at(shadow: Shadow, hit: Hit) -> float:
     """Read the shadow on a plane between its texels; beside its square there is none."""
     dark, square, size = shadow.dark, shadow.square, shadow.dark.shape[0]
     x, y, half = hit[1] - square[0], hit[2] - square[1], square[2]
@@ -346,37 +334,20 @@ def _hit_plane(o: Triple, d: Triple, halves: Floats, near: float) -> Hit:
 
 
 @njit(cache=True, error_model="numpy")
-def _meet_row(
-    shapes: ShapeTable, n: int, measures: tuple[float, float], rays: Floats, v: int,
-    span: tuple[int, int], hits: Floats,
-) -> None:  # fmt: skip
-    """Write where the rays of a row meet a shape, shape (w, 4); one loop per kind is faster."""
+def _hit(shapes: ShapeTable, n: int, o: Triple, d: Triple, measures: tuple[float, float]) -> Hit:
+    """Meet a solid or a plane, given the least depth and half the length of what is round."""
     kind, (near, half) = shapes.kinds[n], measures
-    o, d, step_o, step_d = _along_row(rays, v)
-    if kind in (ELLIPSOID, CAPSULE):
-        for u in range(span[0], span[1]):
-            hits[u, 0], hits[u, 1], hits[u, 2], hits[u, 3] = _hit_round(
-                _at(o, step_o, u), _at(d, step_d, u), half, near
-            )
-    elif kind == BOX:
-        for u in range(span[0], span[1]):
-            hits[u, 0], hits[u, 1], hits[u, 2], hits[u, 3] = _hit_flat(
-                _at(o, step_o, u), _at(d, step_d, u), 0, 1.0, near
-            )
-    elif kind == CYLINDER:
-        for u in range(span[0], span[1]):
-            hits[u, 0], hits[u, 1], hits[u, 2], hits[u, 3] = _hit_flat(
-                _at(o, step_o, u), _at(d, step_d, u), 2, half, near
-            )
-    else:
-        for u in range(span[0], span[1]):
-            hits[u, 0], hits[u, 1], hits[u, 2], hits[u, 3] = _hit_plane(
-                _at(o, step_o, u), _at(d, step_d, u), shapes.halves[n], near
-            )
+    if kind == BOX:
+        return _hit_flat(o, d, 0, 1.0, near)
+    if kind == CYLINDER:
+        return _hit_flat(o, d, 2, half, near)
+    if kind == PLANE:
+        return _hit_plane(o, d, shapes.halves[n], near)
+    return _hit_round(o, d, half, near)
 
 
 @njit(cache=True, error_model="numpy")
-def _tint(color: Floats, tiles: Floats, halves: Floats, hit: Floats, spread: float) -> Triple:
+def _tint(color: Floats, tiles: Floats, halves: Floats, hit: Hit, spread: float) -> Triple:
     """Compute the color, 255 where it is full, of a point of a plane that a pixel spreads over.
 
     Tiles fade into one color where they are smaller than a pixel.
@@ -416,20 +387,14 @@ def draw(
     alpha: float,
     canvas: Canvas,
 ) -> None:
-    """Draw solids and planes over what is there, where they are nearer.
+    """Draw solids and planes, ``which`` of the shapes, over what is there where they are nearer.
 
-    Args:
-        shapes: What there is.
-        which: Rows of what to draw, in this order; no meshes.
-        shadow: On the planes among them.
-        view: The rays of the pixels.
-        light: Unit vector towards the light, and the ambient brightness, shape (4,).
-        alpha: Opacity. Below 1 colors are blended, and depth and owners stay as they are.
-        canvas: What to draw on.
+    ``light`` is the unit vector towards the light, and the ambient brightness, shape (4,). With an
+    opacity ``alpha`` below 1 colors are blended, and depth and owners stay as they are.
     """
     depth, owners, rgb = canvas
     colored, solid, dark = rgb.shape[1] > 0, alpha == 1.0, SHADOW * (1.0 - light[3])
-    behind, hits = 0.0 if solid else TIE, np.empty((depth.shape[1], 4))
+    behind = 0.0 if solid else TIE
     for n in which:
         left, right, top, bottom = _rectangle(shapes, n, view, depth.shape)
         kind, halves, (scale, half) = shapes.kinds[n], shapes.halves[n], _scale(shapes, n)
@@ -442,26 +407,27 @@ def draw(
             if kind in (CAPSULE, CYLINDER, ELLIPSOID):
                 third = 1.0 if kind == ELLIPSOID else 0.0
                 start, stop = _round_span(rays, v, third, left, right)
-            _meet_row(shapes, n, (view.near, half), rays, v, (start, stop), hits)
             for u in range(start, stop):
-                t = hits[u, 0]
+                o, d = _ray(rays, 0, u, v), _ray(rays, 3, u, v)
+                hit = _hit(shapes, n, o, d, (view.near, half))
+                t = hit[0]
                 if t + behind >= depth[v, u]:
                     continue
                 if colored and kind == PLANE:
-                    x, y, z = _ray(rays, 3, u, v)
-                    spread = t * pixel * math.sqrt(x * x + y * y + z * z) / -z
-                    shade = 1.0 - dark * _shadow_at(shadow, hits[u])
+                    spread = t * pixel * math.sqrt(_dot(d, d, 1.0)) / -d[2]
+                    shade = 1.0 - dark * _shadow_at(shadow, hit)
                     shade = _brightness(lamp[2], light[3]) * shade
-                    _blend(rgb, v, u, _tint(tint, tiles, halves, hits[u], spread), shade, alpha)
+                    _blend(rgb, v, u, _tint(tint, tiles, halves, hit, spread), shade, alpha)
                 elif colored:
-                    normal, paint = (hits[u, 1], hits[u, 2], hits[u, 3]), alpha
+                    normal, paint = hit[1:], alpha
                     cosine = _dot(normal, lamp, 1.0)
                     if kind == ELLIPSOID:  # the normal of the scaled ball, divided by the scale
                         x, y, z = normal[0] / scale[0], normal[1] / scale[1], normal[2] / scale[2]
                         cosine = _cosine(x, y, z, lamp)
                     if kind == BOX and not solid:  # twice as opaque where sides meet
-                        x, y, z = _at(_ray(rays, 0, u, v), _ray(rays, 3, u, v), t)
-                        sides = (abs(x) > INNER) + (abs(y) > INNER) + (abs(z) > INNER)
+                        sides = 0
+                        for axis in range(3):
+                            sides += abs(o[axis] + t * d[axis]) > INNER
                         paint = min(alpha * (1.0 if sides < 2 else 2.0), 1.0)
                     _blend(rgb, v, u, color, _brightness(cosine, light[3]), paint)
                 if solid:
@@ -490,18 +456,9 @@ def draw_mesh(
 
     The triangle with the homogeneous pixels a, b, c covers the pixel q where the products of q
     with b × c, c × a and a × b have the sign of a · (b × c); it is seen from outside if that is
-    negative.
-
-    Args:
-        mesh: What to draw, in the frame of its shape.
-        shapes: With the shape.
-        n: Its row.
-        view: The rays of the pixels.
-        light: Unit vector towards the light, and the ambient brightness, shape (4,).
-        alpha: Opacity. Below 1, ``canvas.depth`` has to hold the depth of what is nearest, this
-            mesh included; only where the mesh is nearest are colors blended, and the depth there
-            is minus infinity afterwards. Owners stay as they are.
-        canvas: What to draw on.
+    negative. With an opacity below 1, ``canvas.depth`` has to hold the depth of what is nearest,
+    this mesh included; only where the mesh is nearest are colors blended, and the depth there is
+    minus infinity afterwards. Owners stay as they are.
 
     Source:
         Olano and Greer, *Triangle scan conversion using 2D homogeneous coordinates*, 1997.
@@ -558,12 +515,9 @@ def camera_view(camera: Camera, samples: int) -> View:
 
 
 def parallel_view(slope: Floats, half: float, n: int) -> View:
-    """Compute a ray towards the light for each point of a grid on the floor.
+    """Compute a ray towards the light, at height one, for each of n by n points of a floor.
 
-    Args:
-        slope: Towards the light, at height one, shape (3,).
-        half: Half the edge of the grid [m].
-        n: Points along an edge.
+    ``half`` is half the edge of their square [m].
     """
     step = 2.0 * half / (n - 1)
     zero = np.zeros(3)

@@ -23,7 +23,7 @@ from scm_world.backends.renderer.kernels import (
     draw_mesh,
     parallel_view,
 )
-from scm_world.geometry import rotation_matrix
+from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models.camera import Camera
 from scm_world.models.scene import GoalRegion, Light
 from scm_world.models.shapes import BOX, ELLIPSOID, GOAL_OPACITY, MESH, PLANE, Shapes, mesh_of
@@ -65,9 +65,7 @@ class Parts:
 def parted(shapes: Shapes, *, shadows: bool) -> Parts:
     """Decide how shapes are drawn: first those that do not move, then the others, then clear ones.
 
-    Args:
-        shapes: Their arrays must not change afterwards.
-        shadows: Whether there are any. They fall on floors: on planes that lie.
+    Their arrays must not change afterwards. Shadows fall on floors: on planes that lie.
     """
     table = shapes.table
     opacity, moves = table.colors[:, 3], table.moves
@@ -83,15 +81,7 @@ def parted(shapes: Shapes, *, shadows: bool) -> Parts:
 def draw_parts(
     parts: Parts, camera: Camera, light: Light, samples: int = 1, *, colors: bool = True
 ) -> Canvas:
-    """Draw shapes in front of the sky: the solid ones, then the clear ones from far to near.
-
-    Args:
-        parts: What to draw.
-        camera: Where from.
-        light: Of the picture.
-        samples: Per pixel and axis.
-        colors: Whether to color pixels.
-    """
+    """Draw shapes in front of the sky: the solid ones, then the clear ones from far to near."""
     shapes, moving, clear = parts.shapes, parts.moving, parts.clear
     table, towards, view = shapes.table, lamp(light), camera_view(camera, samples)
     if samples == 1:
@@ -170,11 +160,7 @@ def goal_shapes(goals: Sequence[GoalRegion]) -> Shapes:
 
 
 def lamp(light: Light) -> Floats:
-    """Return the unit vector towards the light, and the ambient brightness, shape (4,).
-
-    Raises:
-        ValueError: The light comes from nowhere.
-    """
+    """Return the unit vector towards the light, and the ambient brightness, shape (4,)."""
     length = math.hypot(*light.direction)
     if not (length > 0.0 and math.isfinite(length)):
         raise ValueError(f"light: the direction must have a length, got {light.direction}")

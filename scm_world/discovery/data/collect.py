@@ -90,8 +90,7 @@ def collect(
 
     Raises:
         InterventionError: More than half of the episodes were refused, or a target cannot be set.
-        Forbidden: The laboratory does not allow it.
-        BudgetExhausted: The laboratory has fewer episodes left.
+        Forbidden: The laboratory does not allow it, or has fewer episodes left.
         UnreadableFile: The folder holds something else, or a damaged file.
         UnwritableFolder: There is no room, or no permission; nothing is lost.
         UnknownOption: An argument does not fit, or other processes cannot have the source.

@@ -13,9 +13,8 @@ import numpy as np
 from scm_world._arguments import typed
 from scm_world.discovery.data.dataset import SEEN, Bools, Ints, Regime
 from scm_world.errors import UnknownOption
-from scm_world.queries.plans import Plan
-from scm_world.queries.timed import ACTS, as_act
-from scm_world.variables import Draw, Function, Intervention, Mechanism, Noise
+from scm_world.queries.plans import Plan, as_act
+from scm_world.variables import ACTS, Draw, Function, Intervention, Mechanism, Noise
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.spaces import Frozen
 

@@ -18,6 +18,7 @@ from scm_world.graph.structure import Edge
 from scm_world.queries.equations import Equations
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.parallel import paths
+from scm_world.queries.plans import Schedule
 from scm_world.queries.rollouts import Unit
 from scm_world.queries.twins import EquationTwins
 
@@ -117,9 +118,9 @@ class ModelSource:
         kinds, where = np.unique(chosen, axis=0, return_inverse=True)
         kind_of = np.asarray(where, dtype=np.int64).reshape(len(chosen))
         regimes = [self._design.regime_of(kind) for kind in kinds]
-        plans = [regime.plan for regime in regimes]
+        plans = [Schedule([(0, regime.plan)]) for regime in regimes]
         units = [
-            Unit(self._seed, number, ((0, plans[kind]),), None, self._length)
+            Unit(self._seed, number, plans[kind], None, self._length)
             for number, kind in zip(numbers, kind_of.tolist(), strict=True)
         ]
         vectors = paths(self._twins, units)[:, min(self._length, 1) :]

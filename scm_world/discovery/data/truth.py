@@ -442,7 +442,7 @@ def acting_edges(table: Dataset) -> list[list[Any]]:
             acts = holds(written["contact"], touch)
             missing -= {i for i in missing if acts(*written["edges"][i][:2])}
     first = int(table.step.min(initial=1)) - table.about.get("lags", 0)
-    later = any(len(regime.plan.at_first()) < len(regime.plan) for regime in table.regimes)
+    later = any(len(regime.plan.at_start()) < len(regime.plan) for regime in table.regimes)
     if first > 0 and not later:  # nothing is set in these rows
         missing |= set(places["set"])
     return [edge for i, edge in enumerate(written["edges"]) if i not in missing]

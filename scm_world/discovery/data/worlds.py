@@ -35,7 +35,7 @@ from scm_world.discovery.data.truth import (
 )
 from scm_world.env.observer import published
 from scm_world.env.vector import WIDE, bounds, spread
-from scm_world.errors import BudgetExhausted, InterventionError, ModelError, UnknownOption
+from scm_world.errors import Forbidden, InterventionError, ModelError, UnknownOption
 from scm_world.graph.structure import Edge
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.episodes import Episode
@@ -52,7 +52,7 @@ from scm_world.queries.twins import AnyTwins, EquationTwins
 from scm_world.variables import Noise, Normal
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import Simulation
-from scm_world.world.plan import merged
+from scm_world.world.interventions import merged
 
 STREAM = "sensor of"
 """Begins the names of the streams; draws of ``sensor_noise`` itself have another one."""
@@ -394,7 +394,7 @@ class Experiments:
         seed: Of what the design draws by lot.
 
     Raises:
-        BudgetExhausted: Fewer episodes are left.
+        Forbidden: Fewer episodes are left.
     """
 
     at_once = False
@@ -404,7 +404,7 @@ class Experiments:
     def __init__(self, laboratory: Laboratory, design: Design, n: int, *, seed: int) -> None:
         left = laboratory.remaining
         if left is not None and n > left:
-            raise BudgetExhausted(n, left)
+            raise Forbidden(f"run {n} more episodes", [f"{left} episodes"])
         self._laboratory, self._design, self._seed = laboratory, design, seed
         # For units and shapes only; it is private, since it would show the graph.
         self._model = laboratory._world.model

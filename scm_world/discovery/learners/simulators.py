@@ -17,8 +17,7 @@ from scm_world._types import Floats, Value, Values
 from scm_world.discovery.data.recorded import first_name
 from scm_world.errors import InterventionError, ModelError
 from scm_world.graph import SCM, NoiseKey
-from scm_world.queries.experiments.effects import Effects, Series
-from scm_world.queries.experiments.models import PairedEquations
+from scm_world.queries.experiments.effects import Effects, gap
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes
 from scm_world.queries.outcomes import Outcome, read
@@ -31,6 +30,19 @@ SMALL = 1e-6  # of the size of a variable: so little that everything answers in 
 MOST = 10_000  # probe states, where the budget is what counts
 OTHER = 1_000_000
 """Units from here on lend their values to the others; none of them is a unit of the experiment."""
+
+
+def paired_effects(
+    system: Simulation | SCM, states: int, seed: int, budget: float = np.inf
+) -> Effects:
+    """Move one variable at a time, in one state or unit after another, as the budget allows."""
+    paired = Paired(system, seed)
+    effects = Effects(exact=paired.exact)
+    for number, probe in enumerate(probes(system, states, seed)):
+        effects.add(paired.run(number, probe))
+        if effects.rollouts >= budget:
+            break
+    return effects
 
 
 class PairedSimulator(Protocol):
@@ -86,10 +98,8 @@ class SCMSimulator:
 
     def effects(self, budget: int) -> Effects:
         """Move one variable at a time; see ``PairedSimulator``."""
-        probes = max(1, budget // (len(self.names) + 2))
-        series = Series(PairedEquations(self._model, self._seed), probes)
-        series.run(range(probes))
-        return series.effects
+        units = max(1, budget // (len(self.names) + 2))
+        return paired_effects(self._model, units, self._seed)
 
     def prepare(self, unit: int) -> None:
         """Draw a unit, two instants of it, and run it as it is: one experiment.
@@ -163,10 +173,7 @@ class StepSimulator:
 
     def effects(self, budget: int) -> Effects:
         """Move one variable at a time; see ``PairedSimulator``."""
-        series = Series(Paired(self._world, self._seed), MOST)
-        states = probes(self._world, MOST, self._seed)
-        series.run(states, lambda effects, _: effects.rollouts >= budget)
-        return series.effects
+        return paired_effects(self._world, MOST, self._seed, budget)
 
 
 @final
@@ -214,13 +221,13 @@ class EpisodeSimulator:
     def _unit(self, unit: int, found: Effects) -> None:
         begin, end = self._begun(unit, {}, found), self._ended(unit, {}, found)
         for what, again in zip(end, self._ended(unit, {}, found), strict=True):
-            found.floor = max(found.floor, float(np.max(np.abs(again - what), initial=0.0)))
+            found.see_unstable("", float(np.max(np.abs(again - what), initial=0.0)))
         others = self._begun(OTHER + unit, {}, found)
         for cause in self._causes:
             try:
                 self._moved(unit, cause, others[cause], begin, end, found)
             except InterventionError:
-                found.refused[cause] = found.refused.get(cause, 0) + 1
+                found.refused[cause] += 1
 
     def _moved(
         self,
@@ -243,12 +250,13 @@ class EpisodeSimulator:
         for name in follow:
             held = self._held(begin, [other for other in follow if other != name])
             there = self._begun(unit, {**do, **held}, found) if held else then
-            found.see(self._named[cause], self._named[name], 0, there[name], begin[name])
+            key = self._named[cause], self._named[name], 0
+            found.see(key, gap(there[name], begin[name]))
         held = self._held(begin, (name for name in self._causes if name != cause))
         after = self._ended(unit, {**held, cause: value}, found)
         last = self.names[len(self._causes) :]
         for name, now, before in zip(last, after, end, strict=True):
-            found.see(self._named[cause], name, 0, now, before)
+            found.see((self._named[cause], name, 0), gap(now, before))
 
     def _begun(self, unit: int, do: Mapping[str, Any], found: Effects) -> dict[str, Value]:
         found.rollouts += 1

@@ -17,6 +17,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
+from scm_world.graph import SCM
 from scm_world.policies.planning import action_range
 from scm_world.variables import (
     Box,
@@ -42,7 +43,8 @@ DRAWS = 96  # of a probe state, without those that have a name
 HALVINGS = 30  # of a range of commands, until one of them is found that no limit cuts
 TINY = 1e-9  # share of that range, which makes a difference there
 KEPT = 10  # for how many control steps an action is kept at most
-JITTER = 0.2  # how far, as a fraction, a parameter without a space is moved
+JITTER = 0.2  # how far, as a fraction, a parameter without a space is moved in a probe state
+FAR = 0.75  # the same in an experiment
 SHARE = 0.5  # of the parameters that have other values, in the probes where some have
 NEAR = 0.5  # of the places are within reach
 REACH = {"rad": np.pi, "m": 0.2, "rad/s": 4.0, "m/s": 2.0}
@@ -110,47 +112,45 @@ class Probe:
 
     Attributes:
         kind: How it came about.
-        snapshot: Of the world.
+        snapshot: Of the world; None of equations.
         action: What is done next, shape (n_actions,).
     """
 
     kind: str
-    snapshot: WorldSnapshot
+    snapshot: Any
     action: Floats
 
 
 def probes(
-    world: Simulation,
+    system: Simulation | SCM,
     n: int,
     seed: int,
     *,
-    settled: bool = True,
     first: int = 0,
     scenarios: bool = True,
 ) -> Iterator[Probe]:
     """Prepare probe states one after another.
 
     Args:
-        world: To experiment with; it is reset for each probe.
+        system: A world, which is reset for each probe, or equations: each is another unit.
         n: How many, those before the first one included.
         seed: Of the choices.
         first: Number of the first one.
-        settled: Whether control steps may be taken first. Without them a probe state is made of
-            the same numbers on every engine.
         scenarios: Whether the task's own scenarios are used, where it has some.
     """
-    noise = Noise(seed)
+    if isinstance(system, SCM):
+        yield from (Probe("unit", None, np.zeros(0)) for _ in range(first, n))
+        return
+    world, noise = system, Noise(seed)
     world.reset(seed=seed)
     asked = world.task.scenarios(world) if scenarios else ()
     known = tuple(Scenario(getattr(one[0], "__name__", "own"), *one) for one in asked)
-    kinds = known or _kinds(world, settled=settled)
+    kinds = known or _kinds(world)
     for number in range(first, n):
-        yield _prepared(world, kinds[number % len(kinds)], noise, number, settled)
+        yield _prepared(world, kinds[number % len(kinds)], noise, number)
 
 
-def _prepared(
-    world: Simulation, scenario: Scenario, noise: Noise, number: int, settled: bool
-) -> Probe:
+def _prepared(world: Simulation, scenario: Scenario, noise: Noise, number: int) -> Probe:
     """Prepare a state from which the world can continue; the beginning where nothing else is one.
 
     Raises:
@@ -159,21 +159,21 @@ def _prepared(
     for attempt in range(ATTEMPTS):
         world.reset(seed=number)
         try:
-            return _made(world, scenario, ProbeGenerator(noise, number, attempt), settled)
+            return _made(world, scenario, ProbeGenerator(noise, number, attempt))
         except (InterventionError, EngineFailure):
             continue
     world.reset(seed=number)
-    return _made(world, AT_REST, ProbeGenerator(noise, number), settled)
+    return _made(world, AT_REST, ProbeGenerator(noise, number))
 
 
-def _made(world: Simulation, scenario: Scenario, rng: ProbeGenerator, settled: bool) -> Probe:
+def _made(world: Simulation, scenario: Scenario, rng: ProbeGenerator) -> Probe:
     states, extra = scenario.prepare(world, rng)
     if states:
         world.do(states)
     action = scenario.act(world, extra, rng)
     drawn = round(rng.uniform(0.0, 2.0))
     steps = drawn if scenario.steps is None else scenario.steps
-    for _ in range(steps if settled else 0):
+    for _ in range(steps):
         world.step(action)
     action = scenario.act(world, extra, rng)
     snapshot = world.snapshot()
@@ -321,7 +321,12 @@ def _jittered(variable: Exogenous, world: Simulation, rng: ProbeGenerator) -> Va
 
 
 def drawn(
-    variable: Variable, present: Value, now: Values, rng: ProbeGenerator, stream: str, share: float
+    variable: Variable,
+    present: Value,
+    now: Values,
+    rng: ProbeGenerator,
+    stream: str,
+    share: float = FAR,
 ) -> Value | None:
     """Draw another value of a variable: from its space A, its space B, or within its bounds.
 
@@ -348,7 +353,7 @@ def drawn(
             others = [member for member in members if not np.any(present == member)]
             return variable.array(others[int(unit[0] * len(others))]) if others else None
     if variable.dtype != "real":
-        return None
+        return present + 1 if variable.dtype == "integer" else None
     if isinstance(variable, Measured):
         return _moved(variable, present, unit[1:])
     named = (variable.space("A"), variable.space("B"), bounds)
@@ -454,10 +459,8 @@ _TOUCH_OTHERWISE = Scenario(
 """Where parameters have other values, too, it says ``others``."""
 
 
-def _kinds(world: Simulation, *, settled: bool) -> tuple[Scenario, ...]:
+def _kinds(world: Simulation) -> tuple[Scenario, ...]:
     """List what is tried in a system of which the task says nothing."""
-    if not settled:
-        return AT_START, _ANYWHERE, _OTHERWISE
     kinds: tuple[Scenario, ...]
     if any(edge.when == "contact" for edge in world.model.edges):
         kinds = (AT_START, _TOUCHING, _ON_TOUCHING, _ANYWHERE)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from abc import abstractmethod
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache, partial
 from typing import Any, ClassVar, Unpack
 
@@ -44,6 +44,7 @@ from scm_world.tasks.trifinger.conventions import CONVENTIONS, TriFingerConventi
 from scm_world.tasks.trifinger.entities.block_world import BlockWorld, fingers_reach
 from scm_world.tasks.trifinger.entities.robot import ACTIONS, robot
 from scm_world.tasks.trifinger.entities.stage import light_and_cameras, stage
+from scm_world.tasks.trifinger.groups import grouped
 from scm_world.tasks.trifinger.hardware import PRESETS, RESOLUTIONS, TIMESTEP
 from scm_world.tasks.trifinger.kernels import POSE
 from scm_world.tasks.trifinger.scenarios import scenarios
@@ -208,6 +209,12 @@ class TriFingerTask(Task):
     def arranged(self) -> Any:
         """The plan; where the task stands alone, the one that its defaults give."""
         return self._first if self.plan is None else self.plan
+
+    def groups(
+        self, model: SCM, spaced: Sequence[Variable], bodies: Collection[str]
+    ) -> dict[str, list[str]]:
+        """Return the groups of variables that curricula know by a word."""
+        return grouped(model, spaced, bodies, placed=bool(self.decided_by))
 
     def dense(self) -> Iterable[Variable]:
         """Declare the dense reward terms."""

@@ -22,11 +22,10 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Value
-from scm_world.geometry import aabb_overlap_fraction, rotation_matrix
-from scm_world.geometry.filling import overlap_fraction
+from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction
 from scm_world.geometry.hulls import Hull, hull_of, hull_overlap
-from scm_world.geometry.rotations import angle_between, rotation_kernel
-from scm_world.geometry.scalars import scalar
+from scm_world.geometry.numbers import scalar
+from scm_world.geometry.rotations import angle_between, rotation_kernel, rotation_matrix
 from scm_world.tasks.rewards import term
 from scm_world.tasks.trifinger import hardware
 from scm_world.variables import Function, Measured, Parent

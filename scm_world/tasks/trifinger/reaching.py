@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Value, Values
-from scm_world.geometry.scalars import scalar
+from scm_world.geometry.numbers import scalar
 from scm_world.tasks.base import Goal, Observed, checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, weighted

@@ -11,9 +11,9 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.geometry import canonical, quaternion_product
 from scm_world.geometry.coordinates import from_cylindrical
-from scm_world.geometry.hulls import Hull, extents
+from scm_world.geometry.hulls import Hull
+from scm_world.geometry.rotations import canonical, quaternion_product
 from scm_world.tasks.base import checked, finite_numbers
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, Common, weighted
@@ -175,7 +175,7 @@ class OneBlock(TriFingerTask):
         if self.shape is None:
             return block_size(f"{name}.size", SIZE)
         doc = "Edge lengths of the box around the shape, in its own frame."
-        return _constant(f"{name}.size", extents(self.shape), doc)
+        return _constant(f"{name}.size", np.ptp(self.shape.vertices, axis=0), doc)
 
     def tool_block(
         self,
@@ -242,7 +242,6 @@ def _constant(name: str, value: Any, doc: str) -> Variable:
 # --- pushing --------------------------------------------------------------------------------------
 
 
-@final
 class Pushing(OneBlock):
     """One tool block and one goal block of the same size, both on the floor.
 
@@ -261,7 +260,7 @@ class Pushing(OneBlock):
         fraction=1.0,
     )
     paper_weights = {"reward.orientation": 0.0}  # noqa: RUF012 # a constant
-    goal_causes = (f"{GOAL}.polar", f"{GOAL}.euler_orientation")
+    goal_causes: tuple[str, ...] = (f"{GOAL}.polar", f"{GOAL}.euler_orientation")
 
     def __init__(
         self,
@@ -430,7 +429,7 @@ def wall_on_the_floor(size: Floats) -> Floats:
 
 
 @final
-class PickAndPlace(OneBlock):
+class PickAndPlace(Pushing):
     """A wall, a block on one side of it, and a goal of the same size on the other.
 
     The blocks share the parents ``block.size`` and ``wall_side``. Which side the block begins
@@ -438,10 +437,7 @@ class PickAndPlace(OneBlock):
     floor however high it is.
 
     Args:
-        tool_block_position: Where the center of the block begins while ``wall_side`` is 0: x and
-            y if it stands on the floor, or x, y and z [m].
-        goal_block_position: Default x and y of the goal, which is on the floor, likewise [m].
-        options: Of block, goal and every task; see ``Alike`` and ``Common``.
+        options: Those of pushing, for ``wall_side`` 0; block and goal are at y of -0.09 and 0.09 m.
     """
 
     name = "pick_and_place"
@@ -457,15 +453,9 @@ class PickAndPlace(OneBlock):
     obstacles = (WALL,)
     goal_causes = (SIDE, f"{GOAL}.polar", f"{GOAL}.euler_orientation")
 
-    def __init__(
-        self,
-        *,
-        tool_block_position: Place = (0.0, -0.09),
-        goal_block_position: Place = (0.0, 0.09),
-        **options: Unpack[Alike],
-    ) -> None:
-        super().__init__(tool_block_position, **options)
-        self._polar = floor_place("goal_block_position", goal_block_position, self.below(GOAL))
+    def __init__(self, **options: Any) -> None:
+        at = {"tool_block_position": (0.0, -0.09), "goal_block_position": (0.0, 0.09)}
+        super().__init__(**{**at, **options})
 
     def entities(self) -> Iterable[Entity]:
         """A block, its goal and the wall between them."""

@@ -10,7 +10,7 @@ from typing import Unpack, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.geometry import rotation_matrix
+from scm_world.geometry.rotations import rotation_matrix
 from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import Common, weighted

@@ -10,7 +10,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import UnknownOption
-from scm_world.geometry import canonical, quaternion_product
+from scm_world.geometry.rotations import canonical, quaternion_product
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import N_FINGERS
 

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from env_executors import actions, check_same, make
+from many_envs import HERE, actions, check_same, make, sync
 
 from scm_world.errors import InterventionError, NotReset
 
 
-@pytest.mark.parametrize("executor", ["loop", "native"])
-def test_a_closed_one_takes_no_step(executor: str) -> None:
+@pytest.mark.parametrize("kind", HERE)
+def test_a_closed_one_takes_no_step(kind: str) -> None:
     """After closing there is no episode; a reset begins one."""
-    envs = make(executor, 2)
+    envs = make(kind, 2)
     envs.reset(seed=0)
     envs.step(actions(1, 2)[0])
     envs.close()
@@ -29,7 +29,7 @@ def test_a_closed_one_takes_no_step(executor: str) -> None:
 
 def test_what_is_done_to_a_world_itself_is_seen() -> None:
     """Noise of the sensors that begins in a world that was asked for is there in the next step."""
-    pair = [make(executor, 2, backend="mujoco") for executor in ("loop", "native")]
+    pair = [make("native", 2), sync(2, backend="mujoco")]
     for envs in pair:
         envs.reset(seed=0)
         envs.step(actions(1, 2)[0])
@@ -43,11 +43,10 @@ def test_what_belongs_to_a_structure_that_is_gone_is_freed() -> None:
     envs: Any = make("native", 1)
     envs.reset(seed=0)
     envs.step(actions(1, 1)[0])
-    executor = envs.unwrapped.executor
-    table = weakref.ref(executor._batch.table(0))
-    executor._bring([0])
-    executor._batch._tables.clear()
-    executor._batch._kinds[0], executor._batch._groups = (), None
+    table = weakref.ref(envs._batch.table(0))
+    envs._bring(0)
+    envs._batch._tables.clear()
+    envs._batch._kinds[0], envs._batch._groups = (), None
     gc.collect()
     assert table() is None
     assert np.isfinite(envs.step(actions(2, 1)[1])[1]).all()
@@ -56,7 +55,7 @@ def test_what_belongs_to_a_structure_that_is_gone_is_freed() -> None:
 def test_goals_that_are_unlike_the_others_are_named() -> None:
     """Where only goals differ, the refusal says so."""
     options = {"observation_mode": "custom", "observe": ["joint_positions"]}
-    envs = make("loop", 2, "scm_world/General-v0", **options)
+    envs = make("turns", 2, "scm_world/General-v0", **options)
     envs.reset(seed=0)
-    with pytest.raises(InterventionError, match="goals"):
+    with pytest.raises(InterventionError, match="achieved_goal"):
         envs.do({1: {"nums_objects": 2}})

@@ -7,23 +7,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from env_executors import REACHING, SIZE, actions, check_alike, check_same, engine, kept, make
+from many_envs import HERE, REACHING, SIZE, actions, check_alike, check_same, engine, kept, make
 
-from scm_world.env.batched.vector_env import EXECUTORS
 from scm_world.errors import (
     InterventionError,
     NotReset,
     OutOfBounds,
-    OutOfSpace,
     SnapshotMismatch,
     UnknownOption,
 )
 
 
-@pytest.fixture(params=EXECUTORS)
+@pytest.fixture(params=HERE)
 def pair(request: pytest.FixtureRequest) -> tuple[Any, Any]:
-    """Give a batch, and another one in the same state that is simulated one by one."""
-    both = kept(request.param), make("loop", backend=engine(request.param), max_episode_length=5)
+    """Give a batch in this process, and one in the same state of single ones in processes."""
+    both = kept(request.param), kept("processes", engine(request.param))
     for envs in both:
         envs.reset(seed=0)
         envs.step(actions(1, seed=9)[0])
@@ -66,7 +64,7 @@ def test_all_worlds_are_intervened_on_or_none(pair: tuple[Any, Any]) -> None:
         with pytest.raises(OutOfBounds, match=f"environment {index}: .*mass") as caught:
             envs.do(requests)
         assert caught.value.variable == "tool_block.mass"
-    with pytest.raises(OutOfSpace, match="environment 0"):
+    with pytest.raises(OutOfBounds, match="environment 0"):
         envs.do({0: {"tool_block.mass": 0.09}}, space="A")
     assert envs.get_attr("interventions") == ((),) * SIZE
     check_same(envs.present(), untouched.present(), "present")
@@ -83,13 +81,11 @@ def test_all_episodes_begin_or_none(pair: tuple[Any, Any]) -> None:
     check_alike(envs, untouched, 3)
 
 
-@pytest.mark.parametrize(
-    "executor", [executor for executor in EXECUTORS if executor != "processes"]
-)
-def test_worlds_of_a_batch_are_observed_alike(executor: str) -> None:
+@pytest.mark.parametrize("kind", HERE)
+def test_worlds_of_a_batch_are_observed_alike(kind: str) -> None:
     """What changes which bodies there are in one of them is refused; it is as it was."""
     start = {"number_of_obstacles": 1}
-    envs, untouched = (make(executor, id_=REACHING, start=start) for _ in range(2))
+    envs, untouched = (make(kind, id_=REACHING, start=start) for _ in range(2))
     for one in (envs, untouched):
         one.reset(seed=0)
     other = {"number_of_obstacles": 2}
@@ -100,10 +96,10 @@ def test_worlds_of_a_batch_are_observed_alike(executor: str) -> None:
         envs.reset(options={"do": {3: other}})
     check_same(envs.present(), untouched.present(), "present")
     check_alike(envs, untouched, 2)
-    single: Any = make(None, 1, REACHING, start=other, backend=engine(executor))
+    single: Any = make(kind, 1, REACHING, start=other)
     single.reset(seed=0)
     with pytest.raises((InterventionError, SnapshotMismatch), match="environment 1: the snapshot"):
-        envs.restore({1: single.snapshot().worlds[0]})
+        envs.restore({1: single.snapshot()[0]})
     check_alike(envs, untouched, 2)
 
 
@@ -119,10 +115,10 @@ def test_it_goes_back_to_a_snapshot(pair: tuple[Any, Any]) -> None:
     other.restore(saved)
     check_same([other.step(action) for action in actions(3)], first, "elsewhere")
     present = envs.snapshot()
-    envs.restore({2: saved.worlds[2]})
+    envs.restore({2: saved[2]})
     shown, _ = envs.present()
     np.testing.assert_array_equal((shown != other.present()[0]).any(axis=1), [0, 0, 1, 0])
-    envs.restore({2: present.worlds[2]})
+    envs.restore({2: present[2]})
     check_alike(envs, other, 2)
 
 
@@ -134,7 +130,7 @@ def test_what_is_done_is_still_done_after_a_snapshot() -> None:
     envs.reset(seed=5, options={"reset_mask": np.array([False, True, True, False])})
     envs.step(actions(1)[0])
     saved = envs.snapshot()
-    assert saved.ended == (True, False, False, True)
+    assert [one.ended for one in saved] == [True, False, False, True]
     first = [envs.step(action) for action in actions(4)]
     envs.restore(saved)
     check_same([envs.step(action) for action in actions(4)], first, "again")

@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from env_executors import check_same
+from gymnasium.vector import SyncVectorEnv
+from many_envs import HERE, check_same, make
 
 from scm_world.env import ScmWorldEnv
-from scm_world.env.batched.loop import LoopExecutor
-from scm_world.env.batched.native import NativeExecutor
-from scm_world.errors import ActionError, EngineFailure, InterventionError, ModelError
+from scm_world.env.native import NativeVectorEnv
+from scm_world.env.processes import ProcessVectorEnv
+from scm_world.errors import ActionError, EngineFailure, ModelError
 from scm_world.tasks import Pushing
 from scm_world.tasks.rewards import term
 
 COUNT = 4
-EVERYONE = np.ones(COUNT, dtype=np.bool_)
 
 OPTIONS: list[dict[str, Any]] = [
     {},
@@ -43,174 +43,142 @@ OPTIONS: list[dict[str, Any]] = [
 ]
 
 
-def executors(
-    threads: int = 2, count: int = COUNT, **options: Any
-) -> tuple[LoopExecutor, NativeExecutor]:
-    """Make both kinds, at the beginning of the same episodes."""
-    make = partial(ScmWorldEnv, **options)
-    loop, native = LoopExecutor(make, count), NativeExecutor(make, count, threads=threads)
-    first = {"do": {"floor_friction": 0.5}}
-    for executor in (loop, native):
-        given = [first, *[None] * (count - 1)]
-        executor.reset(np.ones(count, dtype=np.bool_), range(3, 3 + count), given)
-    return loop, native
+def pair(count: int = COUNT, threads: int = 2, **options: Any) -> tuple[Any, Any]:
+    """Make Gymnasium's own kind and ours, at the beginning of the same episodes."""
+    single = [partial(ScmWorldEnv, **options)] * count
+    both = SyncVectorEnv(single), NativeVectorEnv(count, threads=threads, **options)
+    for envs in both:
+        check_same(envs.reset(seed=3), both[0].reset(seed=3), "reset")
+    return both
 
 
-def compare(loop: LoopExecutor, native: NativeExecutor, where: str) -> None:
-    """Compare their sheets."""
-    for field in (
-        "observations",
-        "rewards",
-        "terminations",
-        "truncations",
-        "infos",
-    ):
-        check_same(
-            getattr(loop.buffers, field), getattr(native.buffers, field), f"{where}: {field}"
-        )
-
-
-def actions(executor: Any, steps: int) -> Any:
+def actions(envs: Any, steps: int) -> Any:
     """Draw actions from the whole space, shape (steps, n, 9)."""
-    space: Any = executor.form.action_space
+    space: Any = envs.single_action_space
     generator = np.random.default_rng(0)
     bounds = np.clip(space.low, -1e3, 1e3), np.clip(space.high, -1e3, 1e3)
-    drawn = generator.uniform(*bounds, (steps, executor.num_envs, 9))
-    return drawn.astype(np.float32).astype(np.float64)
+    return generator.uniform(*bounds, (steps, envs.num_envs, 9)).astype(np.float32)
 
 
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 def test_every_kind_of_environment(options: dict[str, Any]) -> None:
-    """Whatever is observed and however it is commanded, a native executor says the same."""
-    loop, native = executors(**options)
-    compare(loop, native, "reset")
-    for step, asked in enumerate(actions(loop, 6)):
-        which = EVERYONE.copy()
-        which[1] = step != 4
-        for executor in (loop, native):
-            executor.step(which, asked)
-        compare(loop, native, f"step {step}")
-    loop.close()
+    """Whatever is observed and however it is commanded, single environments say the same."""
+    single, native = pair(**options)
+    begin = {"do": {"floor_friction": 0.5}, "reset_mask": np.arange(COUNT) == 1}
+    for step, asked in enumerate(actions(native, 6)):
+        check_same(native.step(asked), single.step(asked), f"step {step}")
+        if step == 3:
+            check_same(*(envs.reset(options=dict(begin)) for envs in (native, single)), "reset")
+    single.close()
     native.close()
 
 
 def test_everything_that_can_be_done_to_one() -> None:
     """Interventions, resets and branches of single environments leave all others alone."""
-    loop, native = executors(action_mode="delta_joint_positions", max_episode_length=9)
+    single, native = pair(action_mode="delta_joint_positions", max_episode_length=9)
     joints = [0.0, 0.9, -1.7] * 3
-    meddling = {
-        2: lambda executor: executor.do(
-            {0: {"gravity": [0, 0, -8.0]}, 2: {"joint_positions": joints}}
+    one, two, three, four = single.envs
+    again = {"reset_mask": np.arange(COUNT) == 1}
+    meddling: dict[int, tuple[Any, Any]] = {
+        2: (
+            lambda: native.do({0: {"gravity": [0, 0, -8.0]}, 2: {"joint_positions": joints}}),
+            lambda: (one.do({"gravity": [0, 0, -8.0]}), three.do({"joint_positions": joints})),
         ),
-        4: lambda executor: executor.restore({1: executor.snapshot([0])[0]}),
-        5: lambda executor: executor.reset(np.arange(COUNT) == 1, [None] * COUNT, [None] * COUNT),
-        6: lambda executor: executor.do({0: {"sensor_noise": 0.05}, 1: {"actuator_noise": 0.1}}),
-        8: lambda executor: executor.call([3], "do", {"tool_block.mass": 0.05}),
+        4: (lambda: native.branch(0, [1]), lambda: two.restore(one.snapshot())),
+        5: (lambda: native.reset(options=dict(again)), lambda: single.reset(options=dict(again))),
+        6: (
+            lambda: native.do({0: {"sensor_noise": 0.05}, 1: {"actuator_noise": 0.1}}),
+            lambda: (one.do({"sensor_noise": 0.05}), two.do({"actuator_noise": 0.1})),
+        ),
+        8: (
+            lambda: native.call_in([3], "do", {"tool_block.mass": 0.05}),
+            lambda: four.do({"tool_block.mass": 0.05}),
+        ),
     }
-    for step, asked in enumerate(actions(loop, 11)):
-        for executor in (loop, native):
-            executor.step(EVERYONE, asked)
-            meddling.get(step, lambda _: None)(executor)
-        compare(loop, native, f"step {step}")
-    check_same(
-        loop.call(range(COUNT), "interventions"),
-        native.call(range(COUNT), "interventions"),
-        "interventions",
-    )
+    for step, asked in enumerate(actions(native, 11)):
+        check_same(native.step(asked), single.step(asked), f"step {step}")
+        for act in meddling.get(step, ()):
+            act()
+        for index, env in enumerate(single.envs):
+            np.testing.assert_array_equal(native.present()[0][index], env.present()[0])
+    check_same(native.get_attr("interventions"), single.get_attr("interventions"))
 
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
 @pytest.mark.parametrize("count", [1, 2, 7, 64])
 def test_numbers_of_environments_and_threads(count: int, threads: int) -> None:
     """What the first environment does depends on neither number."""
-    alone, _ = executors(count=1)
-    _, native = executors(count=count, threads=threads)
+    alone, native = ScmWorldEnv(), NativeVectorEnv(count, threads=threads)
+    alone.reset(seed=3)
+    native.reset(seed=3)
     for asked in actions(native, 4):
-        alone.step(np.ones(1, dtype=np.bool_), asked)
-        native.step(np.ones(count, dtype=np.bool_), asked)
-        np.testing.assert_array_equal(native.buffers.observations[0], alone.buffers.observations[0])
-        assert native.buffers.rewards[0] == alone.buffers.rewards[0]
+        mine, other = native.step(asked), alone.step(asked[0])
+        np.testing.assert_array_equal(mine[0][0], other[0])
+        assert mine[1][0] == other[1]
 
 
-def test_a_refused_intervention_changes_nothing() -> None:
-    """If one of them refuses, all are as they were, in the buffers and in the world."""
-    loop, native = executors()
-    first, second, *_ = actions(loop, 3)
-    for executor in (loop, native):
-        executor.step(EVERYONE, first)
-    with pytest.raises(InterventionError, match="environment 2"):
-        native.do({0: {"floor_friction": 0.7}, 2: {"tool_block.mass": -1.0}})
-    compare(loop, native, "after the refusal")
-    for executor in (loop, native):
-        executor.step(EVERYONE, second)
-    compare(loop, native, "a step later")
-
-
-def test_errors_name_the_environment() -> None:
-    """An action that is no number is refused before anything moves, with the index."""
-    loop, native = executors()
-    asked = actions(loop, 1)[0]
-    asked[2, 3] = np.nan
-    with pytest.raises(ActionError, match="environment 2"):
-        native.step(EVERYONE, asked)
-    compare(loop, native, "after the refusal")
-
-
-@pytest.mark.parametrize("kind", [LoopExecutor, NativeExecutor])
-def test_where_an_action_is_refused_none_moves(kind: Any) -> None:
+@pytest.mark.parametrize("kind", HERE)
+def test_where_an_action_is_refused_none_moves(kind: str) -> None:
     """Nobody is a step further, not even those before the one with the wrong action."""
-    executor = kind(partial(ScmWorldEnv), COUNT)
-    executor.reset(EVERYONE, range(COUNT), [None] * COUNT)
-    asked = actions(executor, 1)[0]
+    envs = make(kind)
+    envs.reset(seed=0)
+    asked = actions(envs, 1)[0]
     asked[2, 3] = np.nan
     with pytest.raises(ActionError, match="environment 2"):
-        executor.step(EVERYONE, asked)
-    assert [env.world.index for env in executor.attribute(range(COUNT), "unwrapped")] == [0] * COUNT
+        envs.step(asked)
+    assert [world.index for world in envs.get_attr("world")] == [0] * COUNT
 
 
-@pytest.mark.parametrize("kind", [LoopExecutor, NativeExecutor])
-def test_where_one_fails_all_others_are_a_step_further(
-    kind: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A state that is lost, and a function that fails, stop no other environment."""
-    monkeypatch.chdir(tmp_path)  # engines may write a log
+@pytest.mark.parametrize("kind", [NativeVectorEnv, partial(ProcessVectorEnv, workers=2)])
+def test_where_one_fails_all_others_are_a_step_further(kind: Any) -> None:
+    """A function that fails stops no other environment."""
     own = term("reward.own", _heavy, ("floor_friction", "control_index"), "Of mine.")
     task = Pushing(terms=[own], weights={"reward.own": 1.0})
-    executor = kind(partial(ScmWorldEnv, task=task), COUNT)
-    given: list[Any] = [None, {"do": {"floor_friction": 0.7}}, None, None]
-    executor.reset(EVERYONE, range(COUNT), given)
-    alone = ScmWorldEnv(task)
-    asked = actions(executor, 2)
-    with pytest.raises(ModelError, match=r"reward\.own"):
-        executor.step(EVERYONE, asked[0])
-    indices = [env.world.index for env in executor.attribute(range(COUNT), "unwrapped")]
-    assert indices == [1] * COUNT
-    executor.reset(EVERYONE, range(COUNT), [None] * COUNT)
-    envs = executor.attribute(range(COUNT), "unwrapped")
-    envs[1].world.backend.realization.data.qvel[:] = 1e200
-    with pytest.raises(EngineFailure):
-        executor.step(EVERYONE, asked[0])
-    envs = executor.attribute(range(COUNT), "unwrapped")
+    envs, alone = kind(COUNT, task=task), ScmWorldEnv(task)
+    envs.reset(seed=0, options={"do": {1: {"floor_friction": 0.7}}})
+    asked = actions(envs, 2)
+    with pytest.raises(ModelError, match=r"environment 1: (.|\n)*reward\.own"):
+        envs.step(asked[0])
+    assert [world.index for world in envs.get_attr("world")] == [1] * COUNT
+    seen, _ = envs.present()
     for index in (0, 2, 3):
         alone.reset(seed=index)
-        shown = alone.step(asked[0][index])[0]
-        assert envs[index].world.index == 1
-        np.testing.assert_array_equal(executor.buffers.observation(index), shown)
+        np.testing.assert_array_equal(seen[index], alone.step(asked[0][index])[0])
+    envs.close()
+
+
+def test_where_one_loses_its_state_all_others_are_a_step_further(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The others go on as if nothing had happened."""
+    monkeypatch.chdir(tmp_path)  # engines may write a log
+    envs, alone = NativeVectorEnv(COUNT), ScmWorldEnv()
+    envs.reset(seed=0)
+    asked = actions(envs, 1)[0]
+    envs.get_attr("world")[1].backend.realization.data.qvel[:] = 1e200
+    with pytest.raises(EngineFailure):
+        envs.step(asked)
+    for index in (0, 2, 3):
+        alone.reset(seed=index)
+        shown = alone.step(asked[index])[0]
+        assert envs.get_attr("world")[index].index == 1
+        np.testing.assert_array_equal(envs.envs[index].unwrapped.present()[0], shown)
 
 
 def _heavy(friction: Any, index: Any) -> float:
     return float("nan") if float(friction) == 0.7 and int(index) else 0.0
 
 
-def test_a_reward_that_is_no_number() -> None:
+def test_a_reward_that_is_not_a_number() -> None:
     """A term that fails in one environment says so as it does in a single one."""
     own = term("reward.own", _late, ("control_index",), "Of mine.")
     task = Pushing(terms=[own], weights={"reward.own": 1.0})
-    _, native = executors(task=task)
+    native = NativeVectorEnv(COUNT, task=task)
+    native.reset(seed=0)
     asked = actions(native, 3)
-    native.step(EVERYONE, asked[0])
+    native.step(asked[0])
     with pytest.raises(ModelError, match=r"(?s)environment 0.*reward\.own"):
-        native.step(EVERYONE, asked[1])
+        native.step(asked[1])
 
 
 def _late(index: Any) -> float:

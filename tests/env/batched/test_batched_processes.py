@@ -1,4 +1,4 @@
-"""Environments in several processes."""
+"""Environments in processes, which Gymnasium's ``AsyncVectorEnv`` runs."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from env_executors import LENGTH, actions, check_alike, check_same, kept, make
+from many_envs import LENGTH, PUSHING, actions, check_alike, check_same, kept, make
 
-from scm_world.env.batched.vector_env import fastest
+from scm_world.env import vector_env
+from scm_world.env.native import NativeVectorEnv
+from scm_world.env.processes import ProcessVectorEnv
 from scm_world.errors import EngineFailure, OutOfBounds, UnknownOption
 from scm_world.work.processes import Worker, cores
 
 
-def test_how_many_processes_there_are_changes_nothing() -> None:
-    """Two or three: bit for bit what one environment after another says."""
+def test_how_many_work_at_the_same_time_changes_nothing() -> None:
+    """One after another, two or three: bit for bit the same."""
     pytest.importorskip("pybullet")
-    options: dict[str, Any] = {"backend": "bullet", "max_episode_length": 3}
-    there = [{"workers": workers} for workers in (2, 3)]
-    executors = [("loop", {}), *(("processes", how) for how in there)]
     said = []
-    for executor, how in executors:
-        envs = make(executor, 3, autoreset_mode="SameStep", **how, **options)
+    for workers in (1, 2, 3):
+        options: dict[str, Any] = {"backend": "bullet", "max_episode_length": 3}
+        envs = make("turns", 3, autoreset_mode="SameStep", workers=workers, **options)
         mine = [envs.reset(seed=1), *(envs.step(action) for action in actions(5, 3))]
         envs.do([None, {"floor_friction": 0.3}, {"tool_block.mass": "B"}])
         said.append([*mine, envs.present(), *(envs.step(action) for action in actions(2, 3, 1))])
@@ -33,115 +33,142 @@ def test_how_many_processes_there_are_changes_nothing() -> None:
         check_same(other, said[0])
 
 
-def test_the_fastest_executor_is_taken() -> None:
+def test_the_fastest_kind_is_taken() -> None:
     """MuJoCo steps them itself; Bullet takes processes if there are several, and several cores."""
-    assert fastest("mujoco", 1, workers=None) == "native"
-    assert fastest("mujoco", 2, workers=2) == "processes"
-    assert fastest("bullet", 2, workers=None) == ("processes" if cores() > 1 else "loop")
-    assert fastest("bullet", 1, workers=None) == "loop"
-    assert fastest("fake", 2, workers=None) == "loop"
-    assert fastest("fake", 2, workers=2) == "processes"
+    pytest.importorskip("pybullet")
+    several = ProcessVectorEnv if cores() > 1 else NativeVectorEnv
+    for backend, number, workers, kind in (
+        ("mujoco", 2, None, NativeVectorEnv),
+        ("fake", 2, None, NativeVectorEnv),
+        ("fake", 2, 2, ProcessVectorEnv),
+        ("bullet", 2, None, several),
+        ("bullet", 2, 1, NativeVectorEnv),
+        ("bullet", 1, None, NativeVectorEnv),
+    ):
+        envs = make("turns", number, backend=backend, workers=workers)
+        assert type(envs) is kind
+        envs.close()
 
 
 def test_a_process_that_is_killed_is_an_error() -> None:
-    """The error says which environments are lost; asking again says it again."""
-    envs = make("processes", 4, workers=2)
+    """The error says which environment is lost; asking again says it again."""
+    envs = make("processes", 2)
     envs.reset(seed=0)
-    worker: Worker = envs.executor._workers[1]
-    os.kill(worker._process.pid, signal.SIGKILL)
-    text = r"environments 2 to 3 are lost: .* exit code -9; make the environments again"
-    for _ in range(2):
+    os.kill(envs._envs.processes[1].pid, signal.SIGKILL)
+    text = r"a process ended: environment 1 .* -9; make the environments again"
+    for ask in (lambda: envs.step(actions(1, 2)[0]), envs.snapshot, envs.present):
         with pytest.raises(EngineFailure, match=text):
-            envs.step(actions(1)[0])
-    with pytest.raises(EngineFailure, match=text):
-        envs.do({0: {"floor_friction": 0.3}})
+            ask()
     envs.close()
 
 
-def test_a_process_that_is_killed_between_calls_is_an_error() -> None:
-    """Whatever it is asked."""
-    envs = make("processes", 1, workers=1)
-    envs.reset(seed=0)
-    worker: Worker = envs.executor._workers[0]
-    os.kill(worker._process.pid, signal.SIGKILL)
-    with pytest.raises(EngineFailure, match="environments 0 to 0 are lost"):
-        envs.snapshot()
-    envs.close()
-
-
-def test_an_interrupted_step_ends_the_executor(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Some environments may have stepped: it cannot go on, and no process stays."""
+def test_an_interrupted_step_ends_the_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some environments may have stepped: they cannot go on, and no process stays."""
 
     def interrupted(*_: Any) -> Any:
         raise KeyboardInterrupt
 
-    envs = make("processes", 1, workers=1)
+    envs = make("processes", 2)
     envs.reset(seed=0)
-    pid = envs.executor._workers[0]._process.pid
+    pids = [process.pid for process in envs._envs.processes]
     with monkeypatch.context() as patched:
-        patched.setattr(Worker, "answer", interrupted)
+        patched.setattr(envs._envs, "step_wait", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            envs.step(actions(1, 1)[0])
-    with pytest.raises(ProcessLookupError):
-        os.kill(pid, 0)
+            envs.step(actions(1, 2)[0])
+    for pid in pids:
+        assert not is_running(pid)
     with pytest.raises(EngineFailure, match="interrupted by KeyboardInterrupt"):
         envs.reset()
 
 
 def test_in_a_process_of_a_pool_no_process_is_started() -> None:
     """One that ends with its parent may have no children."""
-    with Worker(partial(partial, fastest, "bullet", 4, workers=None)) as worker:
-        assert worker.ask("__call__") == "loop"
+    pytest.importorskip("pybullet")
+    with Worker(partial(partial, _kind)) as worker:
+        assert worker.ask("__call__") == "NativeVectorEnv"
+
+
+def _kind() -> str:
+    return type(vector_env(2, task="pushing", backend="bullet")).__name__
 
 
 def test_nothing_is_left_behind() -> None:
     """No process stays, and what was seen can be seen after the end."""
-    envs = make("processes", 3, workers=2, copy=False)
+    envs = make("processes", 2, copy=False)
     observations, _ = envs.reset(seed=0)
-    kept = observations.copy()
-    pids = [worker._process.pid for worker in envs.executor._workers]
+    seen = observations.copy()
+    pids = [process.pid for process in envs._envs.processes]
     envs.close()
-    np.testing.assert_array_equal(observations, kept)
+    np.testing.assert_array_equal(observations, seen)
     for pid in pids:
-        with pytest.raises(ProcessLookupError):
-            os.kill(pid, 0)
+        assert not is_running(pid)
     with pytest.raises(EngineFailure, match="closed; make the environments again"):
-        envs.step(actions(1, 3)[0])
+        envs.step(actions(1, 2)[0])
 
 
-def test_processes_end_with_the_executor_that_nobody_uses() -> None:
+def is_running(pid: int) -> bool:
+    """Return whether there is such a process, and it did not end."""
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_processes_end_with_environments_that_nobody_uses() -> None:
     """Without ``close`` too."""
-    envs = make("processes", 2, workers=1)
-    pid = envs.executor._workers[0]._process.pid
+    envs = make("processes", 2)
+    pids = [process.pid for process in envs._envs.processes]
     del envs
-    with pytest.raises(ProcessLookupError):
-        os.kill(pid, 0)
+    for pid in pids:
+        assert not is_running(pid)
 
 
 def test_what_cannot_be_sent_is_refused() -> None:
     """An argument that cannot be pickled changes nothing, and neither does a wrong one."""
-    with pytest.raises(UnknownOption, match=r"make cannot be"):
-        make("processes", 2, task_options={"weights": lambda: None})
-    envs, twin = kept("processes"), make("loop", max_episode_length=LENGTH)
+    envs, twin = kept("processes"), make("turns", max_episode_length=LENGTH)
     for one in (envs, twin):
         one.reset(seed=0)
     with pytest.raises(UnknownOption, match="argument"):
         envs.do({0: {"floor_friction": 0.3}, 3: {"tool_block.mass": lambda: None}})
-    with pytest.raises(OutOfBounds, match="environment 3"):
+    with pytest.raises(UnknownOption, match="value"):
+        envs.set_attr("remark", lambda: None)
+    with pytest.raises(OutOfBounds, match="environment 3") as refused:
         envs.do({0: {"floor_friction": 0.3}, 3: {"tool_block.mass": -1.0}})
+    assert refused.value.variable == "tool_block.mass"
     check_same(envs.present(), twin.present(), "present")
     check_alike(envs, twin, 3)
 
 
 def test_a_reset_that_one_process_refuses_happens_nowhere() -> None:
     """When episodes begin by themselves, too: the error comes out, and the others go back."""
-    envs, twin = kept("processes"), make("loop", max_episode_length=LENGTH)
+    envs, twin = kept("processes"), make("turns", max_episode_length=LENGTH)
     for one in (envs, twin):
         one.reset(seed=0)
     check_alike(envs, twin, LENGTH)
     envs.set_attr("_start", [{}, {}, {}, {"tool_block.mass": -1.0}])
     with pytest.raises(OutOfBounds, match="environment 3"):
         envs.step(actions(1)[0])
-    assert [snapshot.world.index for snapshot in envs.call("snapshot")] == [LENGTH] * 4
+    assert [snapshot.world.index for snapshot in envs.snapshot()] == [LENGTH] * 4
     envs.set_attr("_start", {})
     check_alike(envs, twin, 3)
+
+
+def test_gymnasiums_own_kind_says_the_same() -> None:
+    """``vectorization_mode="async"`` gives Gymnasium's class as it is."""
+    how = {"context": "forkserver", "shared_memory": True}
+    options: dict[str, Any] = {"backend": "fake", "max_episode_length": 3}
+    import gymnasium
+
+    theirs = gymnasium.make_vec(
+        PUSHING, 2, vectorization_mode="async", vector_kwargs=how, **options
+    )
+    ours = make("turns", 2, **options)
+    check_same(ours.reset(seed=1), theirs.reset(seed=1), "reset")
+    for step, action in enumerate(actions(5, 2)):
+        check_same(ours.step(action), theirs.step(action), f"step {step}")
+    theirs.call("do", {"floor_friction": 0.4})
+    ours.do({"floor_friction": 0.4})
+    action = actions(1, 2, 3)[0]
+    check_same(ours.step(action), theirs.step(action), "after an intervention")
+    theirs.close()

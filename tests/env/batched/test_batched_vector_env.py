@@ -8,7 +8,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from env_executors import (
+from gymnasium.vector import AutoresetMode
+from many_envs import (
+    HERE,
+    KINDS,
     LENGTH,
     PUSHING,
     SIZE,
@@ -20,13 +23,10 @@ from env_executors import (
     make,
     sync,
 )
-from gymnasium.vector import AutoresetMode
 
-from scm_world.env.batched import ScmWorldVectorEnv
-from scm_world.env.batched.vector_env import EXECUTORS
+from scm_world.env import ScmWorldVectorEnv
 from scm_world.errors import ActionError, NotReset, SnapshotMismatch, UnknownOption
 
-HERE = [executor for executor in EXECUTORS if executor != "processes"]
 MODES = [mode.value for mode in AutoresetMode]
 VIEWS: dict[str, dict[str, Any]] = {
     "vector": {},
@@ -40,12 +40,12 @@ VIEWS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("view", VIEWS)
-@pytest.mark.parametrize("executor", HERE)
-def test_it_says_what_gymnasiums_own_kind_says(executor: str, view: str, mode: str) -> None:
+@pytest.mark.parametrize("kind", HERE)
+def test_it_says_what_gymnasiums_own_kind_says(kind: str, view: str, mode: str) -> None:
     """Observations, rewards, flags and infos with their masks: value by value, in every mode."""
     options = {"autoreset_mode": mode, "max_episode_length": 3, **VIEWS[view]}
-    mine = make(executor, **options)
-    other = sync(backend=engine(executor), **options)
+    mine = make(kind, **options)
+    other = sync(backend=engine(kind), **options)
     assert mine.observation_space == other.observation_space
     assert mine.single_observation_space == other.single_observation_space
     assert mine.action_space == other.action_space
@@ -62,10 +62,10 @@ def test_it_says_what_gymnasiums_own_kind_says(executor: str, view: str, mode: s
     other.close()
 
 
-@pytest.mark.parametrize("executor", EXECUTORS)
-def test_some_of_them_are_reset(executor: str) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_some_of_them_are_reset(kind: str) -> None:
     """A reset mask resets those only; the options that are given are not changed."""
-    mine, other = kept(executor), sync(backend=engine(executor), max_episode_length=LENGTH)
+    mine, other = kept(kind), sync(backend=engine(kind), max_episode_length=LENGTH)
     mask = np.array([True, False, False, True])
     for seed in (2, [5, None, 6, 7]):
         for envs in (mine, other):
@@ -78,10 +78,10 @@ def test_some_of_them_are_reset(executor: str) -> None:
         check_alike(mine, other, 8)
 
 
-@pytest.mark.parametrize("executor", EXECUTORS)
-def test_episodes_begin_as_each_one_is_told(executor: str) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_episodes_begin_as_each_one_is_told(kind: str) -> None:
     """Interventions and numbers of episodes are for all, in a list, or by index."""
-    envs, other = kept(executor), sync(backend=engine(executor))
+    envs, other = kept(kind), sync(backend=engine(kind))
     wishes: list[Any] = [{"floor_friction": 0.3}, None, {"tool_block": {"mass": "A"}}, None]
     numbers = {0: 4, 3: 2}
     found = envs.reset(seed=1, options={"do": wishes, "episode": numbers})
@@ -111,10 +111,10 @@ def test_observations_are_copies_unless_they_are_not() -> None:
             assert not np.array_equal(first, kept)
 
 
-@pytest.mark.parametrize("executor", EXECUTORS)
-def test_members_can_be_called(executor: str) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_members_can_be_called(kind: str) -> None:
     """Methods, attributes, generators and pictures, as with Gymnasium's own kind."""
-    envs, other = kept(executor), sync(backend=engine(executor), render_mode="rgb_array")
+    envs, other = kept(kind), sync(backend=engine(kind), render_mode="rgb_array")
     envs.reset(seed=7)
     other.reset(seed=7)
     assert envs.np_random_seed == other.np_random_seed == (7, 8, 9, 10)
@@ -135,10 +135,10 @@ def test_members_can_be_called(executor: str) -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2, 7])
-@pytest.mark.parametrize("executor", HERE)
-def test_how_many_there_are_changes_nothing(executor: str, n: int) -> None:
+@pytest.mark.parametrize("kind", HERE)
+def test_how_many_there_are_changes_nothing(kind: str, n: int) -> None:
     """The first environment does the same, whoever is beside it."""
-    envs, alone = make(executor, n, max_episode_length=3), make(executor, 1, max_episode_length=3)
+    envs, alone = make(kind, n, max_episode_length=3), make(kind, 1, max_episode_length=3)
     first, one = envs.reset(seed=5), alone.reset(seed=5)
     np.testing.assert_array_equal(first[0][0], one[0][0])
     for action in actions(5, n):
@@ -155,7 +155,7 @@ def test_gymnasium_makes_it() -> None:
     envs = gymnasium.make_vec(PUSHING, num_envs=2, backend="fake")
     assert isinstance(envs, ScmWorldVectorEnv)
     assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-    assert repr(envs) == f"ScmWorldVectorEnv({PUSHING}, num_envs=2)"
+    assert repr(envs) == f"NativeVectorEnv({PUSHING}, num_envs=2)"
     assert isinstance(gymnasium.make_vec(envs.spec), ScmWorldVectorEnv)
     assert not isinstance(sync(), ScmWorldVectorEnv)
     assert gymnasium.make(PUSHING, backend="fake").reset(seed=0)[0].shape == (56,)
@@ -164,12 +164,11 @@ def test_gymnasium_makes_it() -> None:
 def test_what_cannot_be_made_is_refused() -> None:
     """Options that do not exist, or do not go together."""
     wrong: tuple[tuple[dict[str, Any], str], ...] = (
-        ({"executor": "horde"}, "loop"),
         ({"autoreset_mode": "Never"}, "NextStep"),
         ({"num_envs": 0}, "whole number from 1"),
-        ({"executor": "loop", "workers": 2}, "workers"),
-        ({"executor": "loop", "threads": 2}, "threads"),
-        ({"executor": "processes", "workers": 0}, "workers"),
+        ({"threads": 2, "workers": 2}, "threads"),
+        ({"threads": 0}, "threads"),
+        ({"workers": 0}, "workers"),
     )
     for options, match in wrong:
         with pytest.raises(UnknownOption, match=match):

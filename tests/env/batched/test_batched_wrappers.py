@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from env_executors import actions, check_same, make, sync
 from gymnasium.wrappers import vector
+from many_envs import actions, check_same, make, sync
 
 LOW, HIGH = np.zeros(56, np.float32), np.ones(56, np.float32)
 WRAPPERS: dict[str, Callable[[Any], Any]] = {

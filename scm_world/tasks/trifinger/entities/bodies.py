@@ -9,10 +9,15 @@ from typing import Any
 import numpy as np
 
 from scm_world._types import Floats, Value
-from scm_world.geometry import canonical, quaternion_product
 from scm_world.geometry.coordinates import from_cylindrical, to_cylindrical
 from scm_world.geometry.hulls import Hull
-from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix, to_rotation_vector
+from scm_world.geometry.rotations import (
+    canonical,
+    from_rotation_vector,
+    quaternion_product,
+    rotation_matrix,
+    to_rotation_vector,
+)
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.catalogue import IDENTITY, ZERO, Causes

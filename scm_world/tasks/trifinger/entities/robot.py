@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import Floats, Value, Values
-from scm_world.geometry.scalars import scalar
+from scm_world.geometry.numbers import scalar
 from scm_world.graph import NoiseKey
 from scm_world.tasks.composition import Commands, Entity
 from scm_world.tasks.trifinger import catalogue as numbers

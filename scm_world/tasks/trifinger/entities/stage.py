@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from scm_world.geometry import from_rotation_vector, to_rotation_vector
+from scm_world.geometry.rotations import from_rotation_vector, to_rotation_vector
 from scm_world.models import Light
 from scm_world.models.camera import Camera
 from scm_world.tasks.composition import Entity

@@ -1,13 +1,33 @@
-"""Numbers brought into their range, in compiled loops."""
+"""Numbers in compiled code: read, brought into their range, gathered."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-from numba import njit
+from numba import njit, types
+from numba.extending import overload
 
 from scm_world._types import Floats, Integers
+
+
+def scalar(value: Any) -> float:
+    """Return a number as a float, also one that comes as an array of shape ().
+
+    Compiled code may call it, where ``float`` refuses arrays.
+    """
+    return float(value)
+
+
+@overload(scalar)
+def _scalar(value: Any) -> Any:
+    def of_array(value: Any) -> Any:
+        return float(value[()])
+
+    def of_number(value: Any) -> Any:
+        return float(value)
+
+    return of_array if isinstance(value, types.Array) else of_number
 
 
 @njit(cache=True)
@@ -36,15 +56,10 @@ def scaled_clip_kernel(
 def scale_rows(
     matrix: Floats, rows: Integers, sources: Integers, shifts: Floats, scale: Floats, out: Any
 ) -> None:
-    """Gather numbers of some rows, saturate them at their bounds, and scale them.
+    """Gather numbers of some rows, saturate them at their bounds, and scale them into 32 bits.
 
-    Args:
-        matrix: The matrix, shape (n, w).
-        rows: Which are written, shape (m,).
-        sources: The column of each number, shape (k,).
-        shifts: Added to the numbers before anything else where not 0, shape (k,).
-        scale: Lower bounds, upper bounds, gains and offsets, shape (4, k).
-        out: Where they are written, shape (n, k), 32-bit.
+    ``sources`` has the column of each number, ``shifts`` what is added to it first, ``scale`` the
+    lower and upper bounds, gains and offsets, shape (4, k).
     """
     for row in rows:
         for j in range(sources.size):

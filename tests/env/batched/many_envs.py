@@ -15,22 +15,32 @@ LENGTH = 5  # of episodes of those that are kept
 SIZE = 4
 
 
-def make(executor: str | None = "loop", n: int = SIZE, id_: str = PUSHING, **options: Any) -> Any:
-    """Make many environments, of the fake backend unless it is said."""
-    options.setdefault("backend", engine(executor))
-    return gymnasium.make_vec(id_, n, executor=executor, **options)
+KINDS: dict[str, dict[str, Any]] = {
+    "native": {"backend": "mujoco", "threads": 2},
+    "turns": {"backend": "fake"},
+    "processes": {"backend": "fake", "workers": 2},
+}
+"""All kinds, each with the quickest backend that it can have."""
+
+HERE = ("native", "turns")
 
 
-def engine(executor: str | None) -> str:
-    """Name the quickest backend of an executor."""
-    return "mujoco" if executor == "native" else "fake"
+def make(kind: str = "turns", n: int = SIZE, id_: str = PUSHING, **options: Any) -> Any:
+    """Make many environments of a kind."""
+    return gymnasium.make_vec(id_, n, **{**KINDS[kind], **options})
+
+
+def engine(kind: str) -> str:
+    """Name the backend of a kind."""
+    backend: str = KINDS[kind]["backend"]
+    return backend
 
 
 @functools.cache
-def kept(executor: str) -> Any:
+def kept(kind: str, backend: str | None = None) -> Any:
     """Make some that are not closed; processes take a second to start, so tests share them."""
-    workers = {"workers": 2} if executor == "processes" else {}
-    return make(executor, max_episode_length=LENGTH, render_mode="rgb_array", **workers)
+    given = {"backend": backend or engine(kind), "render_mode": "rgb_array"}
+    return make(kind, max_episode_length=LENGTH, **given)
 
 
 def sync(

@@ -1,0 +1,192 @@
+"""Comparison of two backends: sign and size of the effect of each parameter."""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from typing import Literal, final
+
+import numpy as np
+
+from scm_world._arguments import whole_number
+from scm_world._types import Floats, Values
+from scm_world.errors import EngineFailure, InterventionError
+from scm_world.queries.experiments.effects import FACTOR, RESOLUTION
+from scm_world.queries.experiments.paired import another, engine_decided, settable
+from scm_world.queries.experiments.probes import ProbeGenerator
+from scm_world.queries.experiments.probes import probes as probe_states
+from scm_world.queries.progress import Progress
+from scm_world.queries.twins import twins_of
+from scm_world.queries.verification import Outcome, Report, Row, outcome, written
+from scm_world.variables import Noise
+from scm_world.world import Simulation
+
+SAME = 0.95
+"""Share of the clear effects whose sign must be the same."""
+
+SCALE = 0.1
+"""How far towards another value a parameter is moved, as a fraction."""
+
+
+@final
+class ParameterEffects(Report):
+    """The effects of one parameter that are clear on both backends.
+
+    Attributes:
+        parameter: Its name.
+        clear: How many effects are compared, one for each state variable and probe state.
+        same: How many of them have the same sign on both.
+        ratio: Median size on the second backend by that on the first.
+        low: Quantile of 10 % of this ratio.
+        high: Quantile of 90 %.
+    """
+
+    parameter: str
+    clear: int
+    same: int
+    ratio: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        size = f"{self.ratio:.2f} (80 % within {self.low:.2f} to {self.high:.2f})"
+        return f"{self.parameter}: {self.same} of {self.clear} with the same sign, size {size}"
+
+
+@final
+class Comparison(Report):
+    """How the effects of parameters on two backends agree.
+
+    Attributes:
+        format: Of the file.
+        task: Name of the task.
+        backends: Their names.
+        seed: Of states and values.
+        probes: In how many states effects were compared.
+        effects: Of each parameter with a clear effect.
+        seconds: Wall time.
+    """
+
+    format: Literal["scm_world/comparison/1"] = "scm_world/comparison/1"
+    task: str
+    backends: tuple[str, str]
+    seed: int
+    probes: int
+    effects: tuple[ParameterEffects, ...]
+    seconds: float
+
+    @property
+    def share(self) -> float:
+        """The share of the clear effects with the same sign; 1 if there is none."""
+        clear = sum(one.clear for one in self.effects)
+        return sum(one.same for one in self.effects) / clear if clear else 1.0
+
+    @property
+    def outcome(self) -> Outcome:
+        """``"confirmed"`` where 95 % of the clear effects have one sign, else ``"refuted"``."""
+        return outcome(wrong=self.share < SAME, unseen=not self.effects)
+
+    @property
+    def title(self) -> str:
+        """The first line of the report."""
+        return f"Comparison of {' and '.join(self.backends)} on {self.task}: {self.outcome}"
+
+    def rows(self) -> tuple[Row, ...]:
+        """List the numbers, what they mean, and whether they are good."""
+        return (
+            ("probe states, seed", f"{self.probes}, {self.seed}", None),
+            ("clear effects with the same sign", f"{100 * self.share:.1f} %", self.share >= SAME),
+            *((f"effects on {self.backends[1]}", str(one), None) for one in self.effects),
+            ("seconds", f"{self.seconds:.1f}", None),
+        )
+
+    def __str__(self) -> str:
+        return written(self.title, self.rows())
+
+
+def compare_backends(
+    world: Simulation,
+    backend: str,
+    *,
+    probes: int = 12,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Change each parameter alike on two backends; see ``World.compare``."""
+    whole_number("number of probes", probes, least=1)
+    started, twins = time.perf_counter(), twins_of(world)
+    other = Simulation(copy.copy(twins.task), **{**twins.options, "backend": backend})
+    found: dict[str, list[tuple[float, float]]] = {}
+    done = 0
+    with twins.twin() as one:
+        pair = one, other
+        for number, probe in enumerate(probe_states(one, probes, seed)):
+            one.restore(probe.snapshot)
+            values = {name: one[name] for name in settable(one.model)}
+            try:
+                for name, answers in _answers(pair, values, probe.action, number, seed):
+                    found.setdefault(name, []).extend(answers)
+                done += 1
+            except (InterventionError, EngineFailure):  # a state that one of them cannot be in
+                pass
+            if progress is not None:
+                progress(number + 1, probes)
+    other.close()
+    effects = []
+    for name, answers in sorted(found.items()):
+        first, second = np.array(answers).T
+        low, ratio, high = np.quantile(np.abs(second / first), (0.1, 0.5, 0.9)).tolist()
+        same = int((first * second > 0.0).sum())
+        counts = {"clear": len(answers), "same": same, "ratio": ratio, "low": low, "high": high}
+        effects.append(ParameterEffects(parameter=name, **counts))
+    return Comparison(
+        task=world.task.name,
+        backends=(world.backend.name, backend),
+        seed=seed,
+        probes=done,
+        effects=tuple(effects),
+        seconds=time.perf_counter() - started,
+    )
+
+
+def _answers(
+    pair: tuple[Simulation, Simulation], values: Values, action: Floats, number: int, seed: int
+) -> Iterator[tuple[str, list[tuple[float, float]]]]:
+    """Yield the clear effects of each parameter in one state: of both, the same component.
+
+    Two backends differ after one step even if nothing is changed, since contacts are solved
+    differently. An effect is clear if it is ten times as large as this difference on both.
+    """
+    model, rng = pair[0].model, ProbeGenerator(Noise(seed), number)
+    states = [name for name in engine_decided(model) if name in pair[1].model]
+
+    def ends(change: Mapping[str, object]) -> Floats:
+        """Take a step from the same numbers on both, shape (2, n)."""
+        found = []
+        for world in pair:
+            world.reset(seed=seed)
+            world.do({**values, **change})
+            world.step(action)
+            found.append(np.concatenate([np.ravel(world[name]) for name in states]))
+        return np.array(found)
+
+    base = ends({})
+    least = np.maximum(FACTOR * np.abs(base[0] - base[1]), RESOLUTION)
+    starts = np.cumsum([0, *(np.size(pair[0][name]) for name in states)])
+    for name in values:
+        if model.declared(name).role != "parameter":
+            continue
+        value = another(model, name, values, rng, "compared", SCALE)
+        if value is None:
+            continue
+        try:
+            moved = ends({name: value}) - base
+        except InterventionError:
+            continue
+        clear = np.abs(moved).min(axis=0) > least
+        parts = (range(first, last) for first, last in pairwise(starts))
+        best = [max(part, key=lambda at: np.abs(moved[:, at]).sum()) for part in parts]
+        if found := [(moved[0, at], moved[1, at]) for at in best if clear[at]]:
+            yield name, found

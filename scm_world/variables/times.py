@@ -1,0 +1,171 @@
+"""When an intervention takes place: at a step, in a window, again and again, or on an event."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Any, ClassVar, Literal, final
+
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+
+from scm_world._arguments import real_number, whole_number
+from scm_world.errors import UnknownOption
+from scm_world.variables.spaces import Frozen
+
+
+@final
+class Contact(Frozen):
+    """The event that two bodies touch: in the last physics step, with a force.
+
+    Attributes:
+        first: Name of a body, or the beginning of one: ``"robot"`` is any link.
+        second: Likewise.
+    """
+
+    kind: Literal["contact"] = "contact"
+    first: str
+    second: str
+
+    def __init__(self, first: str, second: str, **fields: Any) -> None:
+        for body in (first, second):
+            if not isinstance(body, str):
+                raise UnknownOption("body", body, ("the name of a body, or its beginning",))
+        super().__init__(first=first, second=second, **fields)
+
+    @property
+    def bodies(self) -> tuple[str, str]:
+        """Both names."""
+        return self.first, self.second
+
+
+@final
+class Reaches(Frozen):
+    """The event that a number lies above or below a threshold.
+
+    Attributes:
+        name: Name of the variable.
+        above: The event occurs where the variable is greater.
+        below: The event occurs where it is smaller.
+        component: Index of the number, where the variable has several.
+    """
+
+    kind: Literal["reaches"] = "reaches"
+    name: str
+    above: float | None = None
+    below: float | None = None
+    component: int = 0
+
+    def __init__(self, name: str, **fields: Any) -> None:
+        given = [fields.get("above"), fields.get("below")]
+        if (given[0] is None) == (given[1] is None):
+            raise UnknownOption("Reaches", fields, ("above=…", "below=…"))
+        number: Any = given[0] if given[1] is None else given[1]
+        real_number("threshold of Reaches", number)
+        whole_number("component of Reaches", fields.get("component", 0), least=0)
+        super().__init__(name=name, **fields)
+
+
+Event = Annotated[Contact | Reaches, Field(discriminator="kind")]
+
+
+class _Short(Frozen):
+    """A value whose representation and file leave out fields without a value."""
+
+    RARE: ClassVar[tuple[str, ...]] = ()
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """List the fields that are shown, rare ones at the end."""
+        found = [*super().__repr_args__()]
+        yield from (pair for pair in found if pair[0] not in self.RARE)
+        yield from ((n, value) for n, value in found if n in self.RARE and value is not None)
+
+    @model_serializer(mode="wrap")
+    def _shorter(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        found = handler(self)
+        return {n: value for n, value in found.items() if n not in self.RARE or value is not None}
+
+
+@final
+class Time(_Short):
+    """The time of an intervention in an episode, counted in control steps.
+
+    Attributes:
+        at: The step at which it takes place; with ``every``, the first one.
+        during: First step of a window, and the step at which it ends; None is the end of the
+            episode. A state is put there again at every step of the window: its mechanism is cut
+            for as long. A parameter is set once and has its own mechanism again at the end.
+        every: Number of steps from one time to the next.
+        when: It takes place at the first step, after the plan began, at which this holds.
+    """
+
+    RARE: ClassVar[tuple[str, ...]] = ("at", "during", "every", "when")
+
+    at: int | None = None
+    during: tuple[int, int | None] | None = None
+    every: int | None = None
+    when: Event | None = None
+
+    def __init__(self, **fields: Any) -> None:
+        given = {name: value for name, value in fields.items() if value is not None}
+        if {*given} not in ({"at"}, {"during"}, {"every"}, {"at", "every"}, {"when"}):
+            allowed = ("one of at=, during=, every=, when=", "at= and every=")
+            raise UnknownOption("time of an intervention", given, allowed)
+        for name, least in (("at", 0), ("every", 1)):
+            if name in given:
+                given[name] = whole_number(name, given[name], least=least)
+        if "during" in given:
+            given["during"] = _window(given["during"])
+        if "when" in given and not isinstance(given["when"], Contact | Reaches | dict):
+            allowed = ("Contact(first, second)", "Reaches(name, above=…)")
+            raise UnknownOption("event", given["when"], allowed)
+        super().__init__(**given)
+
+    def __str__(self) -> str:
+        if self.when is not None:
+            return f"when {self.when!r}"
+        if self.during is not None:
+            start, stop = self.during
+            return f"from {start} to {'the end' if stop is None else stop}"
+        again = "" if self.every is None else f"every {self.every} steps from "
+        return f"{again or 'at '}{self.at or 0}"
+
+    def holds(self, step: int) -> bool:
+        """Tell whether this is a window, and a control step lies in it."""
+        start, stop = self.during or (step + 1, None)
+        return start <= step and (stop is None or step < stop)
+
+    @property
+    def start(self) -> int | None:
+        """The first step at which it takes place; None of an event."""
+        if self.when is not None:
+            return None
+        return self.during[0] if self.during is not None else self.at or 0
+
+
+def _window(given: Any) -> tuple[int, int | None]:
+    try:
+        start, stop = given
+    except (TypeError, ValueError):
+        raise UnknownOption("during", given, ("(start, stop)", "(start, None)")) from None
+    start = whole_number("start of a window", start, least=0)
+    end = None if stop is None else whole_number("end of a window", stop, least=start + 1)
+    return start, end
+
+
+_TIMES = frozenset(Time.RARE)
+
+
+class Timed(_Short):
+    """An intervention, and when it takes place in the episode of a plan.
+
+    Attributes:
+        time: At the beginning if None; given as ``at=``, ``during=``, ``every=`` or ``when=``.
+    """
+
+    RARE: ClassVar[tuple[str, ...]] = ("time",)
+
+    time: Time | None = None
+
+    def __init__(self, **fields: Any) -> None:
+        if not _TIMES.isdisjoint(fields):
+            fields["time"] = Time(**{n: fields.pop(n) for n in Time.RARE if n in fields})
+        super().__init__(**fields)
