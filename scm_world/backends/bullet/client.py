@@ -181,7 +181,7 @@ class Client:
         self.twin.reset()  # what the last step left there must not matter
         self.twin.place(first.state)
         for part in self._parts:
-            part.put(self.twin.data)
+            part.put()
         for place in self.geoms.values():  # pairs decide what touches
             self.engine.setCollisionFilterGroupMask(*place, 0, 0)
         for parameters, command, substeps in world.steps:
@@ -217,7 +217,7 @@ class Client:
             body, link, other, its = pair
             self.engine.setCollisionFilterPair(body, other, link, its, int(pair in enabled))
         self._enabled = enabled
-        self._parts = parts(self.engine, mj, self.joints, range(mj.ntree))
+        self._parts = parts(self.engine, self.twin.data, self.joints, range(mj.ntree))
         self._scalar = [joint for joint in self.joints if mj.jnt_type[joint] not in (FREE, BALL)]
         self._in_force, self._trees, self._driven = [], set[int](), list[JointSet]()
         self._set_all()
@@ -265,8 +265,12 @@ class Client:
         moved = self._moved()
         if self._trees != moved:
             self._trees = moved
-            self._driven = parts(self.engine, self.twin.model, self.joints, moved)
+            self._driven = parts(self.engine, self.twin.data, self.joints, moved)
+        mj, kinds, own = self.twin.model, mujoco.mjtIntegrator, self.twin.model.opt.integrator
+        implicit = kinds.mjINT_IMPLICITFAST if own == kinds.mjINT_RK4 else own
+        self._integrator = kinds.mjINT_EULER if custom(mj, "bullet_explicit_servos") else implicit
         self._local = self._needs_joints_alone()
+        self._sprung = bool(mj.jnt_stiffness.any() or mj.jnt_stiffnesspoly.any())
 
     def _settings(
         self,
@@ -331,8 +335,9 @@ class Client:
         """Return whether forces follow from coordinates of joints, and no damper is implicit."""
         mj = self.twin.model
         dampers = (mj.dof_damping, mj.dof_dampingpoly, mj.actuator_damping, mj.actuator_dampingpoly)
-        return not (
-            mj.na
+        return bool(self._driven) and not (
+            self._integrator != mujoco.mjtIntegrator.mjINT_EULER
+            or mj.na
             or mj.ntendon
             or mj.nplugin
             or mj.opt.density
@@ -356,45 +361,41 @@ class Client:
         are f, which takes no pass over all bodies where it follows from the joints alone.
         """
         self.twin.forget()
-        mj, data, options = self.twin.model, self.twin.data, self.twin.model.opt
-        asked = options.disableflags, options.integrator
-        options.disableflags |= SMOOTH
-        if options.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-            options.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        if custom(mj, "bullet_explicit_servos"):
-            options.integrator = mujoco.mjtIntegrator.mjINT_EULER
         self.twin.command[:] = command
-        explicit = options.integrator == mujoco.mjtIntegrator.mjINT_EULER
-        direct = explicit and self._local
-        (speeds, rates, forces), step = np.empty((3, mj.nv)), options.timestep
-        velocities, bias = data.qvel, data.qfrc_bias
-        passive, actuators = data.qfrc_passive, data.qfrc_actuator
-        advance = self.engine.stepSimulation
+        mj, data, driven, local = self.twin.model, self.twin.data, self._driven, self._local
+        (speeds, rates, forces), velocities, options = np.empty((3, mj.nv)), data.qvel, mj.opt
+        advance, asked = self.engine.stepSimulation, (options.disableflags, options.integrator)
+        lengths, motion = mujoco.mj_transmission, mujoco.mj_fwdVelocity
+        servos, actuators, sprung = mujoco.mj_fwdActuation, data.qfrc_actuator, self._sprung
+        if not local:
+            options.disableflags, options.integrator = asked[0] | SMOOTH, self._integrator
+        elif not sprung:
+            forces = actuators
         for _ in range(substeps):
-            if self._driven:
-                for part in self._driven:
-                    part.take(data)
-                if direct:
-                    mujoco.mj_transmission(mj, data)
-                    mujoco.mj_fwdVelocity(mj, data)
-                    mujoco.mj_fwdActuation(mj, data)
-                    np.add(passive, actuators, out=forces)
-                else:
-                    speeds[:] = velocities
-                    mujoco.mj_step(mj, data)
-                    np.subtract(velocities, speeds, out=rates)
-                    rates /= step
-                    mujoco.mj_mulM(mj, data, forces, rates)
-                    forces += bias
-                for part in self._driven:
-                    part.drive(data, forces)
+            for part in driven:
+                part.take()
+            if local:
+                lengths(mj, data)
+                motion(mj, data)
+                servos(mj, data)
+                if sprung:
+                    np.add(data.qfrc_passive, actuators, out=forces)
+            elif driven:
+                speeds[:] = velocities
+                mujoco.mj_step(mj, data)
+                np.subtract(velocities, speeds, out=rates)
+                rates /= options.timestep
+                mujoco.mj_mulM(mj, data, forces, rates)
+                forces += data.qfrc_bias
+            for part in driven:
+                part.drive(forces)
             advance()
         options.disableflags, options.integrator = asked
 
     def read(self) -> Floats:
         """Ask the engine for the state."""
         for part in self._parts:
-            part.take(self.twin.data)
+            part.take()
         vector = np.empty(self.twin.structure.layout.size)
         self.twin.read(vector)
         return vector

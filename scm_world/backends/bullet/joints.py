@@ -18,35 +18,35 @@ from scm_world.backends.bullet.build import BALL, FREE, UNTURNED, Handle, compos
 class Scalars:
     """The hinges and slides of a multibody, in one call of the engine."""
 
-    def __init__(self, engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle]) -> None:
-        joints, self._places = list(places), list(places.values())
+    def __init__(self, engine: Any, data: mujoco.MjData, places: Mapping[int, Handle]) -> None:
+        joints, self._places, mj = list(places), list(places.values()), data.model
         multibody, links = self._places[0][0], [link for _, link in self._places]
         self._ask = partial(engine.getJointStates, multibody, links)
         self._tell = partial(
             engine.setJointMotorControlArray, multibody, links, engine.TORQUE_CONTROL
         )
-        self._put = engine.resetJointState
+        self._put, self._qpos, self._qvel = engine.resetJointState, data.qpos, data.qvel
         self._positions = _run(mj.jnt_qposadr[joints])
         self._velocities = _run(mj.jnt_dofadr[joints])
         self._references = mj.qpos0[self._positions]
         self._shifted = bool(self._references.any())
 
-    def put(self, data: mujoco.MjData) -> None:
+    def put(self) -> None:
         """Set the state in the engine to that of MuJoCo."""
-        values = (data.qpos[self._positions] - self._references).tolist()
-        speeds = data.qvel[self._velocities].tolist()
+        values = (self._qpos[self._positions] - self._references).tolist()
+        speeds = self._qvel[self._velocities].tolist()
         for place, value, speed in zip(self._places, values, speeds, strict=True):
             self._put(*place, value, speed)
 
-    def take(self, data: mujoco.MjData) -> None:
+    def take(self) -> None:
         """Set the state of MuJoCo to that in the engine."""
         rows = self._ask()
-        data.qpos[self._positions] = [row[0] for row in rows]
+        self._qpos[self._positions] = [row[0] for row in rows]
         if self._shifted:
-            data.qpos[self._positions] += self._references
-        data.qvel[self._velocities] = [row[1] for row in rows]
+            self._qpos[self._positions] += self._references
+        self._qvel[self._velocities] = [row[1] for row in rows]
 
-    def drive(self, data: mujoco.MjData, forces: Floats) -> None:
+    def drive(self, forces: Floats) -> None:
         """Apply forces along the joints in the next step; MuJoCo has the positions before it."""
         self._tell(forces=forces[self._velocities].tolist())
 
@@ -62,28 +62,29 @@ def _run(numbers: Integers) -> Any:
 class Ball:
     """A ball joint. The engine has it about the principal axes of the body."""
 
-    def __init__(self, engine: Any, mj: mujoco.MjModel, joint: int, place: Handle) -> None:
-        self._engine, self._place = engine, place
+    def __init__(self, engine: Any, data: mujoco.MjData, joint: int, place: Handle) -> None:
+        self._engine, self._data, self._place, mj = engine, data, place, data.model
         q, v, body = (int(a[joint]) for a in (mj.jnt_qposadr, mj.jnt_dofadr, mj.jnt_bodyid))
         self._turn, self._spin = slice(q, q + 4), slice(v, v + 3)
         last = mj.body_jntadr[body] + mj.body_jntnum[body] - 1 == joint  # others have no mass
         self._axes = mj.body_iquat[body].copy() if last else UNTURNED
         self._back = np.array([1.0, -1.0, -1.0, -1.0]) * self._axes
 
-    def put(self, data: mujoco.MjData) -> None:
+    def put(self) -> None:
         """Set the state in the engine to that of MuJoCo."""
+        data = self._data
         turn = composed(composed(self._back, data.qpos[self._turn]), self._axes)
         spin = rotated(self._back, data.qvel[self._spin]).tolist()
         self._engine.resetJointStateMultiDof(*self._place, plain(turn), spin)
 
-    def take(self, data: mujoco.MjData) -> None:
+    def take(self) -> None:
         """Set the state of MuJoCo to that in the engine."""
         (x, y, z, w), spin, *_ = self._engine.getJointStateMultiDof(*self._place)
         turn = composed(composed(self._axes, np.array([w, x, y, z])), self._back)
-        data.qpos[self._turn] = turn
-        data.qvel[self._spin] = rotated(self._axes, np.array(spin))
+        self._data.qpos[self._turn] = turn
+        self._data.qvel[self._spin] = rotated(self._axes, np.array(spin))
 
-    def drive(self, data: mujoco.MjData, forces: Floats) -> None:
+    def drive(self, forces: Floats) -> None:
         """Apply a torque, which is given in the frame of the body."""
         torque, mode = rotated(self._back, forces[self._spin]), self._engine.TORQUE_CONTROL
         self._engine.setJointMotorControlMultiDof(*self._place, mode, force=torque.tolist())
@@ -96,36 +97,37 @@ class Free:
     Their coordinates in MuJoCo are positions of their frames.
     """
 
-    def __init__(self, engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle]) -> None:
-        self._engine, joints = engine, list(places)
+    def __init__(self, engine: Any, data: mujoco.MjData, places: Mapping[int, Handle]) -> None:
+        self._engine, self._data, joints, mj = engine, data, list(places), data.model
         self._starts = np.stack([mj.jnt_qposadr[joints], mj.jnt_dofadr[joints]], axis=1)
         self._multibodies = [multibody for multibody, _ in places.values()]
         self._bodies = mj.jnt_bodyid[joints].tolist()
         self._centers, self._axes = mj.body_ipos[self._bodies], mj.body_iquat[self._bodies]
         self._pose, self._velocity = engine.getBasePositionAndOrientation, engine.getBaseVelocity
 
-    def put(self, data: mujoco.MjData) -> None:
+    def put(self) -> None:
         """Set the state in the engine to that of MuJoCo."""
+        data = self._data
         rows = np.empty((len(self._multibodies), 13))
         _to_centers(data.qpos, data.qvel, self._starts, self._centers, self._axes, rows)
         for body, row in zip(self._multibodies, rows.tolist(), strict=True):
             self._engine.resetBasePositionAndOrientation(body, row[:3], row[3:7])
             self._engine.resetBaseVelocity(body, row[7:10], row[10:])
 
-    def take(self, data: mujoco.MjData) -> None:
+    def take(self) -> None:
         """Set the state of MuJoCo to that in the engine, with quaternions whose w >= 0.
 
         The engine keeps a matrix: which of two quaternions it makes of it has no meaning.
         """
-        rows = []
+        rows, data = [], self._data
         for body in self._multibodies:
             (position, turn), (speed, spin) = self._pose(body), self._velocity(body)
             rows.append(position + turn + speed + spin)
         _from_centers(np.array(rows), self._starts, self._centers, self._axes, data.qpos, data.qvel)
 
-    def drive(self, data: mujoco.MjData, forces: Floats) -> None:
+    def drive(self, forces: Floats) -> None:
         """Apply forces at the origins of the bodies, and torques that are given in their frames."""
-        engine, world = self._engine, self._engine.WORLD_FRAME
+        engine, data, world = self._engine, self._data, self._engine.WORLD_FRAME
         for multibody, body, v in zip(
             self._multibodies, self._bodies, self._starts[:, 1].tolist(), strict=True
         ):
@@ -139,18 +141,22 @@ JointSet = Scalars | Ball | Free
 
 
 def parts(
-    engine: Any, mj: mujoco.MjModel, places: Mapping[int, Handle], trees: Collection[int]
+    engine: Any, data: mujoco.MjData, places: Mapping[int, Handle], trees: Collection[int]
 ) -> list[JointSet]:
-    """List what can move in some kinematic trees, as few parts as there can be."""
+    """List what can move in some kinematic trees, as few parts as there can be.
+
+    The arrays of the data are written and read as long as the parts are in use.
+    """
+    mj = data.model
     own = [j for j in sorted(places) if mj.body_treeid[mj.jnt_bodyid[j]] in trees]
     together: dict[int, dict[int, Handle]] = {}  # by multibody; free bodies by -1
     for joint in own:
         if mj.jnt_type[joint] != BALL:
             key = -1 if mj.jnt_type[joint] == FREE else places[joint][0]
             together.setdefault(key, {})[joint] = places[joint]
-    balls = [Ball(engine, mj, j, places[j]) for j in own if mj.jnt_type[j] == BALL]
+    balls = [Ball(engine, data, j, places[j]) for j in own if mj.jnt_type[j] == BALL]
     kinds = ((Free if key < 0 else Scalars, joints) for key, joints in together.items())
-    return [*balls, *(kind(engine, mj, joints) for kind, joints in kinds)]
+    return [*balls, *(kind(engine, data, joints) for kind, joints in kinds)]
 
 
 @njit(cache=True)
