@@ -217,3 +217,14 @@ def test_no_effect_by_contact_is_without_its_contact(engine: str) -> None:
             world.restore(after)
     assert {when for _, when in seen} == {None, "contact"}
     assert len(seen) > 100
+
+
+def test_parameters_of_the_world_act_where_anything_touches() -> None:
+    """A block on the floor bounces with the restitution, which no body has; in the air nothing."""
+    edge = ("restitution", "tool_block.linear_velocity")
+    with World("pushing") as world:
+        world.reset(seed=0)
+        world.step(world["joint_positions"])
+        assert world.local_graph(world["joint_positions"]).has_edge(*edge)
+        world.do({"tool_block.cartesian_position": [0.0, 0.0, 0.2]})
+        assert not world.local_graph(world["joint_positions"]).has_edge(*edge)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scm_world.env import ScmWorldEnv, ScmWorldVectorEnv
+from scm_world.env import ScmWorldEnv, vector_env
 from scm_world.errors import Infeasible, InterventionError, ModelError, UnknownOption
 from scm_world.evaluation import evaluate
 from scm_world.geometry.rotations import rotation_matrix
@@ -202,7 +202,7 @@ def test_a_task_declares_its_own_success(backend: str) -> None:
         assert (world["success"], world["fractional_success"]) == (1, 1.0)
         assert world.model.parents("fractional_success") == (SPIN,)
         world.close()
-    envs = ScmWorldVectorEnv(2, task=Spinning(), backend=backend)
+    envs = vector_env(2, task=Spinning(), backend=backend)
     envs.reset(seed=0)
     envs.do({1: {SPIN: [0.0, 0.0, 30.0]}})
     infos = envs.step(np.zeros((2, 9)))[-1]

@@ -263,8 +263,8 @@ class BlockWorld(Composition):
         return (*(f"robot_finger_{finger}" for finger in FINGERS), *self.blocks)
 
     def shaped(self) -> Mapping[str, str]:
-        """Map parameters to the body that they are a property of."""
-        bodies = self.touched()
+        """Map parameters to the body that they are a property of; those of the world have none."""
+        bodies = {*self.touched()} - {"world"}
         return {name: body for name, (body, _) in self.parameters().items() if body in bodies}
 
     def looks(self, values: Values) -> tuple[tuple[GoalRegion, ...], Light]:
