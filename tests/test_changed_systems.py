@@ -117,6 +117,12 @@ def test_what_is_done_counts(tmp_path: Path) -> None:
         call(2.0)
 
 
+@pytest.fixture(autouse=True)
+def _modules_are_read_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of one second and one size would have the same bytecode."""
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+
+
 def task_file(path: Path) -> str:
     """Write a task of the model with a reward, and name it."""
     source = path.with_name("task_of_mine.py")

@@ -224,8 +224,8 @@ class Verification(Report):
 
         Example:
             >>> from scm_world.queries import verify
-            >>> verify("reaching", backend="fake", probes=1, held_out=0).headline[:70]
-            'not refuted: joint_torques never changed under any of its declared cau'
+            >>> verify("reaching", backend="fake", probes=1, held_out=0).headline[:26]
+            'not refuted: joint_torques'
         """
         counts = (
             (len(self.undeclared), "effects without an edge"),

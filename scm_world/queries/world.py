@@ -280,7 +280,7 @@ class World(Simulation, Questions):
             >>> world = World("pushing", backend="fake")
             >>> world.reset(seed=0)
             >>> graph = world.local_graph()
-            >>> graph.has_edge("tool_block.mass", "tool_block.linear_velocity")
+            >>> graph.has_edge("gravity", "tool_block.linear_velocity")
             True
             >>> graph.has_edge("joint_positions", "tool_block.linear_velocity")
             False

@@ -766,13 +766,18 @@ def feasible(
     """
     draws = [name for name, act in request.items() if isinstance(act, Draw)]
     deciding = here.structures.deciding.intersection(draws)
-    left, turn, tried = ATTEMPTS, 0, ""
-    while left > 0:
+    first, turn, tried, named = 0, 0, "", frozenset[str]()
+    while first < ATTEMPTS:
         asked = _drawn_anew(request, deciding, turn) if turn else request
-        draft = Draft(here.structures, here.base, asked, space, key, found)
+        drawn = Draft(here.structures, here.base, asked, space, key, found)
+        if not named.issubset(drawn.asked):  # it leaves out bodies that are named
+            first, turn = first + 1, turn + 1
+            continue
+        draft, named = drawn, frozenset(drawn.asked)
         again = [name for name in draws if name not in deciding and draft.redraws(name)]
         key = replace(key, kept=frozenset(draws).difference(again)) if draws else key
-        attempts = range(min(left, CHUNK) if deciding else ATTEMPTS) if again else range(1)
+        end = min(first + CHUNK, ATTEMPTS) if deciding else ATTEMPTS
+        attempts = range(first, end if again else first + 1)
         for attempt in _promising(draft, key, attempts, again) if again else attempts:
             solution = Solution(draft, replace(key, attempt=attempt) if attempt else key)
             with np.errstate(all="ignore"):  # what is not finite is refused by name
@@ -793,7 +798,7 @@ def feasible(
             if draws and _anyhow(draft, again, problems):
                 tried = tried if deciding else "whatever is drawn, "
                 break
-        left, turn = left - attempt - 1 if deciding else 0, turn + 1
+        first, turn = attempt + 1 if deciding else ATTEMPTS, turn + 1
     raise refusal(here, draft, problems, key, tried)
 
 

@@ -86,6 +86,9 @@ class Mechanisms:
         self.decided = frozenset(self.static)
         self.places = places(self.where[name] for name in self.static)
         widths = [self.where[name].stop - self.where[name].start for name in self.static]
+        followed = {*self.computed}
+        given = [place for name, place in self.where.items() if name not in followed]
+        self.kept = places([slice(0, self.state_size), *given, *self.earlier.values()])
         self.owners = np.repeat(np.arange(len(widths)), widths)
         self._steps = {name: self._bound(name) for name in self.computed}
         remembered = [self.where[name] for name in self.earlier]

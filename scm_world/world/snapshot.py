@@ -42,9 +42,11 @@ class SavedBase:
 
     @classmethod
     def of(cls, base: StepBase) -> SavedBase:
-        """Leave out what is compiled."""
-        plan, held = base.compiled.plan, base.model.interventions
-        return cls(plan, base.row.numbers, held, dict(base.pending), base.at_start, base.drawn)
+        """Leave out what is compiled, and what follows from the rest."""
+        plan, held, mechanisms = base.compiled.plan, base.model.interventions, base.row.mechanisms
+        numbers = mechanisms.start.copy()
+        numbers[mechanisms.kept] = base.row.numbers[mechanisms.kept]
+        return cls(plan, numbers, held, dict(base.pending), base.at_start, base.drawn)
 
     def opened(self, structures: StructureCache) -> StepBase:
         """Compile what was left out."""

@@ -79,7 +79,7 @@ def test_a_report_prints_its_numbers(pushing: Verification) -> None:
     text = str(pushing)
     for words in (
         "noise floor (run twice)",
-        f"of {len(pushing.declared)}",
+        f"{len(pushing.declared)} edges were",
         f"on {pushing.backend}",
     ):
         assert words in text

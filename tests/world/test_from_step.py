@@ -140,7 +140,7 @@ def test_discovery_thins_out_what_nobody_knew() -> None:
 def test_a_forgotten_parent_is_found() -> None:
     """An edge that the function has and the declaration has not is undeclared."""
     forgotten = ("spring1.stiffness", "mass2.velocity")
-    report = verify(chain_world(leave_out=forgotten), probes=4, least=4)
+    report = verify(chain_world(leave_out=forgotten), probes=4)
     assert [edge.key for edge in report.undeclared] == [(*forgotten, 1)]
     assert not report.never_fired
     assert report.outcome == "refuted"
@@ -148,7 +148,7 @@ def test_a_forgotten_parent_is_found() -> None:
 
 def test_the_full_declaration_is_verified() -> None:
     """With the parent, everything is declared and everything declared is seen."""
-    report = verify(chain_world(), probes=4, least=4)
+    report = verify(chain_world(), probes=4)
     assert report.outcome == "confirmed"
     assert report.floor == 0.0
 
@@ -238,7 +238,7 @@ def test_several_actions_are_one_command() -> None:
 
 def test_every_kind_of_edge_is_seen() -> None:
     """Categories, vectors, whole numbers, and an action that the reward depends on at once."""
-    report = verify(shop_world(), probes=16, least=4)
+    report = verify(shop_world(), probes=16)
     assert report.outcome == "confirmed"
     assert ("price", "reward", 0) in report.found
 

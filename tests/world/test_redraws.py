@@ -188,3 +188,15 @@ def test_draws_that_are_looked_at_together_have_the_numbers_of_their_streams(epi
         for name, row in zip(names, found, strict=True):
             expected = noise.uniforms(name, n=n, episode=episode, step=step)
             np.testing.assert_array_equal(row, expected[0])
+
+
+def test_crowded_structures_are_drawn_until_one_is_feasible() -> None:
+    """Where bodies come and go, each draw of them is followed by other draws of the rest."""
+    world = World("reaching", backend="fake")
+    drawn = {
+        v.name: Draw("A")
+        for v in world.model.variables
+        if v.settable and v.role in ("parameter", "state") and v.a is not None
+    }
+    for seed in range(12):
+        world.reset(seed=seed, do=drawn)
