@@ -126,6 +126,7 @@ def published(
     command: str | None = None,
     limits: Sequence[str] = (),
     ceiling: str | None = None,
+    keep: bool = False,
 ) -> MlpPolicy:
     """Give what goes into the zoo: a policy without its value network, with its scores.
 
@@ -135,16 +136,21 @@ def published(
         command: That trained it; from its card if None.
         limits: What has to be known, in sentences.
         ceiling: See ``scores_of``.
+        keep: Keep the scores of its card on engines that the evaluations leave out.
 
     Raises:
         UnreadableFile: A file is damaged, or an evaluation is not of this policy.
         UnknownOption: Nobody says with which command it was trained.
     """
     policy = load_policy(source)
+    scores = scores_of(source, results, ceiling)
+    engines = {row["engine"] for row in scores}
+    earlier = policy.about.card.get(RESULTS, []) if keep else []
+    scores = [*(row for row in earlier if row["engine"] not in engines), *scores]
     about: PolicyAbout = policy.about.with_card(
         **{
             COMMAND: command or policy.about.card.get(COMMAND) or command_of(policy.about.card),
-            RESULTS: scores_of(source, results, ceiling),
+            RESULTS: scores,
             LIMITS: [*limits],
         }
     )
@@ -190,8 +196,9 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--command", help="that trained it; from its recipe by default")
     parser.add_argument("--limit", action="append", default=[], help="sentence; one for each")
     parser.add_argument("--ceiling", help="agent in the evaluations that sees the whole world")
+    parser.add_argument("--keep", action="store_true", help="scores on engines left out now")
     asked = parser.parse_args(words)
-    more: dict[str, Any] = {"limits": asked.limit, "ceiling": asked.ceiling}
+    more: dict[str, Any] = {"limits": asked.limit, "ceiling": asked.ceiling, "keep": asked.keep}
     path = publish(asked.source, asked.name, asked.results, command=asked.command, **more)
     print(f"written: {path}, {PAGE}")
 
