@@ -26,15 +26,17 @@ from scm_world.variables.checks import check_bounds, check_draw, coerce
 
 
 def refuse_time(name: str, act: Any) -> None:
-    """Refuse an intervention with a time, where there is no episode for it.
+    """Refuse an intervention with a time, or several, where there is no episode for it.
 
     Raises:
-        InterventionError: It has one.
+        InterventionError: It is one.
     """
-    if getattr(act, "time", None) is not None:
+    is_plan = isinstance(act, tuple) and any(hasattr(one, "time") for one in act)
+    if is_plan or getattr(act, "time", None) is not None:
+        said = "interventions one after another count" if is_plan else f"a time ({act.time}) counts"
         raise InterventionError(
-            f"do({name}): a time ({act.time}) counts in the plan of an episode: give it to "
-            "rollout, sample, effect, counterfactual, given, or reset(do=…) of a World",
+            f"do({name}): {said} in the plan of an episode: give it to rollout, sample, effect or "
+            "counterfactual, to given or reset(do=…) of a World, or to a curriculum",
             variable=name,
             value=act,
         )

@@ -82,8 +82,11 @@ def flatten(
             inner = flatten(value, problems)
             parts = {f"{name}.{key}": part for key, part in inner.items()}
         else:
-            held = isinstance(value, list | tuple) or hasattr(value, "__array__")
-            parts = {name: deepcopy(value) if held else value}
+            one = value
+            if isinstance(value, tuple) and len(value) == 1 and isinstance(value[0], Frozen):
+                one = value[0]  # the only act of a plan
+            held = isinstance(one, list | tuple) or hasattr(one, "__array__")
+            parts = {name: deepcopy(one) if held else one}
         problems += [ConflictingTargets((key, key), key) for key in parts if key in flat]
         for key, part in parts.items():
             flat.setdefault(key, part)

@@ -10,8 +10,9 @@ from typing import Literal, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats, Values
+from scm_world.backends import backends
 from scm_world.errors import EngineFailure, InterventionError
 from scm_world.queries.experiments.effects import FACTOR, RESOLUTION
 from scm_world.queries.experiments.paired import another, engine_decided, settable
@@ -65,6 +66,7 @@ class Comparison(Report):
         backends: Their names.
         seed: Of states and values.
         probes: In how many states effects were compared.
+        skipped: How many states one of the backends cannot be in.
         effects: Of each parameter with a clear effect.
         seconds: Wall time.
     """
@@ -74,6 +76,7 @@ class Comparison(Report):
     backends: tuple[str, str]
     seed: int
     probes: int
+    skipped: int = 0
     effects: tuple[ParameterEffects, ...]
     seconds: float
 
@@ -95,9 +98,11 @@ class Comparison(Report):
 
     def rows(self) -> tuple[Row, ...]:
         """List the numbers, what they mean, and whether they are good."""
+        same = f"{100 * self.share:.1f} %" if self.effects else "there is no clear effect"
         return (
             ("probe states, seed", f"{self.probes}, {self.seed}", None),
-            ("clear effects with the same sign", f"{100 * self.share:.1f} %", self.share >= SAME),
+            ("states that one backend cannot be in", str(self.skipped), None),
+            ("clear effects with the same sign", same, self.share >= SAME),
             *((f"effects on {self.backends[1]}", str(one), None) for one in self.effects),
             ("seconds", f"{self.seconds:.1f}", None),
         )
@@ -116,6 +121,7 @@ def compare_backends(
 ) -> Comparison:
     """Change each parameter alike on two backends; see ``World.compare``."""
     whole_number("number of probes", probes, least=1)
+    one_of("backend", backend, backends())
     started, twins = time.perf_counter(), twins_of(world)
     other = Simulation(copy.copy(twins.task), **{**twins.options, "backend": backend})
     found: dict[str, list[tuple[float, float]]] = {}
@@ -146,6 +152,7 @@ def compare_backends(
         backends=(world.backend.name, backend),
         seed=seed,
         probes=done,
+        skipped=probes - done,
         effects=tuple(effects),
         seconds=time.perf_counter() - started,
     )

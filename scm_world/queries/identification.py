@@ -188,13 +188,17 @@ def estimate(
     Raises:
         MissingExtra: DoWhy is not installed.
         ModelError: The effect is not identified.
-        UnknownOption: The table lacks a column.
+        UnknownOption: The table lacks a column, or an argument is of another kind.
 
     Example:
         >>> found = identify(nx.DiGraph([("z", "x"), ("z", "y"), ("x", "y")]), "x", "y")
         >>> estimate(found, table, do=1.0, versus=0.0).value  # doctest: +SKIP
         2.03
     """
+    if not isinstance(found, Identification):
+        raise UnknownOption("found", found, ("a result of identify",))
+    if not hasattr(table, "columns"):
+        raise UnknownOption("table", type(table), ("a data frame, as pandas.DataFrame(table)",))
     if not found.variables:
         ends = f"{found.treatment!r} on {found.outcome!r}"
         advice = "observe more variables, look for front doors, or intervene (effect)"

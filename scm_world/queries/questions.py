@@ -491,4 +491,10 @@ class SCM(Questions, graph.SCM):
         return self._twins, Equations(self._twins.layout)
 
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
-        return do if isinstance(do, Plan) else Plan(numbered(self, {} if do is None else do))
+        plan = do if isinstance(do, Plan) else Plan(numbered(self, {} if do is None else do))
+        if not self.is_temporal:
+            for name, act in plan.timed():
+                if act.time.start != 0:
+                    allowed = ("none, or at=0: a model without lagged edges has one instant",)
+                    raise UnknownOption(f"time of an intervention on {name}", act, allowed)
+        return plan

@@ -12,6 +12,7 @@ import networkx as nx
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends import Backend
+from scm_world.errors import UnknownOption
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import System
@@ -51,6 +52,9 @@ class World(Simulation, Questions):
         Args:
             world: Such as ``env.unwrapped.world``; it is left as it is.
 
+        Raises:
+            UnknownOption: It is not a world.
+
         Example:
             >>> import gymnasium
             >>> env = gymnasium.make("scm_world/Pushing-v0", backend="fake")
@@ -59,6 +63,8 @@ class World(Simulation, Questions):
             ...     world.effect("reward", do={"floor_friction": 0.9}, n=2, steps=3).n
             2
         """
+        if not isinstance(world, Simulation):
+            raise UnknownOption("world", world, ("a world, such as env.unwrapped.world",))
         build, (_, *how) = Simulation.__reduce__(world)
         made: Self = build(cls, *how)
         return made

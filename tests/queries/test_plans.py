@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 
 from scm_world.errors import InterventionError, ModelError, UnknownOption
-from scm_world.queries import Plan, World, do
+from scm_world.queries import SCM, Plan, World, do
 from scm_world.variables import (
     Box,
     Contact,
     Draw,
+    Exogenous,
     Function,
     Hard,
     Mechanism,
     Natural,
+    Normal,
     Reaches,
     Scale,
     Shift,
@@ -222,3 +224,27 @@ def test_worlds_are_given_more_and_more() -> None:
         late.step(late["joint_positions"])
     assert float(late["floor_friction"]) == 0.1
     assert world.given({}).rollout(seed=1, steps=4) == found[0]
+
+
+def test_a_plan_without_times_is_an_intervention() -> None:
+    """Wherever something is done at once; one with times is refused where no episode follows it."""
+    world = World("pushing", backend="fake")
+    plain, later = do({"floor_friction": 0.2}), do({"floor_friction": Hard(0.2, at=3)})
+    both = {"floor_friction": (Hard(0.2), Hard(0.3, at=3))}
+    world.reset(seed=0, do=plain)
+    assert world["floor_friction"] == 0.2
+    world.reset(seed=0)
+    world.do(plain)
+    assert world.graph.do(plain).interventions["floor_friction"].value == 0.2
+    for wrong in (later, both):
+        with pytest.raises(InterventionError, match=r"count.* in the plan of an episode"):
+            world.do(wrong)
+
+
+def test_models_of_one_instant_know_no_later_one() -> None:
+    """A time that never comes is refused, and so is an event."""
+    model = SCM([Exogenous(name="a", distribution=Normal(0.0, 1.0))])
+    for late in (Hard(0.0, at=2), Hard(0.0, when=Contact("x", "y"))):
+        with pytest.raises(UnknownOption, match="has one instant"):
+            model.rollout(do={"a": late})
+    assert model.rollout(do={"a": Hard(0.5, at=0)}).final("a") == 0.5
