@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Literal, final
 
@@ -202,9 +203,9 @@ class _Chosen(_Several):
     def __init__(self, *parts: Any, **fields: Any) -> None:
         super().__init__(*parts, **fields)
 
+    @abstractmethod
     def chosen(self, memory: Memory, episode: int) -> Part:
         """Return the part that acts in an episode."""
-        raise NotImplementedError
 
     def acts(self, situation: Situation) -> Mapping[str, Any]:
         """Return the interventions of that part."""

@@ -148,7 +148,7 @@ def _asked(
     values, backs = list[Value](), list[Value]()
     for target in targets:
         if target in compiled.actions:
-            act = solution.draft.acts[target][1]
+            act = solution.checked.acts[target][1]
             values += [np.array(act.value)] if isinstance(act, Hard) else []
             continue
         values.append(np.array(now[target]))

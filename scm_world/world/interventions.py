@@ -82,8 +82,8 @@ def _targets(model: SCM, name: str) -> tuple[str, ...]:
 
 @final
 @dataclass
-class Instant:
-    """A world when someone intervenes.
+class Present:
+    """The present of a world, in which an intervention is planned.
 
     Attributes:
         structures: Of the task.
@@ -99,7 +99,7 @@ class Instant:
 
 
 @final
-class Draft:
+class CheckedRequest:
     """An intervention that has been checked, to be solved once for each draw.
 
     Args:
@@ -315,7 +315,7 @@ class Solution:
     """What a world would be after an intervention, with one of its draws.
 
     Args:
-        draft: The intervention.
+        checked: The intervention.
         key: Where to draw.
         numbers: The row that is written, shape (width,); as physics left it if None.
 
@@ -325,14 +325,14 @@ class Solution:
         changed: Parameters whose values are not the present ones, once ``feasible`` has compared.
     """
 
-    def __init__(self, draft: Draft, key: NoiseKey, numbers: Any = None) -> None:
-        self.draft, self.key, self.compiled = draft, key, draft.compiled
-        self.asked = draft.asked
-        self._base = draft.base.row
+    def __init__(self, checked: CheckedRequest, key: NoiseKey, numbers: Any = None) -> None:
+        self.checked, self.key, self.compiled = checked, key, checked.compiled
+        self.asked = checked.asked
+        self._base = checked.base.row
         numbers = self._base.numbers.copy() if numbers is None else numbers
-        self.row = Row(self.compiled.mechanisms, numbers, {*draft.targets})
-        self.problems = [*draft.problems]
-        self._impossible = {*draft.impossible}
+        self.row = Row(self.compiled.mechanisms, numbers, {*checked.targets})
+        self.problems = [*checked.problems]
+        self._impossible = {*checked.impossible}
         self.changed: list[str] = []
         self._drawn: set[str] = set()
         self._whole: dict[str, Value] = {}  # what bundles are to be
@@ -343,21 +343,21 @@ class Solution:
 
         A mechanism never meets values that its parents cannot have.
         """
-        draft = self.draft
-        if draft.draws:
+        checked = self.checked
+        if checked.draws:
             self._draw_boxes()
-        for name in draft.order:
+        for name in checked.order:
             if name not in self._drawn:
                 self.compute(name)
-        if self._impossible.isdisjoint(draft.head):
+        if self._impossible.isdisjoint(checked.head):
             self._set_states()
-        if draft.space is not None:
-            self._check_space(draft.space)
+        if checked.space is not None:
+            self._check_space(checked.space)
         return self._as_asked() if self.problems else []
 
     def _draw_boxes(self) -> None:
         attempt, kept = self.key.attempt, self.key.kept
-        for names, streams, columns, low, edges in self.draft.together:
+        for names, streams, columns, low, edges in self.checked.together:
             own = zip(names, streams, strict=True)
             again = (s if n in kept or not attempt else f"{s}#{attempt}" for n, s in own)
             drawn = uniforms(self.key, again, columns.shape[1])
@@ -367,9 +367,9 @@ class Solution:
 
     def compute(self, name: str) -> None:
         """Compute a parameter, whose parents have been."""
-        draft, declared = self.draft, self.compiled.model.declared
+        checked, declared = self.checked, self.compiled.model.declared
         variable = declared(name)
-        asked, act = draft.acts.get(name, (name, None))
+        asked, act = checked.acts.get(name, (name, None))
         bounds = variable.bounds
         follows = bounds is not None and bool(bounds.parents())
         if isinstance(act, Hard) and asked == name and not follows:
@@ -381,9 +381,9 @@ class Solution:
             self._impossible.add(name)
             return
         try:
-            drawn = draft.drawn(name, self.key, (self.key.attempt,))
+            drawn = checked.drawn(name, self.key, (self.key.attempt,))
             if drawn is None:
-                value = draft.model.evaluate(name, self.row, self.key)
+                value = checked.model.evaluate(name, self.row, self.key)
                 if value.shape != variable.shape:  # of a mechanism that a user gave
                     raise WrongValue(name, value, variable.shape, np.shape(value))
             else:
@@ -403,13 +403,13 @@ class Solution:
         States that others follow come first; a shift or scale starts from where its state was
         carried to.
         """
-        acts, followed = self.draft.acts, self.compiled.set_parents
-        if any(isinstance(acts[target][1], Mechanism) for target in self.draft.states):
+        acts, followed = self.checked.acts, self.compiled.set_parents
+        if any(isinstance(acts[target][1], Mechanism) for target in self.checked.states):
             self._earlier = Row(self.row.mechanisms, self.row.numbers.copy())
-        for target in self.draft.states:
+        for target in self.checked.states:
             if target not in followed:
                 self.set_state(target)
-        moved, fresh = {*self.draft.order, *self.draft.states}, self.draft.base.fresh
+        moved, fresh = {*self.checked.order, *self.checked.states}, self.checked.base.fresh
         for variable in self.compiled.carried:
             name = variable.name
             if name in moved or name in fresh or not moved.isdisjoint(followed[name]):
@@ -418,7 +418,7 @@ class Solution:
 
     def set_state(self, name: str) -> None:
         """Carry a state along with its parents, and do what is asked of it."""
-        asked, act = self.draft.acts.get(name, (name, None))
+        asked, act = self.checked.acts.get(name, (name, None))
         if name in self.compiled.set_parents and (act is None or isinstance(act, SOFT)):
             self._carry(name)
         if act is None:
@@ -466,7 +466,7 @@ class Solution:
         elif isinstance(act, Natural | Null):
             value = self.coordinates(name)
         elif isinstance(act, Draw):
-            source = self.draft.source(name, act)
+            source = self.checked.source(name, act)
             value = self.key.draw(source, name, requested.shape, self.row, act.stream)
         else:
             present = self.coordinates(name)
@@ -492,7 +492,7 @@ class Solution:
     def _carry(self, name: str) -> None:
         """Move a state with the parents that act on it when set (a block that grows)."""
         variable: Measured = self.compiled.carried_by_name[name]
-        parents, base = self.compiled.set_parents[name], self.draft.base
+        parents, base = self.compiled.set_parents[name], self.checked.base
         if name not in base.fresh:
             moved = [p for p in parents if not same(self._base[p], self.row[p])]
             if not moved:
@@ -537,7 +537,7 @@ class Solution:
         """Tell whether an intervention on other coordinates always lies in a space."""
         if getattr(requested, "inverse", None) is None:
             return False
-        _, act = self.draft.pending[self.compiled.model.target(requested.name)]
+        _, act = self.checked.pending[self.compiled.model.target(requested.name)]
         if not isinstance(act, Hard):
             return isinstance(act, Draw) and act.source == space
         try:
@@ -548,7 +548,7 @@ class Solution:
 
     def _held_action(self, name: str) -> Value:
         """Return the action that is to be taken from now on."""
-        acts = [self.draft.acts[target][1] for target in self.compiled.model.targets(name)]
+        acts = [self.checked.acts[target][1] for target in self.compiled.model.targets(name)]
         values = [np.asarray(act.value) for act in acts if isinstance(act, Hard)]
         if len(values) == len(acts):
             return values[0] if len(values) == 1 else np.concatenate([v.ravel() for v in values])
@@ -581,19 +581,19 @@ class Solution:
     @cached_property
     def _fixed(self) -> dict[str, Hard]:
         """The values that came out of draws, as interventions by target."""
-        return {target: Hard(self.row[target].tolist()) for target in self.draft.draws}
+        return {target: Hard(self.row[target].tolist()) for target in self.checked.draws}
 
     @property
     def model(self) -> SCM:
         """The model with the interventions that would hold, draws as the values that came out."""
-        model = self.draft.model
-        return model.with_interventions(self._fixed) if self.draft.draws else model
+        model = self.checked.model
+        return model.with_interventions(self._fixed) if self.checked.draws else model
 
     def kept(self) -> PendingInterventions:
         """Return the interventions at this control step, draws as the values that came out."""
-        acts, by_hand, actions = self.draft.acts, self.compiled.set_by_hand, self.compiled.actions
+        acts, by_hand, actions = self.checked.acts, self.compiled.set_by_hand, self.compiled.actions
         found: PendingInterventions = {}
-        for target, named in self.draft.pending.items():
+        for target, named in self.checked.pending.items():
             lasting = target not in by_hand and isinstance(named[1], (*SOFT, Mechanism, Natural))
             stays = isinstance(named[1], Hard) or lasting or target in actions
             if stays or target not in acts:
@@ -601,7 +601,7 @@ class Solution:
             else:
                 value = self._fixed.get(target) or Hard(self.row[target].tolist())
                 found[target] = target, value
-        removals = self.draft.request.items()
+        removals = self.checked.request.items()
         return found | {name: (name, act) for name, act in removals if isinstance(act, Null)}
 
 
@@ -610,19 +610,19 @@ class Candidates:
     """The worlds of several draws of one intervention: a row for each, computed where asked.
 
     Args:
-        draft: The intervention.
+        checked: The intervention.
         key: Where to draw.
         attempts: Numbers of the draws.
         varying: What follows from a draw.
     """
 
     def __init__(
-        self, draft: Draft, key: NoiseKey, attempts: range, varying: frozenset[str]
+        self, checked: CheckedRequest, key: NoiseKey, attempts: range, varying: frozenset[str]
     ) -> None:
         self.attempts = [*attempts]
-        self._draft, self._key, self._varying = draft, key, varying
-        self._numbers = np.repeat(draft.base.row.numbers[None], len(attempts), axis=0)
-        self._names = {key: name for name, key in draft.compiled.parameter_keys.items()}
+        self._checked, self._key, self._varying = checked, key, varying
+        self._numbers = np.repeat(checked.base.row.numbers[None], len(attempts), axis=0)
+        self._names = {key: name for name, key in checked.compiled.parameter_keys.items()}
         self._done: set[str] = set()
 
     def keep(self, which: Value) -> None:
@@ -633,13 +633,13 @@ class Candidates:
     def parameter(self, key: ParameterKey) -> Value:
         """Compute a physical parameter, shape (n or 1, *shape); it must be a variable."""
         name = self._names[key]
-        where = self._draft.compiled.mechanisms.where[name]
-        shape = self._draft.compiled.model.declared(name).shape
+        where = self._checked.compiled.mechanisms.where[name]
+        shape = self._checked.compiled.model.declared(name).shape
         return self._computed([name], where).reshape(-1, *shape)
 
     def state(self, where: slice) -> Value:
         """Compute some numbers of the state vector, shape (n or 1, size)."""
-        compiled = self._draft.compiled
+        compiled = self._checked.compiled
         inside = (
             n
             for n, own in compiled.slices.items()
@@ -654,21 +654,21 @@ class Candidates:
         return found[:1] if self._varying.isdisjoint(names) else found
 
     def _compute(self, name: str) -> None:
-        draft, compiled = self._draft, self._draft.compiled
+        checked, compiled = self._checked, self._checked.compiled
         is_state = name in compiled.slices
-        if name in self._done or not (is_state or name in draft.order):
+        if name in self._done or not (is_state or name in checked.order):
             return
         self._done.add(name)
-        drawn = draft.drawn(name, self._key, self.attempts)
+        drawn = checked.drawn(name, self._key, self.attempts)
         if drawn is not None and not isinstance(compiled.model.declared(name).bounds, Rotations):
             where = compiled.mechanisms.where[name]
             self._numbers[:, where] = drawn.reshape(len(drawn), -1)
             return
         parents = compiled.set_parents.get(name, ()) if is_state else ()
-        for parent in parents if is_state else draft.model.structure.parents(name):
+        for parent in parents if is_state else checked.model.structure.parents(name):
             self._compute(parent)
         for attempt, numbers in zip(self.attempts, self._numbers, strict=True):
-            one = Solution(draft, replace(self._key, attempt=attempt), numbers)
+            one = Solution(checked, replace(self._key, attempt=attempt), numbers)
             if is_state:
                 one.set_state(name)
             else:
@@ -738,7 +738,7 @@ def _overlaps_before(base: StepBase) -> tuple[Overlap, ...]:
 
 
 def feasible(
-    here: Instant,
+    here: Present,
     request: Mapping[str, Any],
     space: AnyRegion | None,
     key: NoiseKey,
@@ -769,37 +769,37 @@ def feasible(
     first, turn, tried, named = 0, 0, "", frozenset[str]()
     while first < ATTEMPTS:
         asked = _drawn_anew(request, deciding, turn) if turn else request
-        drawn = Draft(here.structures, here.base, asked, space, key, found)
+        drawn = CheckedRequest(here.structures, here.base, asked, space, key, found)
         if not named.issubset(drawn.asked):  # it leaves out bodies that are named
             first, turn = first + 1, turn + 1
             continue
-        draft, named = drawn, frozenset(drawn.asked)
-        again = [name for name in draws if name not in deciding and draft.redraws(name)]
+        checked, named = drawn, frozenset(drawn.asked)
+        again = [name for name in draws if name not in deciding and checked.redraws(name)]
         key = replace(key, kept=frozenset(draws).difference(again)) if draws else key
         end = min(first + CHUNK, ATTEMPTS) if deciding else ATTEMPTS
         attempts = range(first, end if again else first + 1)
-        for attempt in _promising(draft, key, attempts, again) if again else attempts:
-            solution = Solution(draft, replace(key, attempt=attempt) if attempt else key)
+        for attempt in _promising(checked, key, attempts, again) if again else attempts:
+            solution = Solution(checked, replace(key, attempt=attempt) if attempt else key)
             with np.errstate(all="ignore"):  # what is not finite is refused by name
                 wrong = solution.solve()
             if wrong:
                 raise_all(wrong)
-            row, compiled = solution.row, draft.compiled
+            row, compiled = solution.row, checked.compiled
             solution.changed = changed = here.now.differing(row)
             change = difference(compiled, here.now, here.structure, row, changed)
             problems = []
             if change is not None:
-                problems = overlaps(compiled, draft.base, here.now, row, change, draft.asked)
+                problems = overlaps(compiled, checked.base, here.now, row, change, checked.asked)
             if draws and not problems:
                 problems = _in_obstacles(solution, draws)
             if not problems:
                 return solution, change
             tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one " if draws else ""
-            if draws and _anyhow(draft, again, problems):
+            if draws and _anyhow(checked, again, problems):
                 tried = tried if deciding else "whatever is drawn, "
                 break
         first, turn = attempt + 1 if deciding else ATTEMPTS, turn + 1
-    raise refusal(here, draft, problems, key, tried)
+    raise refusal(here, checked, problems, key, tried)
 
 
 def _drawn_anew(request: Mapping[str, Any], names: Iterable[str], turn: int) -> Mapping[str, Any]:
@@ -809,19 +809,21 @@ def _drawn_anew(request: Mapping[str, Any], names: Iterable[str], turn: int) -> 
     return {**request, **anew}
 
 
-def _promising(draft: Draft, key: NoiseKey, attempts: range, draws: list[str]) -> Iterator[int]:
+def _promising(
+    checked: CheckedRequest, key: NoiseKey, attempts: range, draws: list[str]
+) -> Iterator[int]:
     """Yield the draws that may be feasible, and the last one.
 
     A draw that is left out puts two bodies in one place.
     """
-    before = max((overlap.depth for overlap in _overlaps_before(draft.base)), default=0.0)
-    varying = draft.compiled.reached(draws)
+    before = max((overlap.depth for overlap in _overlaps_before(checked.base)), default=0.0)
+    varying = checked.compiled.reached(draws)
     for first in range(0, len(attempts), CHUNK):
         chunk = attempts[first : first + CHUNK]
-        candidates = Candidates(draft, key, chunk, varying)
+        candidates = Candidates(checked, key, chunk, varying)
         try:
             with np.errstate(all="ignore"):
-                draft.compiled.composition.thin(candidates, before + ROUNDING)
+                checked.compiled.composition.thin(candidates, before + ROUNDING)
         except Exception:  # solving says what is wrong
             yield from chunk
         else:
@@ -830,10 +832,10 @@ def _promising(draft: Draft, key: NoiseKey, attempts: range, draws: list[str]) -
         yield attempts[-1]
 
 
-def _anyhow(draft: Draft, draws: Iterable[str], problems: Iterable[Overlap]) -> bool:
+def _anyhow(checked: CheckedRequest, draws: Iterable[str], problems: Iterable[Overlap]) -> bool:
     """Tell whether every draw has an overlap: of bodies that can be moved and follow no draw."""
-    moved = {name.partition(".")[0] for name in draft.compiled.reached(draws)}
-    unmoved = {*draft.compiled.composition.bodies} - moved
+    moved = {name.partition(".")[0] for name in checked.compiled.reached(draws)}
+    unmoved = {*checked.compiled.composition.bodies} - moved
     return not draws or any(unmoved.issuperset(overlap.bodies) for overlap in problems)
 
 
@@ -847,24 +849,24 @@ def _in_obstacles(solution: Solution, draws: Iterable[str]) -> list[Overlap]:
 
 
 def refusal(
-    here: Instant, draft: Draft, problems: list[Overlap], key: NoiseKey, tried: str = ""
+    here: Present, checked: CheckedRequest, problems: list[Overlap], key: NoiseKey, tried: str = ""
 ) -> Infeasible:
     """Return the error that names the target to blame, and its nearest feasible value."""
     bodies = {body for overlap in problems for body in overlap.bodies}
 
     def blame(name: str) -> tuple[bool, bool]:
-        moved = draft.compiled.surfaces((name,)) if name in draft.compiled.model else ()
+        moved = checked.compiled.surfaces((name,)) if name in checked.compiled.model else ()
         return bool({part.partition(".")[0] for part in moved} & bodies), bool(moved)
 
-    name = max(draft.request, key=blame)
+    name = max(checked.request, key=blame)
     key = replace(key, attempt=0, kept=frozenset())
-    found = _nearest(here, draft.request, key)
+    found = _nearest(here, checked.request, key)
     reasons = [tried + str(problem) for problem in problems]
-    return Infeasible(name, draft.request[name], reasons, None if found is None else found[name])
+    return Infeasible(name, checked.request[name], reasons, None if found is None else found[name])
 
 
 def _nearest(
-    at: Instant, request: Mapping[str, Any], key: NoiseKey, *, halvings: int = 20
+    at: Present, request: Mapping[str, Any], key: NoiseKey, *, halvings: int = 20
 ) -> dict[str, Any] | None:
     """Search the straight line from the present values to the wanted ones for the last feasible."""
     here: dict[str, Value] = {}
@@ -886,15 +888,15 @@ def _nearest(
     low, high = 0.0, 1.0
     for _ in range(halvings):
         middle = 0.5 * (low + high)
-        draft = Draft(at.structures, at.base, between(middle), None, key)
-        solution = Solution(draft, key)
+        checked = CheckedRequest(at.structures, at.base, between(middle), None, key)
+        solution = Solution(checked, key)
         with np.errstate(all="ignore"):
             blocked = bool(solution.solve())  # outside the bounds on the way
         if not blocked:
-            row, compiled = solution.row, draft.compiled
+            row, compiled = solution.row, checked.compiled
             change = difference(compiled, at.now, at.structure, row, at.now.differing(row))
             if change is not None:
-                found = overlaps(compiled, draft.base, at.now, row, change, draft.asked)
+                found = overlaps(compiled, checked.base, at.now, row, change, checked.asked)
                 blocked = bool(found)
         low, high = (low, middle) if blocked else (middle, high)
     return between(low)

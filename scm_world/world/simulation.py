@@ -44,8 +44,8 @@ from scm_world.world.compiled_task import (
     check_functions,
 )
 from scm_world.world.interventions import (
-    Draft,
-    Instant,
+    CheckedRequest,
+    Present,
     Solution,
     difference,
     feasible,
@@ -292,9 +292,11 @@ class Simulation:
         if change is not None and compiled.composition.solid:
             problems = overlaps(compiled, base, present, row, change)
         if problems:
-            draft = Draft(self.structures, base, {compiled.random[0]: Draw("A")}, None, key)
-            here = Instant(self.structures, base, present, self.structure)
-            raise refusal(here, draft, problems, key)
+            checked = CheckedRequest(
+                self.structures, base, {compiled.random[0]: Draw("A")}, None, key
+            )
+            here = Present(self.structures, base, present, self.structure)
+            raise refusal(here, checked, problems, key)
         if change is not None:
             self.backend.apply(change)
         self._adopt(compiled, compiled.model, row)
@@ -579,7 +581,7 @@ class Simulation:
             flat, drawn = self._anew(flat, base)
         region = self.variables_space if space is None else as_region("space", space)
         key = self.noise_key(self._index)
-        here = Instant(self.structures, base, self._values.row, self.structure)
+        here = Present(self.structures, base, self._values.row, self.structure)
         solution, change = feasible(here, flat, region, key, twice)
         audit = self._commit(solution, change, flat, check, at_start=base.at_start)
         self._base = StepBase(

@@ -30,7 +30,7 @@ from scm_world.errors import (
 )
 from scm_world.models import Difference
 from scm_world.variables import Draw, Normal, Null, Scale, Shift
-from scm_world.world.interventions import Instant, feasible
+from scm_world.world.interventions import Present, feasible
 
 NAN = float("nan")
 HUGE = 1e308
@@ -224,7 +224,7 @@ def test_an_engine_is_told_the_difference_of_the_scenes(backend: str, task: str)
         request = {name: other(world, name)}
         key = world.noise_key(world.index)
         base = world._step_base()
-        here = Instant(world.structures, base, base.row, world.structure)
+        here = Present(world.structures, base, base.row, world.structure)
         solution, told = feasible(here, request, None, key)
         compiled, row = solution.compiled, solution.row
         then = compiled.describe(row, compiled.state_of(row))
