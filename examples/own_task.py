@@ -12,7 +12,7 @@ import numpy as np
 from scm_world.evaluation import Protocol, evaluate
 from scm_world.tasks import register, term
 from scm_world.tasks.trifinger.entities.bodies import position
-from scm_world.tasks.trifinger.single import GOAL, TOOL, Alike, OneBlock
+from scm_world.tasks.trifinger.single import GOAL, TOOL, BlockOptions, OneBlock
 from scm_world.variables import Parent, Variable
 
 
@@ -33,7 +33,7 @@ class Centering(OneBlock):
     name = "centering"
     default_weights: ClassVar = {"reward.nearer": 100.0, "fractional_success": 1.0}
 
-    def __init__(self, **options: Unpack[Alike]) -> None:
+    def __init__(self, **options: Unpack[BlockOptions]) -> None:
         super().__init__((0.0, 0.1), **options)
 
     def entities(self) -> tuple[Any, ...]:

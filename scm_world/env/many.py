@@ -360,7 +360,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
 
 @final
 @dataclass(frozen=True)
-class Alike:
+class MemberShapes:
     """What the environments of a batch have in common.
 
     Attributes:
@@ -372,7 +372,7 @@ class Alike:
     infos: dict[str, tuple[int, ...]]
 
     @classmethod
-    def of(cls, env: gymnasium.Env[Any, Any]) -> Alike:
+    def of(cls, env: gymnasium.Env[Any, Any]) -> MemberShapes:
         """Read it from one of them."""
         return cls(env.observation_space, env.get_wrapper_attr("info_shapes"))
 
@@ -393,7 +393,7 @@ class Alike:
         return (None if method in SHOWN else answer), shown
 
     def _check(self, env: gymnasium.Env[Any, Any], variable: str) -> None:
-        here = Alike.of(env)
+        here = MemberShapes.of(env)
         if here == self:
             return
         before, after = self._shapes(), here._shapes()

@@ -15,7 +15,7 @@ from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.env.delta import JOINTS
 from scm_world.env.environment import REWARD, ScmWorldEnv
-from scm_world.env.many import Alike, Mask, ScmWorldVectorEnv, located
+from scm_world.env.many import Mask, MemberShapes, ScmWorldVectorEnv, located
 from scm_world.env.observer import DictObserver
 from scm_world.env.vector import KEYPOINTS, Vector
 from scm_world.errors import EngineFailure, FunctionFailure, ScmWorldError
@@ -71,7 +71,7 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         # They share what is declared, and each can be made again by itself.
         shared = {**options, "task": lead.world.structures, "task_options": None}
         self.envs = [first, *(member(**shared) for _ in range(count - 1))]
-        self._alike = [Alike.of(env) for env in self.envs]
+        self._alike = [MemberShapes.of(env) for env in self.envs]
         self._inner: list[Any] = [env.unwrapped for env in self.envs]
         for inner in self._inner:
             inner._ezpickle_kwargs = lead._ezpickle_kwargs

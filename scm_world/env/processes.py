@@ -17,7 +17,7 @@ from gymnasium.vector.utils import create_empty_array
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.env.environment import ScmWorldEnv
-from scm_world.env.many import Alike, Mask, ScmWorldVectorEnv, located, read_mode, row_of
+from scm_world.env.many import Mask, MemberShapes, ScmWorldVectorEnv, located, read_mode, row_of
 from scm_world.errors import EngineFailure, ScmWorldError
 from scm_world.work.processes import PROCESS, children_single_threaded, pickled
 
@@ -190,7 +190,7 @@ class Member(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, make: Callable[[], gymnasium.Env[Any, Any]], index: int) -> None:
         super().__init__(make())
-        self._index, self._alike = index, Alike.of(self.env)
+        self._index, self._alike = index, MemberShapes.of(self.env)
         self._seen = row_of(create_empty_array(self.env.observation_space, 1, np.zeros), 0)
         self._before: Any = None
 

@@ -93,7 +93,7 @@ def _read(option: str, given: Any, sizes: tuple[int, ...], allowed: tuple[str, .
     return [*map(float, numbers)]
 
 
-class Alike(Common, total=False):
+class BlockOptions(Common, total=False):
     """Options of tasks with one block and one goal, in addition to those of every task.
 
     Attributes:
@@ -120,17 +120,17 @@ class OneBlock(TriFingerTask):
     Args:
         tool_block_position: Where the center of the block begins: x and y if it stands on the
             floor, or x, y and z [m].
-        options: Of block, goal and every task; see ``Alike`` and ``Common``.
+        options: Of block, goal and every task; see ``BlockOptions`` and ``Common``.
 
     Attributes:
         place: x and y of the block at the start, and the height of its lowest point [m].
     """
 
-    options = Alike
+    options = BlockOptions
     targets: ClassVar[dict[str, str]] = {GOAL: TOOL}
     ready_terms = kernels.ONE_BLOCK
 
-    def __init__(self, tool_block_position: Place, **options: Unpack[Alike]) -> None:
+    def __init__(self, tool_block_position: Place, **options: Unpack[BlockOptions]) -> None:
         common: Any = dict(options)
         self.shape = common.pop("shape", None)
         if not (self.shape is None or isinstance(self.shape, Hull)):
@@ -249,7 +249,7 @@ class Pushing(OneBlock):
         tool_block_position: Where the center of the block begins: x and y if it stands on the
             floor, or x, y and z [m].
         goal_block_position: Default x and y of the goal, which is on the floor [m].
-        options: Of block, goal and every task; see ``Alike`` and ``Common``.
+        options: Of block, goal and every task; see ``BlockOptions`` and ``Common``.
     """
 
     name = "pushing"
@@ -267,7 +267,7 @@ class Pushing(OneBlock):
         *,
         tool_block_position: Place = (0.0, -0.08),
         goal_block_position: Place = (0.0, 0.08),
-        **options: Unpack[Alike],
+        **options: Unpack[BlockOptions],
     ) -> None:
         super().__init__(tool_block_position, **options)
         self._polar = floor_place("goal_block_position", goal_block_position, self.below(GOAL))
@@ -319,7 +319,7 @@ class Picking(OneBlock):
         tool_block_position: Where the center of the block begins: x and y if it stands on the
             floor, or x, y and z [m]. The goal is above it.
         goal_height: Default height of the center of the goal [m].
-        options: Of block, goal and every task; see ``Alike`` and ``Common``.
+        options: Of block, goal and every task; see ``BlockOptions`` and ``Common``.
     """
 
     name = "picking"
@@ -341,7 +341,7 @@ class Picking(OneBlock):
         *,
         tool_block_position: Place = (0.0, 0.0),
         goal_height: float = 0.15,
-        **options: Unpack[Alike],
+        **options: Unpack[BlockOptions],
     ) -> None:
         super().__init__(tool_block_position, **options)
         heights = numbers.Range(Box(0.0, 0.5), Box(*HEIGHT_A), Box(*HEIGHT_B), "m")
