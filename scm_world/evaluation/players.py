@@ -29,7 +29,6 @@ from scm_world.policies.scripted import NAMED, OpenLoopPolicy, Policy
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries.episode_files import load_episode
 from scm_world.queries.episodes import Episode
-from scm_world.queries.twins import Twins
 from scm_world.variables import Function
 from scm_world.world import Simulation
 
@@ -528,7 +527,7 @@ def _of_episode(episode: Episode | Recorded, about: About) -> Player:
         UnknownOption: It is an episode of equations, whose actions are not those of a robot.
     """
     if isinstance(episode, Episode):
-        if not isinstance(episode.twins, Twins):
+        if episode.twins.model is not None:
             raise UnknownOption("policy", episode, ("an episode of a world, not of equations",))
         mode = episode.twins.options["action_mode"]
         return _of_actions(

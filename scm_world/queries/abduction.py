@@ -27,7 +27,7 @@ from scm_world._types import Integers as Numbers
 from scm_world.errors import ImpossibleObservation, InterventionError, ModelError, UnknownOption
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier, first_value
-from scm_world.queries.equations import Layout
+from scm_world.queries.equations import CompiledModel
 from scm_world.queries.inversion import Found, density_of, noise_given, proposed
 from scm_world.queries.observations import Observations, observations
 from scm_world.queries.plans import Plan, at_once, numbered
@@ -220,7 +220,7 @@ class _Abduction:
         self.model, self.n, self._tolerance = model, n, tolerance
         own = np.random.SeedSequence((whole_number("seed", seed, least=0), 1))  # not that of data
         self._noise = Noise(int(own.generate_state(1)[0]))
-        self._together = Layout(model).is_vectorised
+        self._together = CompiledModel(model).is_vectorised
         self._seen, self._rows, self._size = seen, seen.rows, seen.rows * n
         if self._size * seen.steps > MOST:
             said = f"{seen.rows} units with {n} draws each of {seen.steps} instants are too many"

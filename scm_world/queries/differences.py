@@ -12,9 +12,8 @@ import numpy as np
 from scm_world._arguments import real_number, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.queries.episodes import Episode
+from scm_world.queries.episodes import Episode, as_names
 from scm_world.queries.outcomes import as_outcome, is_category, read
-from scm_world.queries.rollouts import as_names
 from scm_world.variables import Draw, Natural
 
 NOISY = ("sensor_noise", "actuator_noise")
@@ -122,7 +121,7 @@ def _divergence(first: Episode, second: Episode, name: str, tolerance: float) ->
     one, other = np.asarray(first[name], float), np.asarray(second[name], float)
     if one.shape != other.shape:
         return Divergence(0, float("inf"), 0, np.asarray(np.inf))
-    if any(is_category(world, name) for _, world in first.trace.declarations):
+    if any(is_category(world, name) for _, world in first.declarations):
         one, other = (one != other).astype(float), np.zeros_like(one)
     apart = np.abs(one - other).reshape(len(one), -1)
     sizes = apart.max(axis=1, initial=0.0)
@@ -136,9 +135,7 @@ def _divergence(first: Episode, second: Episode, name: str, tolerance: float) ->
 
 def _noise(episode: Episode) -> set[str]:
     """Name the draws of an episode: those of interventions, and of noise that is not zero."""
-    drawn = {
-        name for _, plan in episode.layers for name, act in plan.acts() if isinstance(act, Draw)
-    }
+    drawn = {name for name, act in episode.plan.acts() if isinstance(act, Draw)}
     there = set(episode.names)
     return drawn | {name for name in NOISY if name in there and np.any(episode[name])}
 
@@ -203,7 +200,7 @@ def but_for(
     """
     _check_episode(episode)
     most, at = whole_number("most", most, least=1), whole_number("at", at, least=0)
-    contrasts = _contrasts(episode, over, at)
+    contrasts = _contrasts(episode, over)
     wanted = as_outcome(outcome)
     actual = read(wanted, episode)
     found: list[ButFor] = []
@@ -223,12 +220,10 @@ def but_for(
     return tuple(sorted(found, key=lambda entry: (-entry.size, len(entry.causes))))
 
 
-def _contrasts(
-    episode: Episode, over: Iterable[str] | Mapping[str, Any] | None, at: int
-) -> dict[str, Any]:
+def _contrasts(episode: Episode, over: Iterable[str] | Mapping[str, Any] | None) -> dict[str, Any]:
     if isinstance(over, Mapping):
         return dict(over)
-    done = dict.fromkeys(name for start, plan in episode.layers if start <= at for name in plan)
+    done = episode.plan
     names = tuple(done) if over is None else as_names(over)
     for name in names:
         if name not in done:

@@ -14,16 +14,14 @@ from scm_world.errors import UnknownOption
 from scm_world.graph import scm as graph
 from scm_world.queries import samples
 from scm_world.queries.abduction import Counterfactuals, counterfactuals
-from scm_world.queries.episodes import Episode
-from scm_world.queries.equations import Equations, System
+from scm_world.queries.episodes import Episode, Unit, as_names
+from scm_world.queries.equations import CompiledModel, Equations, System, length
 from scm_world.queries.estimates import Effect, effect_of
-from scm_world.queries.live import LiveEpisode
 from scm_world.queries.outcomes import Outcome, as_outcome, is_category, usual_outcomes
-from scm_world.queries.plans import Plan, Schedule, numbered
+from scm_world.queries.plans import Plan, numbered
 from scm_world.queries.progress import Progress, part
-from scm_world.queries.rollouts import Unit, as_names, length
 from scm_world.queries.samples import Samples, Setting
-from scm_world.queries.twins import AnyTwins, EquationTwins
+from scm_world.queries.twins import Twins, twins_of
 from scm_world.variables import Variable
 
 
@@ -33,7 +31,7 @@ class Questions(ABC):
     __slots__ = ()
 
     @abstractmethod
-    def _asked(self) -> tuple[AnyTwins, System]:
+    def _asked(self) -> tuple[Twins, System]:
         """Return where episodes are run, and a system that knows what is declared."""
 
     @abstractmethod
@@ -84,12 +82,12 @@ class Questions(ABC):
             unit = Unit(
                 seed=seed,
                 number=episode,
-                schedule=Schedule([(0, plan)]),
+                plan=plan,
                 policy=policy,
                 steps=length(world, steps),
                 names=as_names(record),
             )
-            return Episode(twins, unit, unit.run(world))
+            return unit.run(world, twins)
 
     def live(
         self,
@@ -98,7 +96,7 @@ class Questions(ABC):
         seed: int = 0,
         episode: int = 0,
         do: Mapping[str, Any] | None = None,
-    ) -> LiveEpisode:
+    ) -> Episode:
         """Begin an episode that is run by hand: ``step``, ``do``, ``split``, ``episode``.
 
         Args:
@@ -111,7 +109,7 @@ class Questions(ABC):
             InterventionError: An intervention was refused.
         """
         plan = self._with(do)
-        made = LiveEpisode(self._asked()[0], Unit(seed, episode, Schedule([(0, plan)]), policy, 1))
+        made = Episode.live(self._asked()[0], Unit(seed, episode, plan, policy, 1))
         made.begin()
         return made
 
@@ -403,8 +401,8 @@ class SCM(Questions, graph.SCM):
         np.float64(0.981)
     """
 
-    __slots__ = ("_twins",)
-    _twins: EquationTwins
+    __slots__ = ("_system",)
+    _system: Equations
 
     def __init__(self, variables: Iterable[Variable] | graph.SCM) -> None:
         if isinstance(variables, graph.SCM):
@@ -485,16 +483,25 @@ class SCM(Questions, graph.SCM):
     def __exit__(self, *_: object) -> None:
         pass
 
-    def _asked(self) -> tuple[AnyTwins, System]:
-        if not hasattr(self, "_twins"):
-            self._twins = EquationTwins(self)
-        return self._twins, Equations(self._twins.layout)
+    def _asked(self) -> tuple[Twins, System]:
+        if not hasattr(self, "_system"):
+            self._system = Equations(CompiledModel(self))
+        return twins_of(self._system), self._system
 
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
-        plan = do if isinstance(do, Plan) else Plan(numbered(self, {} if do is None else do))
-        if not self.is_temporal:
-            for name, act in plan.timed():
-                if act.time.start != 0:
-                    allowed = ("none, or at=0: a model without lagged edges has one instant",)
-                    raise UnknownOption(f"time of an intervention on {name}", act, allowed)
-        return plan
+        return planned(self, do)
+
+
+def planned(model: graph.SCM, do: Mapping[str, Any] | None) -> Plan:
+    """Read an intervention on equations, with labels of categories as numbers.
+
+    Raises:
+        UnknownOption: It has a time, and the model has one instant.
+    """
+    plan = do if isinstance(do, Plan) else Plan(numbered(model, {} if do is None else do))
+    if not model.is_temporal:
+        for name, act in plan.timed():
+            if act.time.start != 0:
+                allowed = ("none, or at=0: a model without lagged edges has one instant",)
+                raise UnknownOption(f"time of an intervention on {name}", act, allowed)
+    return plan

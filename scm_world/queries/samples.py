@@ -14,8 +14,8 @@ import numpy as np
 from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.queries.episodes import Episode
-from scm_world.queries.equations import Equations, System
+from scm_world.queries.episodes import Episode, Unit, as_names
+from scm_world.queries.equations import Equations, System, length
 from scm_world.queries.outcomes import (
     ORDERLESS,
     Outcome,
@@ -25,11 +25,9 @@ from scm_world.queries.outcomes import (
     is_category,
     read,
 )
-from scm_world.queries.parallel import Result, paths, run_units
-from scm_world.queries.plans import Plan, Schedule
+from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
-from scm_world.queries.rollouts import Unit, as_names, length
-from scm_world.queries.twins import AnyTwins, EquationTwins
+from scm_world.queries.twins import Result, Twins
 from scm_world.world.interventions import merged
 
 STEPS = 25
@@ -105,14 +103,14 @@ class Setting:
         return Unit(
             seed=self.seed,
             number=number,
-            schedule=Schedule([(0, plan)]),
+            plan=plan,
             policy=self.policy,
             steps=length(world, self.steps),
             names=as_names(names),
         )
 
     def episode(
-        self, twins: AnyTwins, world: System, do: Mapping[str, Any] | None, number: int, names: Any
+        self, twins: Twins, world: System, do: Mapping[str, Any] | None, number: int, names: Any
     ) -> Episode:
         """Run one unit.
 
@@ -125,7 +123,7 @@ class Setting:
         """
         unit = self.unit(world, self.plan(world, do), number, names)
         with twins.twin() as twin:
-            return Episode(twins, unit, unit.run(twin))
+            return unit.run(twin, twins)
 
 
 @final
@@ -192,7 +190,7 @@ class Samples(Mapping[str, Floats]):
 
 
 def sample(
-    twins: AnyTwins,
+    twins: Twins,
     world: System,
     do: Mapping[str, Any] | None,
     n: int,
@@ -234,8 +232,7 @@ def sample(
         nonlocal done
         if isinstance(result, Exception):
             raise result
-        episode = Episode(twins, units[place], result)
-        found = [read(outcome, episode) for outcome in wanted]
+        found = [read(outcome, result) for outcome in wanted]
         done += 1
         if progress is not None:
             progress(done, count)
@@ -250,16 +247,15 @@ def sample(
             raise UnknownOption(f"time of an intervention on {name}", act, allowed)
     units = [replace(unit, number=number) for number in numbers]
     if each:
-        several = [Schedule([(0, plan.do(more))]) for more in each]
-        units = [replace(one, schedule=own) for one, own in zip(units, several, strict=True)]
-    if isinstance(twins, EquationTwins) and all(isinstance(one, Outcome) for one in wanted):
-        vectors = paths(twins, units)
-        read_off = (one.of_many(twins.layout.read(one.name, vectors)) for one in wanted)
+        units = [replace(one, plan=plan.do(own)) for one, own in zip(units, each, strict=True)]
+    if twins.model is not None and all(isinstance(one, Outcome) for one in wanted):
+        vectors = twins.paths(units)
+        read_off = (one.of_many(twins.model.read(one.name, vectors)) for one in wanted)
         found = [as_numbers(v, one) for v, one in zip(read_off, wanted, strict=True)]
         if progress is not None:
             progress(count, count)
     else:
-        rows = run_units(twins, units, finish, setting.workers)
+        rows = twins.run(units, finish, setting.workers)
         try:
             found = [np.array([row[i] for row in rows]) for i in range(len(wanted))]
         except ValueError:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, Self, final
+from typing import Any, Self, final, overload
 
 import networkx as nx
 
@@ -14,13 +14,12 @@ from scm_world._types import ArrayLike, Floats
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
 from scm_world.queries.comparison import Comparison, compare_backends
-from scm_world.queries.episodes import Episode
-from scm_world.queries.equations import System
+from scm_world.queries.equations import CompiledModel, Equations, System
 from scm_world.queries.local import local_graph
-from scm_world.queries.plans import Key, Plan, Schedule
+from scm_world.queries.plans import Key, Plan
 from scm_world.queries.progress import Progress
-from scm_world.queries.questions import Questions
-from scm_world.queries.twins import AnyTwins, twins_of
+from scm_world.queries.questions import SCM, Questions, planned
+from scm_world.queries.twins import Twins, twins_of
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit, Simulation, WorldSnapshot
@@ -45,15 +44,24 @@ class World(Simulation, Questions):
         True
     """
 
+    @overload
     @classmethod
-    def of(cls, world: Simulation) -> Self:
+    def of(cls, world: Simulation) -> Self: ...
+
+    @overload
+    @classmethod
+    def of(cls, world: SCM) -> EquationWorld: ...
+
+    @classmethod
+    def of(cls, world: Simulation | SCM) -> Self | EquationWorld:
         """Return a world like another one, at the same instant, that can be asked.
 
         Args:
-            world: Such as ``env.unwrapped.world``; it is left as it is.
+            world: Such as ``env.unwrapped.world``, which is left as it is; or a causal model
+                without a backend, which becomes a world to reset, step and do something to.
 
         Raises:
-            UnknownOption: It is not a world.
+            UnknownOption: It is neither.
 
         Example:
             >>> import gymnasium
@@ -63,8 +71,10 @@ class World(Simulation, Questions):
             ...     world.effect("reward", do={"floor_friction": 0.9}, n=2, steps=3).n
             2
         """
+        if isinstance(world, SCM):
+            return EquationWorld(CompiledModel(world))
         if not isinstance(world, Simulation):
-            raise UnknownOption("world", world, ("a world, such as env.unwrapped.world",))
+            raise UnknownOption("world", world, ("a world, such as env.unwrapped.world", "an SCM"))
         build, (_, *how) = Simulation.__reduce__(world)
         made: Self = build(cls, *how)
         return made
@@ -173,7 +183,7 @@ class World(Simulation, Questions):
         )
 
     _standing: Plan = Plan()
-    _schedule: Schedule = Schedule(())
+    _running: Plan = Plan()
     _fired: Mapping[Key, int] = MappingProxyType({})
 
     # --- another world ------------------------------------------------------------------------
@@ -200,42 +210,12 @@ class World(Simulation, Questions):
         other = copy.deepcopy(self)
         other._standing = self._with(do)
         if other._started:
-            other._schedule = Schedule([*self._schedule.layers, (other.index, Plan(do))])
+            other._running = self._running.then(do, self.model, at=self.index)
             other._fired = fired = dict(self._fired)
-            due = other._schedule.due(other, other.index, fired)
+            due = other._running.due(other, other.index, fired)
             if due:
                 other.do(due)
         return other
-
-    def counterfactual(
-        self,
-        do: Mapping[str, Any] | None = None,
-        *,
-        at: int = 0,
-        actions: Any = "replay",
-        policy: Any = None,
-        seed: int = 0,
-        episode: int = 0,
-        steps: int | None = None,
-        record: Iterable[str] = (),
-    ) -> Episode:
-        """Run an episode and return its counterfactual: an intervention, with the same noise.
-
-        Args:
-            do: The intervention; without a time it takes place at the instant ``at``.
-            at: Number of the control step.
-            actions: ``"replay"`` for the same actions, or a policy that acts from there on.
-            policy: Of the episode; see ``rollout``, also for what follows.
-            seed: Of the noise.
-            episode: Number of the episode within that noise.
-            steps: How many control steps.
-            record: Variables to write down on the way.
-
-        Returns:
-            The episode as it would have been; compare it with ``rollout`` of the same seed.
-        """
-        factual = self.rollout(policy, seed=seed, episode=episode, steps=steps, record=record)
-        return factual.counterfactual(do, at=at, actions=actions, record=record)
 
     def compare(
         self, backend: str, *, probes: int = 12, seed: int = 0, progress: Progress | None = None
@@ -307,7 +287,7 @@ class World(Simulation, Questions):
             arguments,
             {
                 "_standing": self._standing,
-                "_schedule": self._schedule,
+                "_running": self._running,
                 "_fired": dict(self._fired),
             },
         )
@@ -323,19 +303,19 @@ class World(Simulation, Questions):
         """Begin an episode, with what is given; see ``Simulation.reset``."""
         plan = self._with(do)
         if not len(self._standing) and not any(True for _ in plan.timed()):
-            self._schedule, self._fired = Schedule(()), {}
+            self._running, self._fired = Plan(), {}
             return super().reset(seed=seed, episode=episode, do=do, space=space)
         super().reset(seed=seed, episode=episode)
         fired: dict[Key, int] = {}
-        self._schedule, self._fired = Schedule([(0, plan)]), fired
-        due = self._schedule.due(self, 0, fired)
+        self._running, self._fired = plan, fired
+        due = plan.due(self, 0, fired)
         return self.do(due, space=space) if due else None
 
     def advance(self, command: Floats) -> None:
         """Advance one control step, with what is due at its beginning."""
-        if self._schedule.layers and self.index:
+        if len(self._running) and self.index:
             fired = dict(self._fired)
-            due = self._schedule.due(self, self.index, fired)
+            due = self._running.due(self, self.index, fired)
             self._fired = fired
             if due:
                 self.do(due)
@@ -343,18 +323,56 @@ class World(Simulation, Questions):
 
     def snapshot(self) -> WorldSnapshot:
         """Save everything, with the events that have happened."""
-        return replace(super().snapshot(), memory=(self._schedule, dict(self._fired)))
+        return replace(super().snapshot(), memory=(self._running, dict(self._fired)))
 
     def restore(self, snapshot: WorldSnapshot) -> None:
         """Go back to a snapshot, bit for bit."""
         super().restore(snapshot)
         if snapshot.memory is not None:
-            self._schedule, self._fired = snapshot.memory[0], dict(snapshot.memory[1])
+            self._running, self._fired = snapshot.memory[0], dict(snapshot.memory[1])
 
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
         """Add something to what is given; of two names of one quantity the later one counts."""
         plan = Plan(do)
         return Plan(merged(self.model, self._standing, plan)) if len(self._standing) else plan
 
-    def _asked(self) -> tuple[AnyTwins, System]:
+    def _asked(self) -> tuple[Twins, System]:
         return twins_of(self), self
+
+
+@final
+class EquationWorld(Equations, Questions):
+    """Equations that also answer questions: a ``World`` without a backend; see ``World.of``.
+
+    Example:
+        >>> from scm_world.variables import Derived, Exogenous, Linear, Normal
+        >>> model = SCM([
+        ...     Exogenous(name="x", distribution=Normal()),
+        ...     Derived(name="y", parents=("x",), mechanism=Linear(weights=(2.0,))),
+        ... ])
+        >>> world = World.of(model)
+        >>> world.reset(seed=0)
+        >>> print(world.do({"x": 1.5}))
+        x = 1.5
+          follows: y -2.186088 → 3.
+        >>> float(world["y"])
+        3.0
+        >>> world.effect("y", do={"x": 1.0}, versus={"x": 0.0}, n=10).mean.round(3)
+        np.float64(2.0)
+    """
+
+    def given(self, do: Mapping[str, Any]) -> Self:
+        """Return another world in which this is done too; this one is not changed."""
+        return type(self)(CompiledModel(self.model.do(do)))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def _asked(self) -> tuple[Twins, System]:
+        return twins_of(self), self
+
+    def _with(self, do: Mapping[str, Any] | None) -> Plan:
+        return planned(self.model, do)

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from scm_world.errors import ActionError, InterventionError, UnknownOption
-from scm_world.queries import SCM, Plan, World
-from scm_world.queries.live import LiveEpisode
+from scm_world.queries import SCM, Episode, Plan, World
 from scm_world.variables import (
     Derived,
     Draw,
@@ -31,7 +30,7 @@ def world() -> Iterator[World]:
         yield made
 
 
-def walked(live: LiveEpisode, steps: int) -> None:
+def walked(live: Episode, steps: int) -> None:
     """Take some control steps with the policy."""
     for _ in range(steps):
         live.step()
@@ -53,7 +52,7 @@ def test_it_is_the_episode_of_its_plan(world: World) -> None:
     assert episode.steps == 15
     plan = {MASS: [Hard(0.05, during=(5, None))], FRICTION: Hard(0.2, during=(9, 12))}
     assert world.rollout("random", seed=3, do=plan, steps=15) == episode
-    assert world.rollout(live.actions, seed=3, do=live.plan(), steps=15) == episode
+    assert world.rollout(live.actions, seed=3, do=live.plan, steps=15) == episode
     assert episode.counterfactual({}, at=10) == episode
     assert not world.has_begun
 
@@ -90,7 +89,7 @@ def test_the_plan_says_what_was_done(world: World) -> None:
     live.do({MASS: Natural()})
     live.do({FRICTION: Hard(0.4, during=(9, 11))})
     walked(live, 6)
-    plan = Plan.from_json(live.plan().to_json())
+    plan = Plan.from_json(live.plan.to_json())
     assert world.rollout("random", seed=5, do=plan, steps=15) == live.episode()
 
 
