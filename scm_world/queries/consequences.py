@@ -117,9 +117,9 @@ def consequences(
         ((), True)
     """
     one_of("space", space, (None, *SPACES))
+    if not isinstance(system, Questions):
+        raise UnknownOption("system", system, ("a World", "an SCM"))
     given: Any = system
-    if not isinstance(given, Questions):
-        raise UnknownOption("system", given, ("a World", "an SCM"))
     steps = whole_number("steps", steps, least=0) if given.graph.is_temporal else 0
     with closing(given.live(seed=seed)) as plain, closing(plain.split()) as other:
         world, before = other.world, plain.world.values()

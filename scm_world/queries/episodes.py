@@ -137,7 +137,6 @@ class Episode:
         unit: What is run.
         world: The twin at the present instant, while the episode is under way; change it through
             the episode only.
-        policy: What acts, while it is under way; it can be replaced.
         vectors: State of each instant, after what was done then.
         statics: From when which values of parameters held.
         declarations: From when which structure there was.
@@ -166,7 +165,6 @@ class Episode:
     twins: Any
     unit: Unit
     world: Any = None
-    policy: Any = None
     vectors: list[Floats] = field(default_factory=list)
     statics: list[tuple[int, dict[str, Value]]] = field(default_factory=list)
     declarations: list[tuple[int, Any]] = field(default_factory=list)
@@ -177,6 +175,7 @@ class Episode:
     values: dict[str, list[Value]] = field(default_factory=dict)
     touching: list[Pairs] = field(default_factory=list)
     touched: list[Pairs] = field(default_factory=list)
+    _policy: Any = field(default=None, init=False)
     _version: int = field(default=-1, init=False)
     _lease: ExitStack = field(default_factory=ExitStack, init=False)
     _arrival: Floats | None = field(default=None, init=False)  # the present, before what is done
@@ -188,7 +187,7 @@ class Episode:
         """Return an episode under way in a world, with the past of its unit."""
         made = cls(twins, unit) if unit.past is None else unit.past.until(unit.first)
         made.twins, made.unit, made.world = twins, unit, world
-        made.policy, made._settled = as_policy(unit.policy, world), unit.plan
+        made.policy, made._settled = unit.policy, unit.plan
         return made
 
     @classmethod
@@ -270,7 +269,7 @@ class Episode:
 
     def ended(self) -> Self:
         """Leave the world; the episode is over."""
-        self.world = self.policy = None
+        self.world = self._policy = None
         return self
 
     # --- by hand ------------------------------------------------------------------------------
@@ -279,6 +278,15 @@ class Episode:
         if self.world is None:
             raise UnknownOption("episode", "one that is over", ("one that world.live() began",))
         return self.world
+
+    @property
+    def policy(self) -> Any:
+        """What acts in an episode under way; see ``rollout``. It can be replaced at any time."""
+        return self._policy
+
+    @policy.setter
+    def policy(self, given: Any) -> None:
+        self._policy = as_policy(given, self.world)
 
     @property
     def held(self) -> dict[str, Any]:

@@ -154,8 +154,7 @@ class Twins:
 
         Args:
             units: All of the same steps, with the same names and kind of policy.
-            finish: Called with the place of a unit and its result; what it raises is raised. It
-                may be called by several threads, in any order.
+            finish: Called with the place of a unit and its result; what it raises is raised.
             workers: Threads, see ``Setting``.
 
         Returns:
@@ -175,8 +174,7 @@ class Twins:
             results = (self._alone(unit) for unit in units)
         else:
             with ThreadPoolExecutor(given) as pool:  # backends compute without Python's lock
-                places = range(len(units))
-                return [*pool.map(lambda i: finish(i, self._alone(units[i])), places)]
+                return [*map(finish, range(len(units)), pool.map(self._alone, units))]
         with closing(results):
             return [finish(place, result) for place, result in enumerate(results)]
 
