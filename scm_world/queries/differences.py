@@ -13,7 +13,7 @@ from scm_world._arguments import real_number, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode
-from scm_world.queries.outcomes import as_outcome, is_category, read
+from scm_world.queries.outcomes import Outcome, as_outcome, is_category, read
 from scm_world.queries.rollouts import as_names
 from scm_world.variables import Draw, Natural
 
@@ -122,7 +122,7 @@ def _divergence(first: Episode, second: Episode, name: str, tolerance: float) ->
     one, other = np.asarray(first[name], float), np.asarray(second[name], float)
     if one.shape != other.shape:
         return Divergence(0, float("inf"), 0, np.asarray(np.inf))
-    if any(is_category(world, name) for _, world in first.trace.declarations):
+    if any(is_category(world, Outcome(name)) for _, world in first.trace.declarations):
         one, other = (one != other).astype(float), np.zeros_like(one)
     apart = np.abs(one - other).reshape(len(one), -1)
     sizes = apart.max(axis=1, initial=0.0)

@@ -249,7 +249,7 @@ class Laboratory:
                 raise
             found = replace(found, plan=plan)
             self.records.append(Experiment(kind, found))
-            return found.copy()
+            return found
 
     # --- permissions --------------------------------------------------------------------------
 

@@ -14,11 +14,9 @@ from scm_world.queries.equations import Equations, System
 from scm_world.tasks.rewards import FRACTION
 from scm_world.variables.spaces import Frozen
 
-MANY = 10  # numbers, of which an error shows the first wrong one
 ORDERLESS = ("final", "first", "path")
 """The summaries that categories have."""
 HOWS = ("final", "mean", "max", "min", "sum", "first", "change", "path")
-Given = "str | Outcome | Callable[[Episode], Any]"
 
 
 @final
@@ -96,16 +94,15 @@ def as_outcome(given: Any) -> Any:
         return Outcome(given)
     if isinstance(given, Outcome) or callable(given):
         return given
-    raise UnknownOption(
-        "outcome",
-        given,
-        ("the name of a variable", "Outcome(name, how)", "a function of the episode"),
-    )
+    allowed = ("the name of a variable", "Outcome(name, how)", "a function of the episode")
+    raise UnknownOption("outcome", given, allowed)
 
 
-def is_category(world: Any, name: str) -> bool:
-    """Return whether a variable of a system has categories, whose numbers have no order or mean."""
-    return name in world.model and world.model.declared(name).dtype == "categorical"
+def is_category(system: System, outcome: Any) -> bool:
+    """Return whether an outcome has categories, whose numbers have no order or mean."""
+    if not isinstance(outcome, Outcome) or outcome.name not in system.model:
+        return False
+    return system.model.declared(outcome.name).dtype == "categorical"
 
 
 def usual_outcomes(world: System) -> tuple[str, ...]:
@@ -133,7 +130,7 @@ def read(outcome: Any, episode: Episode) -> Floats:
     """Read an outcome off an episode, as numbers.
 
     Raises:
-        UnknownOption: It is no finite numbers.
+        UnknownOption: They are not finite numbers.
         FunctionFailure: A function raised an error.
     """
     if isinstance(outcome, Outcome):
@@ -144,19 +141,13 @@ def read(outcome: Any, episode: Episode) -> Floats:
 
 
 def as_numbers(value: Any, outcome: Any) -> Floats:
-    """Check the value of an outcome.
-
-    Raises:
-        UnknownOption: It is no finite numbers.
-    """
+    """Return the value of an outcome as finite numbers; refuse others, and name the first one."""
     try:
         number = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         number = np.asarray(np.nan)
     if not np.isfinite(number).all():
-        wrong = (
-            value if np.size(value) < MANY else np.ravel(number)[~np.isfinite(np.ravel(number))][0]
-        )
+        wrong = value if np.size(value) < 10 else number[~np.isfinite(number)][0]
         raise UnknownOption(f"value of the outcome {label(outcome)!r}", wrong, ("finite numbers",))
     return number
 

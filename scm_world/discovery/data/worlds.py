@@ -227,8 +227,7 @@ class WorldSource:
         units: list[Unit] = []
         for number, done in zip(numbers, regimes, strict=True):
             given = Plan(merged(self._world.model, self._given, done.plan))
-            plan = self._setting.plan(self._world, given)
-            unit = self._setting.unit(self._world, plan, number, written)
+            unit = self._setting.unit(self._world, given, number, written)
             units.append(replace(unit, listens=self._contacts))
         found = run_units(self._twins, units, finish, self._setting.workers)
         rows: list[Row] = []
