@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Literal, final
 
 import numpy as np
@@ -96,6 +97,12 @@ def as_outcome(given: Any) -> Any:
         return given
     allowed = ("the name of a variable", "Outcome(name, how)", "a function of the episode")
     raise UnknownOption("outcome", given, allowed)
+
+
+def as_outcomes(given: Any) -> list[Any]:
+    """Return outcomes, each as ``as_outcome`` does; a single one counts as a list of one."""
+    alone = not isinstance(given, Iterable) or isinstance(given, str | Outcome)
+    return [as_outcome(outcome) for outcome in ((given,) if alone else given)]
 
 
 def is_category(system: System, outcome: Any) -> bool:

@@ -20,7 +20,7 @@ from scm_world.queries.outcomes import (
     ORDERLESS,
     Outcome,
     as_numbers,
-    as_outcome,
+    as_outcomes,
     column,
     is_category,
     read,
@@ -192,8 +192,7 @@ def sample(
         progress: Called after each episode.
     """
     count, first = whole_number("n", n, least=1), whole_number("first", first, least=0)
-    alone = not isinstance(outcomes, Iterable) or isinstance(outcomes, str | Outcome)
-    wanted = [as_outcome(outcome) for outcome in ((outcomes,) if alone else outcomes)]
+    wanted = as_outcomes(outcomes)
     for one in wanted:
         if is_category(system, one) and one.how not in ORDERLESS:
             raise UnknownOption(f"summary of the categories of {one.name!r}", one.how, ORDERLESS)
