@@ -15,7 +15,7 @@ Source:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -29,7 +29,7 @@ from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier, first_value
 from scm_world.queries.equations import Layout
 from scm_world.queries.inversion import Found, density_of, noise_given, proposed
-from scm_world.queries.observations import Observations, observations
+from scm_world.queries.observations import Observations, observations, per
 from scm_world.queries.plans import Plan, at_once, numbered
 from scm_world.variables import (
     Action,
@@ -183,15 +183,9 @@ class Counterfactuals(Mapping[str, Floats]):
 
 
 def counterfactuals(
-    model: SCM,
-    observed: Any,
-    do: Mapping[str, Any],
-    *,
-    n: int | None = None,
-    seed: int = 0,
-    tolerance: float = 1e-6,
+    model: SCM, observed: Any, do: Mapping[str, Any], n: int | None, seed: int, tolerance: float
 ) -> Counterfactuals:
-    """Say what observed units would have been under an intervention; see ``SCM.counterfactual``."""
+    """Return what observed units would have been; see ``SCM.counterfactual``."""
     tolerance = real_number("tolerance", tolerance, least=0.0)
     seen = observations(model, observed)
     if n is None:
@@ -228,50 +222,48 @@ class _Abduction:
         self._log_weights = np.zeros(self._size)
         self._ancestors = np.tile(np.arange(n), self._rows)
         self.sampled = False
-        self._given: list[dict[str, Value]] = []  # noise, by instant
+        self._given: list[dict[str, Value]] = []  # noise, and roots without intervention, by step
         self._values: list[dict[str, Value]] = []
-        self._before: Values = self._start(model)
-        constants = {name for name in model if _per(model.declared(name)) == "episode"}
+        self._before: Values = {}
+        order = model.structure.order
         for step in range(seen.steps):
-            kept = self._given[0].items() if step else ()
-            self._given.append({name: noise for name, noise in kept if name in constants})
+            self._given.append(self._constants() if step else {})
             self._values.append({})
-            for name in model.structure.order:
-                self._find(model[name], step)
+            if model.is_temporal and not step:  # the instant before has the constants, too
+                for name in order:
+                    if per(model[name]) == "episode" and not model[name].all_parents:
+                        self._find(model[name], 0)
+                self._before = self._start(model)
+            for name in order:
+                if name not in self._values[-1]:
+                    self._find(model[name], step)
                 if certain and self.sampled:
                     return
             self._before = model.remembered(self._values[-1], self._before)
             if step < seen.steps - 1:
                 self._draw_again(step)
 
-    # --- abduction ------------------------------------------------------------------------------
+    def _constants(self) -> dict[str, Value]:
+        """Return the noise of the first step that is that of the whole episode."""
+        known = self._given[0].items()
+        return {name: value for name, value in known if per(self.model.declared(name)) == "episode"}
 
-    def _observed(self, name: str, step: int) -> tuple[Value, Value]:
-        """Return values of a variable, 0 where it was not observed, and where it was."""
-        declared = self.model.declared(name)
-        if name not in self._seen.values:
-            return np.zeros((self._size, *declared.shape)), np.zeros(self._size, dtype=bool)
-        found = self._seen.values[name]
-        if _per(declared) == "episode":  # known once it is seen
-            first = np.isfinite(found).argmax(axis=1)[:, None]
-            found = np.where(np.isnan(found), np.take_along_axis(found, first, axis=1), found)
-        wanted = np.repeat(found[:, step], self.n, axis=0)
-        return np.nan_to_num(wanted), ~np.isnan(wanted).reshape(self._size, -1).any(axis=1)
+    # --- abduction ------------------------------------------------------------------------------
 
     def _find(self, variable: Any, step: int) -> None:
         """Find value and noise of a variable, from what was observed of it and of its causes."""
-        name, values, given = variable.name, self._values[-1], self._given[-1]
-        wanted, there = self._observed(name, step)
+        name, given = variable.name, self._given[-1]
+        wanted = np.repeat(self._seen.values[name][:, step], self.n, axis=0)
+        there = ~np.isnan(wanted).reshape(self._size, -1).any(axis=1)
+        wanted = np.nan_to_num(wanted)
+        natural = self._without_intervention(name, wanted) if there.any() else wanted
         source = _source(variable)
-        if source is None and _is_free(variable):
-            exogenous = isinstance(variable, Exogenous)
-            default = variable.array(variable.default) if exogenous else np.zeros(variable.shape)
-            values[name] = _either(there, wanted, default)
-            return
         unsure = self.sampled and bool(variable.all_parents)
-        if source is not None and name not in given:
+        if source is None and _is_free(variable):
+            given[name] = _either(there, natural, first_value(variable))
+        elif source is not None and name not in given:
             given[name] = self._drawn(variable, source, step, there)
-            found = self._inverted(variable, source, wanted, step) if there.any() else None
+            found = self._inverted(variable, source, natural, step) if there.any() else None
             self.sampled |= found is None or found.drawn or not there.all()
             unsure |= found is None
             if found is not None:
@@ -280,20 +272,38 @@ class _Abduction:
                 self._weigh(name, there & ~possible, unsure=unsure)
                 self._log_weights[possible] += log[possible]
                 given[name] = _either(possible, found.noise, given[name])
-        value = self._computed(self.model, name, values, self._before, step)
-        self._weigh(name, there & ~self._near(value, wanted), unsure=unsure)
+        value = self._computed(self.model, name, self._values[-1], self._before, step)
+        apart = np.abs(np.asarray(value, dtype=float) - wanted).reshape(self._size, -1)
+        most = self._tolerance * (1.0 + np.abs(wanted)).reshape(self._size, -1)
+        self._weigh(name, there & ~(apart <= most).all(axis=1), unsure=unsure)
         value = _either(there, wanted, value)
-        values[name] = value if variable.dtype == "real" else np.rint(value).astype(np.int64)
+        self._values[-1][name] = (
+            value if variable.dtype == "real" else np.rint(value).astype(np.int64)
+        )
+
+    def _without_intervention(self, name: str, value: Value) -> Value:
+        """Return what a variable would have been that was observed under a shift or scale."""
+        act = self.model.act_on(name)
+        match None if act is None else act.intervention:
+            case Shift(by=by):
+                return np.asarray(value - np.asarray(by))
+            case Scale(by=by):
+                if not np.all(by):
+                    said = f"{name!r} was observed under Scale(0), which tells nothing of it"
+                    raise ModelError([f"{said}: leave it out, or give NaN"])
+                return np.asarray(value / np.asarray(by))
+        return value
 
     def _drawn(self, variable: Any, source: Any, step: int, there: Value) -> Value:
         """Draw the noise of a variable; weigh it where the variable was not observed."""
-        key, shape = self._key(step), getattr(variable, "noise_shape", None) or variable.shape
-        found = proposed(source, shape, self._shares(f"{variable.name}|hidden", shape, step))
+        name, shape = variable.name, getattr(variable, "noise_shape", None) or variable.shape
+        found = proposed(source, shape, self._shares(f"{name}|hidden", shape, step))
         if found is not None:
             log = found.log_density.reshape(self._size, -1).sum(axis=1)
             self._log_weights += np.where(there, 0.0, log)
             return found.noise
-        return key.natural(source, variable.name, shape, self._values[-1])
+        key = NoiseKey(self._noise, 0, step, self._size)
+        return key.natural(source, name, shape, self._values[-1])
 
     def _shares(self, name: str, shape: tuple[int, ...], step: int) -> Floats:
         size = int(np.prod(shape))
@@ -302,49 +312,37 @@ class _Abduction:
 
     def _inverted(self, variable: Any, source: Any, value: Value, step: int) -> Found | None:
         """Find the noise of a variable for an observed value; None where only draws can tell."""
-        name, act, values = variable.name, self.model.act_on(variable.name), self._values[-1]
+        name, shape, values = variable.name, variable.shape, self._values[-1]
         if isinstance(variable, Exogenous):
             try:
-                log = density_of(source, variable.shape, values).log_density(value)
+                log = density_of(source, shape, values).log_density(value)
             except ModelError:
                 if source.parents():
                     raise
                 log = np.zeros(self._size)
             # without causes the density is the same for all draws
             return Found(value, log if source.parents() else np.where(np.isfinite(log), 0.0, log))
-        match None if act is None else act.intervention:
-            case Shift(by=by):
-                value = value - np.asarray(by)
-            case Scale(by=by):
-                if not np.all(by):
-                    said = f"{name!r} was observed under Scale(0), which tells nothing of it"
-                    raise ModelError([f"{said}: leave it out, or give NaN"])
-                value = value / np.asarray(by)
         parents: list[Value] = []
         for parent in variable.all_parents:
             known = self._before if parent.lag else values
             where = earlier(parent.name, parent.lag) if parent.lag else parent.name
             first = first_value(self.model.declared(parent.name))
             parents.append(known.get(where, np.broadcast_to(first, (self._size, *first.shape))))
-        shares = self._shares(f"{name}|abduction", variable.shape, step)
-        return noise_given(variable, source, value, parents, self._apply, shares)
 
-    def _apply(
-        self, function: Any, parents: list[Value], noise: Values, shape: tuple[int, ...]
-    ) -> Value:
-        """Call a function for all units; NaN where it is not defined, as the logarithm of 0."""
+        def apply(
+            function: Any, parents: list[Value], noise: Values, shape: tuple[int, ...]
+        ) -> Value:
+            def called(key: NoiseKey, parents: Mapping[Any, Value], noise: Values) -> Value:
+                try:
+                    with np.errstate(all="ignore"):
+                        return np.asarray(function(*parents.values(), **noise), dtype=float)
+                except (ArithmeticError, ValueError):  # not defined there, as the logarithm of 0
+                    return np.full(shape if key.count is None else (key.count, *shape), np.nan)
 
-        def called(parents: list[Value], noise: Values, shape: tuple[int, ...]) -> Value:
-            try:
-                with np.errstate(all="ignore"):
-                    return np.asarray(function(*parents, **noise), dtype=float)
-            except (ArithmeticError, ValueError):
-                return np.full(shape, np.nan)
+            return self._each(called, step, {}, dict(enumerate(parents)), noise)
 
-        if self._together:
-            return called(parents, noise, (self._size, *shape))
-        rows = range(self._size)
-        return np.array([called([p[i] for p in parents], _row(noise, i), shape) for i in rows])
+        shares = self._shares(f"{name}|abduction", shape, step)
+        return noise_given(variable, source, value, parents, apply, shares)
 
     def _weigh(self, name: str, wrong: Value, *, unsure: bool) -> None:
         """Leave out draws that contradict an observation; refuse what no draw gives."""
@@ -468,9 +466,9 @@ class _Abduction:
             return
         self.sampled = True
         shape = getattr(self.model.declared(name), "noise_shape", None)
-        held[name] = self._key(0 if _per(variable) == "episode" else step).draw(
-            source, name, variable.shape if shape is None else shape, values, "counterfactual"
-        )
+        key = NoiseKey(self._noise, 0, 0 if per(variable) == "episode" else step, self._size)
+        own = variable.shape if shape is None else shape
+        held[name] = key.draw(source, name, own, values, "counterfactual")
 
     def _stacked(self, instants: list[dict[str, Value]]) -> dict[str, Floats]:
         """Return all values by variable, shape (rows, n, *shape), or with steps in between."""
@@ -483,39 +481,48 @@ class _Abduction:
 
     # --- evaluation -----------------------------------------------------------------------------
 
-    def _key(self, step: int, given: Values | None = None) -> NoiseKey:
-        return NoiseKey(self._noise, 0, step, self._size, given=given)
-
-    def _near(self, found: Value, wanted: Value) -> Value:
-        """Return which units are as observed, shape (units,)."""
-        apart = np.abs(np.asarray(found, dtype=float) - wanted)
-        close = apart <= self._tolerance * (1.0 + np.abs(wanted))
-        return np.asarray(close.reshape(len(close), -1).all(axis=1))
-
     def _computed(self, model: SCM, name: str, values: Values, before: Values, step: int) -> Value:
         """Compute one variable with the noise that was found."""
-        more = {"previous": before, "only": (name,)}
-        return self._solved(model.solve, (name,), values, step, more)[name]
+        given = self._given[step]
+        known = {**values, name: given[name]} if name in given else values
+
+        def solved(key: NoiseKey, known: Values, before: Values) -> Value:
+            return model.solve(known, previous=before, key=key, only=(name,))[name]
+
+        return self._each(solved, step, given, known, before)
 
     def _start(self, model: SCM) -> dict[str, Value]:
         """Compute what the first step of a model with lagged edges looks back at."""
-        free = [n for n in model if _is_free(model[n]) and not isinstance(model[n], Exogenous)]
-        known = {name: np.zeros((self._size, *model.declared(name).shape)) for name in free}
-        return self._solved(model.begin, model, known, 0, {}) if model.is_temporal else {}
+        values: dict[str, Value] = {}
+        given = self._constants()
+        for name in model.structure.order if model.is_temporal else ():
+            variable = model[name]
+            if name in given:
+                values[name] = given[name]
+            elif _is_free(variable) and not isinstance(variable, Exogenous):
+                values[name] = np.zeros((self._size, *variable.shape))
 
-    def _solved(
-        self, solve: Any, names: Iterable[str], values: Values, step: int, more: dict[str, Any]
-    ) -> dict[str, Value]:
-        """Solve all units together, or one after another where functions take one only."""
-        given: Values = self._given[step] if step < len(self._given) else {}
+            def begun(key: NoiseKey, known: Values, name: str = name) -> Value:
+                return model.begin(known, key=key, only=(name,))[name]
+
+            values[name] = self._each(begun, 0, given, values)
+        return values
+
+    def _each(
+        self, function: Callable[..., Value], step: int, given: Values, *known: Mapping[Any, Value]
+    ) -> Value:
+        """Call a function of values for all units together, or for one after another."""
         if self._together:
-            return dict(solve(values, key=self._key(step, given), **more))
-        before, rows = more.get("previous", {}), []
-        for row in range(self._size):
-            key = NoiseKey(self._noise, row, step, given=_row(given, row))
-            more = {**more, "previous": _row(before, row)} if before else more
-            rows.append(solve(_row(values, row), key=key, **more))
-        return {name: np.array([row[name] for row in rows]) for name in names}
+            key = NoiseKey(self._noise, 0, step, self._size, given=given)
+            return np.asarray(function(key, *known))
+        rows = [
+            function(
+                NoiseKey(self._noise, row, step, given=_row(given, row)),
+                *(_row(values, row) for values in known),
+            )
+            for row in range(self._size)
+        ]
+        return np.array(rows)
 
 
 def _moved(variable: Any, was: Values, values: Values) -> Value:
@@ -534,12 +541,8 @@ def _either(there: Value, one: Value, other: Value) -> Value:
     return np.where(there.reshape(-1, *(1,) * (np.ndim(one) - 1)), one, other)
 
 
-def _row(values: Values, row: int) -> dict[str, Value]:
+def _row(values: Mapping[Any, Value], row: int) -> dict[Any, Value]:
     return {name: value[row] for name, value in values.items()}
-
-
-def _per(variable: Any) -> str:
-    return getattr(variable, "per", "step")
 
 
 def _source(variable: Any) -> Any:

@@ -20,7 +20,7 @@ class Observations(NamedTuple):
     """Observations of some units.
 
     Attributes:
-        values: By variable, shape (rows, steps, *shape); NaN where nothing was observed.
+        values: Every variable, shape (rows, steps, *shape); NaN where it was not observed.
         rows: How many units.
         steps: How many control steps; 1 without lagged edges.
         one: Whether a single unit was given, without an axis for rows.
@@ -33,22 +33,13 @@ class Observations(NamedTuple):
 
 
 def observations(model: SCM, observed: Any) -> Observations:
-    """Read observations.
+    """Read observations: values or labels by name, a data frame, or a ``Dataset``.
 
-    Args:
-        model: Whose variables were observed.
-        observed: Values or labels by name, a data frame, or a ``Dataset``. Names of components,
-            such as ``"v[2]"``, are put together. Rows of several control steps are put side by
-            side.
-
-    Raises:
-        UnknownVariable: The model has no variable of a name.
-        ModelError: Shapes do not fit together, a vector was observed in part, or something was
-            done in a row.
-        ImpossibleObservation: A value is infinite, or neither number nor label.
+    Names of components, such as ``"v[2]"``, are put together. Rows of several control steps are put
+    side by side. What is drawn once per episode is known once it is seen.
     """
     temporal, columns = model.is_temporal, _columns(model, observed)
-    leads, found = set[tuple[int, ...]](), dict[str, Value]()
+    leads = set[tuple[int, ...]]()
     for name, values in columns.items():
         shape = model.declared(name).shape
         lead = values.shape[: values.ndim - len(shape)]
@@ -57,8 +48,6 @@ def observations(model: SCM, observed: Any) -> Observations:
             said = f"{name!r} was observed with shape {values.shape}: give {allowed}"
             raise ModelError([said + f" and then {shape}" * bool(shape)])
         leads.add(lead)
-        rows = lead[0] if len(lead) > temporal else 1
-        found[name] = values.reshape(rows, lead[-1] if temporal else 1, *shape)
         unknown = np.isnan(values.reshape(*lead, int(np.prod(shape))))
         if np.isinf(values).any():
             said = "an observation is finite, or NaN where there is none"
@@ -68,8 +57,23 @@ def observations(model: SCM, observed: Any) -> Observations:
     if len(leads) != 1 or 0 in next(iter(leads)):
         said = "observe at least one variable, and all of the same rows and control steps"
         raise ModelError([said])
-    rows, steps = next(iter(found.values())).shape[:2]
-    return Observations(found, rows, steps, len(leads.pop()) == temporal)
+    lead = leads.pop()
+    rows, steps = lead[0] if len(lead) > temporal else 1, lead[-1] if temporal else 1
+    found: dict[str, Value] = {}
+    for variable in model.variables:
+        values = columns.get(variable.name, np.array(np.nan))
+        whole = (rows, steps, *variable.shape)
+        values = values.reshape(whole) if values.ndim else np.full(whole, values)
+        if per(variable) == "episode":
+            first = np.isfinite(values).argmax(axis=1)[:, None]
+            values = np.where(np.isnan(values), np.take_along_axis(values, first, axis=1), values)
+        found[variable.name] = values
+    return Observations(found, rows, steps, len(lead) == temporal)
+
+
+def per(variable: Any) -> str:
+    """Return whether a variable is drawn once for an ``"episode"`` or in every ``"step"``."""
+    return getattr(variable, "per", "step")
 
 
 def _columns(model: SCM, observed: Any) -> dict[str, Value]:
@@ -110,13 +114,8 @@ def _columns(model: SCM, observed: Any) -> dict[str, Value]:
 
 
 def _numbers(model: SCM, name: str, values: Value) -> Value:
-    """Read numbers or labels of a variable; None is NaN.
-
-    Raises:
-        ImpossibleObservation: Something is neither.
-    """
-    bounds = model.declared(name).bounds
-    known = {}
+    """Return numbers for numbers or labels of a variable; None is NaN."""
+    bounds, known = model.declared(name).bounds, dict[Any, int]()
     if isinstance(bounds, Categories) and bounds.labels:
         known = dict(zip(bounds.labels, bounds.members, strict=True))
     if values.dtype.kind in "OUS":

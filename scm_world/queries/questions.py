@@ -430,7 +430,7 @@ class SCM(Questions, graph.SCM):
                 "a replay of a simulated unit, rollout(seed=…).counterfactual({…})",
             )
             raise UnknownOption("do", do, allowed)
-        return counterfactuals(self, observed, do, n=n, seed=seed, tolerance=tolerance)
+        return counterfactuals(self, observed, do, n, seed, tolerance)
 
     def given(self, do: Mapping[str, Any]) -> Self:
         """Give the model in which this is done too: the same as ``do``."""
