@@ -74,7 +74,7 @@ class Effect:
             if isinstance(value, Plan):
                 value = value.as_dict()
             elif not isinstance(value, str | int):  # numbers; None where there is no interval
-                value = np.where(np.isfinite(value), value, None).tolist()
+                value = np.asarray(np.where(np.isfinite(value), value, None)).tolist()
             found[field.name] = value
         return found
 

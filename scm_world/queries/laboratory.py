@@ -117,12 +117,17 @@ class Laboratory:
 
     def terms(self) -> dict[str, Any]:
         """Return what decides the results of an experiment, as plain data."""
-        setting, options = self._setting, self._twins.options
+        setting = self._setting
         plans = {"given": [*self._given.acts()], "nature": [*Plan(setting.nature).acts()]}
-        system = {**self._world.__fingerprint__(), "policy": setting.policy, **plans}
-        found = {"task": self._world.task.name, "fingerprint": fingerprint(system)}
-        found |= {"options": options, "seed": setting.seed, "steps": setting.steps}
-        return {**found, "outcomes": [outcome.model_dump() for outcome in self.outcomes]}
+        system = self._world.__fingerprint__() | {"policy": setting.policy, **plans}
+        return {
+            "task": self._world.task.name,
+            "fingerprint": fingerprint(system),
+            "options": self._twins.options,
+            "seed": setting.seed,
+            "steps": setting.steps,
+            "outcomes": [outcome.model_dump() for outcome in self.outcomes],
+        }
 
     @property
     def spent(self) -> int:

@@ -201,18 +201,10 @@ class Questions(ABC):
     ) -> Effect:
         """Estimate the part of an effect that does not go through mediators.
 
-        The *controlled* direct effect holds them at given values in both arms. The *natural* one
-        lets each unit keep, under ``do``, the values that its mediators have under ``versus``.
-        Both are paired; the other arguments are those of ``effect``.
-
-        Args:
-            outcome: As in ``effect``.
-            do: What is done.
-            versus: The intervention it is compared with; none if None.
-            mediators: Values by name for the controlled effect; names for the natural one.
-            n: How many units.
-            progress: Called after each episode.
-            setting: See ``sample``.
+        The *controlled* direct effect holds ``mediators``, values by name, in both arms. The
+        *natural* one, of names alone, lets each unit keep, under ``do``, the values that its
+        mediators have under ``versus``. Both are paired. The other arguments are those of
+        ``effect``.
 
         Raises:
             UnknownOption: The natural effect is asked of what has several instants, where a
@@ -249,13 +241,8 @@ class Questions(ABC):
     ) -> tuple[Effect, ...]:
         """Estimate the paired effects of values of a variable, each against the first one.
 
-        Args:
-            outcome: As in ``effect``.
-            name: Name of the variable.
-            values: Two or more.
-            n: How many units.
-            progress: Called after each episode.
-            setting: See ``sample``.
+        ``values`` are two or more values of the variable ``name``; the other arguments are those of
+        ``effect``.
         """
         if not isinstance(name, str):
             raise UnknownOption("name", name, ("the name of a variable",))
@@ -280,16 +267,10 @@ class Questions(ABC):
     ) -> tuple[tuple[tuple[float, float], Effect], ...]:
         """Estimate paired effects among units that differ in a covariate.
 
-        Args:
-            outcome: As in ``effect``.
-            do: What is done.
-            versus: The intervention it is compared with; none if None.
-            by: The covariate: like an outcome, one number; read off the world of ``versus``.
-            bins: Into how many groups of equal size the units are sorted. Units with one value are
-                in one group: of a covariate with no more values than that, each has its own.
-            n: How many units, over all groups.
-            progress: Called after each episode.
-            setting: See ``sample``.
+        The covariate ``by`` is, like an outcome, one number; it is read off the world of
+        ``versus``. The ``n`` units are sorted into ``bins`` groups of equal size. Units with one
+        value are in one group: of a covariate with no more values than that, each has its own. The
+        other arguments are those of ``effect``.
 
         Returns:
             For each group the ends of the covariate, and the effect.

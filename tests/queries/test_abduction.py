@@ -789,3 +789,36 @@ def test_a_constant_of_an_episode_may_be_seen_once() -> None:
     once["k"][0, 1] = 9.0
     with pytest.raises(ImpossibleObservation, match="'k'"):
         model.counterfactual(once, do={"a": 0.0})
+
+
+@pytest.mark.parametrize("do", [{"a": Shift(1.0)}, {"k": 0.0}, {"k": Shift(1.0)}])
+def test_a_constant_of_an_episode_acts_from_before_its_first_step(do: Any) -> None:
+    """What the first step looks back at has the constant that was observed, not another one."""
+    model = SCM(
+        [
+            Exogenous(name="k", distribution=Normal()),
+            Derived(name="a", parents=(Parent("a", 1), Parent("k", 1)),
+                    mechanism=Linear(weights=(0.5, 1.0)), noise=Normal(), start=1.0),
+        ]
+    )  # fmt: skip
+    seen, wanted = (m.draw(3, seed=0, steps=4) for m in (model, model.do(do)))
+    found = model.counterfactual(seen, do=do)
+    assert found.exact
+    np.testing.assert_allclose(found["a"], wanted["a"], atol=1e-12)
+
+
+def test_what_was_observed_is_shifted() -> None:
+    """A root without a distribution, an action, and a root that was observed under a shift."""
+    alone = SCM([Exogenous(name="x"), *line().variables[1:]])
+    assert alone.counterfactual({"x": 3.0, "y": 6.5}, do={"x": Shift(1.0)})["y"] == 8.5
+    shifted = line().do({"x": Shift(1.0)})
+    for done, wanted in (({"x": Shift(2.0)}, 8.5), ({"x": Natural()}, 4.5), ({"x": 0.0}, 0.5)):
+        found = shifted.counterfactual({"x": 3.0, "y": 6.5}, do=done)
+        assert (found.exact, found["y"]) == (True, pytest.approx(wanted))
+    acted = SCM(
+        [
+            Action(name="u", bounds=Box(-1.0, 1.0)),
+            Derived(name="s", parents=("u",), mechanism=Linear(weights=(2.0,)), noise=Normal()),
+        ]
+    )
+    assert acted.counterfactual({"u": 0.5, "s": 1.5}, do={"u": Scale(-1.0)})["s"] == -0.5
