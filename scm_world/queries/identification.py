@@ -193,7 +193,7 @@ def estimate(
         ends = f"{found.treatment!r} on {found.outcome!r}"
         advice = "observe more variables, look for front doors, or intervene (effect)"
         raise ModelError([f"the effect of {ends} is not identified: {advice}"])
-    way = next(iter(found.variables)) if method is None else method.partition(".")[0]
+    way = next(iter(found.variables)) if method is None else str(method).partition(".")[0]
     one_of("method", way, tuple(found.variables))
     columns = [found.treatment, found.outcome, *found.variables[way]]
     for name in columns:
@@ -238,7 +238,7 @@ def _front_doors(
     behind = _without_edges_from(graph, [treatment])
     for size in (1, 2, 3):
         found = False
-        for mediators in combinations(sorted(between), size):
+        for mediators in combinations(sorted(between, key=str), size):
             without, after = graph.copy(), _without_edges_from(graph, mediators)
             without.remove_nodes_from(mediators)
             intercepts = not nx.has_path(without, treatment, outcome)

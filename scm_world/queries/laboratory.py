@@ -17,7 +17,8 @@ from scm_world._types import Floats
 from scm_world.errors import Forbidden, UnknownOption
 from scm_world.queries.outcomes import Outcome, as_outcomes, column
 from scm_world.queries.plans import Plan
-from scm_world.queries.samples import Samples, Setting, sample
+from scm_world.queries.rollouts import as_names, length
+from scm_world.queries.samples import Samples, Setting, refuse_late, sample
 from scm_world.queries.tables import read_protocol
 from scm_world.queries.twins import twins_of
 from scm_world.variables import Contact, Fixed, Reaches
@@ -95,7 +96,8 @@ class Laboratory:
         self._world, self._twins = world, twins_of(world)
         self._setting = Setting.of(world, setting)
         self._given: Plan = getattr(world, "plan", Plan())
-        self.allow = (allow,) if isinstance(allow, str) else tuple(allow)
+        self._steps = length(world, self._setting.steps)
+        self.allow = as_names(allow)
         for question in self.allow:
             one_of("question", question, QUESTIONS)
         model = world.model
@@ -180,8 +182,11 @@ class Laboratory:
         Raises:
             Forbidden: As in ``do``, or the unit was never seen.
         """
+        unit, at = whole_number("unit", unit, least=0), whole_number("at", at, least=0)
         with self._lock:
             self._permit("counterfactual", request, 1)
+            if at >= self._steps:
+                raise UnknownOption("at", at, (f"a control step from 0 to {self._steps - 1}",))
             units = self._units()
             if unit not in units:
                 there = f"units 0 to {len(units) - 1}" if units else "none yet: see or do first"
@@ -260,6 +265,7 @@ class Laboratory:
         if kind not in self.allow:
             raise Forbidden(kind, self.allow)
         plan = Plan(request)
+        refuse_late(plan, self._steps)
         for name in plan:
             if name not in self.settable:
                 raise Forbidden(f"set {name}", self.settable)
@@ -287,8 +293,8 @@ class Laboratory:
 
 
 def _matching(option: str, patterns: Iterable[str], names: Sequence[str]) -> tuple[str, ...]:
-    given = (patterns,) if isinstance(patterns, str) else tuple(patterns)
+    given = as_names(patterns)
     for pattern in given:
-        if not any(fnmatchcase(name, pattern) for name in names):
+        if not isinstance(pattern, str) or not any(fnmatchcase(name, pattern) for name in names):
             raise UnknownOption(option, pattern, names)
     return tuple(n for n in names if any(fnmatchcase(n, pattern) for pattern in given))

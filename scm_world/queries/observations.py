@@ -79,16 +79,17 @@ def per(variable: Any) -> str:
 def _columns(model: SCM, observed: Any) -> dict[str, Value]:
     """Return numbers by variable, shape (..., *shape), with an axis for rows if there are many."""
     if hasattr(observed, "regimes"):  # a Dataset
-        given = dict(zip(observed.names, observed.values.T, strict=True))
+        given: dict[str, Any] = dict(zip(observed.names, observed.values.T, strict=True))
         given |= {"episode": observed.episode, "step": observed.step}
         given["intervention_targets"] = np.array([bool(names) for names in observed.targets])
     elif isinstance(observed, Mapping) or hasattr(observed, "columns"):
         names = observed if isinstance(observed, Mapping) else observed.columns
-        given = {str(name): np.asarray(observed[name]) for name in names}
+        given = {str(name): observed[name] for name in names}
     else:
         allowed = ("values by name", "a table by name", "a data frame", "a Dataset")
         raise UnknownOption("observed", observed, allowed)
-    about = {name: given.pop(name) for name in RECORDED if name in given and name not in model}
+    own = [name for name in RECORDED if name in given and name not in model]
+    about = {name: np.asarray(given.pop(name)) for name in own}
     if any(target is not None and target is not np.False_ for target in about.get(RECORDED[3], ())):
         advice = "take its rows without (table.observational), or ask model.do({…}) of the others"
         raise ModelError([f"the table has rows in which something was done: {advice}"])
@@ -113,14 +114,18 @@ def _columns(model: SCM, observed: Any) -> dict[str, Value]:
     return columns
 
 
-def _numbers(model: SCM, name: str, values: Value) -> Value:
+def _numbers(model: SCM, name: str, observed: Any) -> Value:
     """Return numbers for numbers or labels of a variable; None is NaN."""
     bounds, known = model.declared(name).bounds, dict[Any, int]()
     if isinstance(bounds, Categories) and bounds.labels:
         known = dict(zip(bounds.labels, bounds.members, strict=True))
-    if values.dtype.kind in "OUS":
-        values = np.array([known.get(v, v) for v in values.ravel().tolist()]).reshape(values.shape)
     try:
+        values = np.asarray(observed)
+        if values.dtype.kind in "OUS":
+            listed = [known.get(v, v) for v in values.ravel().tolist()]
+            values = np.array(listed).reshape(values.shape)
+        if values.dtype.kind == "c":
+            raise TypeError("these are complex")
         return values.astype(float)
     except (TypeError, ValueError) as error:
         allowed = f", and labels are {', '.join(known)}" if known else ""

@@ -75,6 +75,8 @@ class Setting:
             defaults = {"steps": STEPS if system.model.is_temporal else 0, "policy": None}
         found = cls(**{**defaults, **given})
         length(system, found.steps)
+        if found.workers is not None:
+            whole_number("workers", found.workers, least=1)
         return found
 
     def unit(
@@ -166,6 +168,14 @@ class Samples(Mapping[str, Floats]):
         beside.write_text(json.dumps(about, indent=1) + "\n")
 
 
+def refuse_late(plan: Plan, steps: int) -> None:
+    """Refuse an intervention that would begin when the episode has ended."""
+    for name, act in plan.timed():
+        if (act.time.start or 0) >= max(steps, 1):
+            allowed = (f"a control step before {steps}, where episodes end",)
+            raise UnknownOption(f"time of an intervention on {name}", act, allowed)
+
+
 def sample(
     twins: AnyTwins,
     system: System,
@@ -198,10 +208,7 @@ def sample(
             raise UnknownOption(f"summary of the categories of {one.name!r}", one.how, ORDERLESS)
     names = tuple(dict.fromkeys(one.name for one in wanted if isinstance(one, Outcome)))
     unit = setting.unit(system, do, first, names)
-    for name, act in Plan(do).timed():
-        if (act.time.start or 0) >= max(unit.steps, 1):
-            allowed = (f"a control step before {unit.steps}, where episodes end",)
-            raise UnknownOption(f"time of an intervention on {name}", act, allowed)
+    refuse_late(Plan(do), unit.steps)
     units = [replace(unit, number=number) for number in range(first, first + count)]
     if each:
         schedule: Any = unit.schedule

@@ -822,3 +822,23 @@ def test_what_was_observed_is_shifted() -> None:
         ]
     )
     assert acted.counterfactual({"u": 0.5, "s": 1.5}, do={"u": Scale(-1.0)})["s"] == -0.5
+
+
+@pytest.mark.parametrize("wrong", [[[1.0], [1.0, 2.0]], {"y": 1.0}, 1j, object(), "much"])
+def test_what_is_not_a_number_is_refused_by_name(wrong: Any) -> None:
+    """Ragged lists, nested dictionaries, complex numbers and words."""
+    with pytest.raises(ImpossibleObservation, match="'x': observations are numbers"):
+        line().counterfactual({"x": wrong, "y": 1.0}, do={"x": 1.0})
+
+
+def test_a_hidden_constant_acts_from_before_the_first_step() -> None:
+    """Its posterior counts what it did to the first observation: normal, in closed form."""
+    model = SCM(
+        [
+            Exogenous(name="k", distribution=Normal()),
+            Derived(name="a", parents=(Parent("k", 1),), mechanism=ONE, noise=Normal()),
+        ]
+    )
+    found = model.counterfactual({"a": [3.0, 1.0]}, do={"k": 0.0}, n=20_000)
+    assert believed(found, "k")[0, 0] == pytest.approx(4.0 / 3.0, abs=0.03)
+    assert found["a"] == pytest.approx([3.0 - 4.0 / 3.0, 1.0 - 4.0 / 3.0], abs=0.03)
