@@ -28,7 +28,7 @@ from scm_world.errors import ImpossibleObservation, InterventionError, ModelErro
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier, first_value
 from scm_world.queries.equations import Layout
-from scm_world.queries.inversion import Found, density_of, noise_given, proposed
+from scm_world.queries.inversion import Found, density_of, noise_given, noise_shape, proposed
 from scm_world.queries.observations import Observations, observations, per
 from scm_world.queries.plans import Plan, at_once, numbered
 from scm_world.variables import (
@@ -211,7 +211,7 @@ class _Abduction:
         *,
         certain: bool = False,
     ) -> None:
-        self.model, self.n, self._tolerance = model, n, tolerance
+        self.model, self.n, self._tolerance, self._certain = model, n, tolerance, certain
         own = np.random.SeedSequence((whole_number("seed", seed, least=0), 1))  # not that of data
         self._noise = Noise(int(own.generate_state(1)[0]))
         self._together = Layout(model).is_vectorised
@@ -267,19 +267,20 @@ class _Abduction:
             self.sampled |= found is None or found.drawn or not there.all()
             unsure |= found is None
             if found is not None:
-                log = found.log_density.reshape(self._size, -1).sum(axis=1)
+                log = found.log_weight
                 possible = there & np.isfinite(log)
                 self._weigh(name, there & ~possible, unsure=unsure)
                 self._log_weights[possible] += log[possible]
                 given[name] = _either(possible, found.noise, given[name])
+        if self._certain and self.sampled:
+            return
         value = self._computed(self.model, name, self._values[-1], self._before, step)
         apart = np.abs(np.asarray(value, dtype=float) - wanted).reshape(self._size, -1)
         most = self._tolerance * (1.0 + np.abs(wanted)).reshape(self._size, -1)
         self._weigh(name, there & ~(apart <= most).all(axis=1), unsure=unsure)
         value = _either(there, wanted, value)
-        self._values[-1][name] = (
-            value if variable.dtype == "real" else np.rint(value).astype(np.int64)
-        )
+        whole = variable.dtype != "real"
+        self._values[-1][name] = np.rint(value).astype(np.int64) if whole else value
 
     def _without_intervention(self, name: str, value: Value) -> Value:
         """Return what a variable would have been that was observed under a shift or scale."""
@@ -296,11 +297,10 @@ class _Abduction:
 
     def _drawn(self, variable: Any, source: Any, step: int, there: Value) -> Value:
         """Draw the noise of a variable; weigh it where the variable was not observed."""
-        name, shape = variable.name, getattr(variable, "noise_shape", None) or variable.shape
+        name, shape = variable.name, noise_shape(variable)
         found = proposed(source, shape, self._shares(f"{name}|hidden", shape, step))
         if found is not None:
-            log = found.log_density.reshape(self._size, -1).sum(axis=1)
-            self._log_weights += np.where(there, 0.0, log)
+            self._log_weights += np.where(there, 0.0, found.log_weight)
             return found.noise
         key = NoiseKey(self._noise, 0, step, self._size)
         return key.natural(source, name, shape, self._values[-1])
@@ -353,9 +353,7 @@ class _Abduction:
         said = f"in row {lost.argmax()}, " if self._rows > 1 else ""
         if unsure:  # the model may give it: it was not met
             said = f"{name!r}: {said}none of {self.n} draws gives what was observed"
-            advice = (
-                "observe its causes, declare inverse_noise, draw more (n), or allow a tolerance"
-            )
+            advice = "observe its causes, declare inverse_noise, draw more (n) or allow a tolerance"
             raise ModelError([f"{said}: {advice}"])
         variable = self.model[name]
         if _source(variable) is None:
@@ -465,10 +463,9 @@ class _Abduction:
         if isinstance(done, Draw) or source is None or (name in held and not other):
             return
         self.sampled = True
-        shape = getattr(self.model.declared(name), "noise_shape", None)
         key = NoiseKey(self._noise, 0, 0 if per(variable) == "episode" else step, self._size)
-        own = variable.shape if shape is None else shape
-        held[name] = key.draw(source, name, own, values, "counterfactual")
+        shape = noise_shape(self.model.declared(name))
+        held[name] = key.draw(source, name, shape, values, "counterfactual")
 
     def _stacked(self, instants: list[dict[str, Value]]) -> dict[str, Floats]:
         """Return all values by variable, shape (rows, n, *shape), or with steps in between."""

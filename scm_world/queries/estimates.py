@@ -100,16 +100,10 @@ class Effect:
 def difference(
     treated: Floats, control: Floats, *, paired: bool
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Estimate the mean difference of two samples, with its interval.
+    """Return the mean difference of two samples, shape (n, ...), with its interval.
 
-    Args:
-        treated: Shape (n, ...).
-        control: Shape (n, ...); row i is the same unit where they are paired.
-        paired: Whether they are.
-
-    Returns:
-        Mean, lower and upper end of the interval of Student's t, and the ratio of the variances
-        unpaired : paired. The ends are NaN where nothing varies but by rounding.
+    The four results are the mean, the ends of the interval of Student's t (NaN where nothing
+    varies but by rounding), and the ratio of the variances unpaired : paired.
     """
     from scipy.special import stdtrit
 

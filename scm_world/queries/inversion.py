@@ -48,6 +48,17 @@ class Found(NamedTuple):
     log_density: Floats
     drawn: bool = False
 
+    @property
+    def log_weight(self) -> Floats:
+        """By which a draw is weighed, shape (units,)."""
+        return np.asarray(self.log_density.reshape(len(self.log_density), -1).sum(axis=1))
+
+
+def noise_shape(variable: Any) -> tuple[int, ...]:
+    """Return the shape of the noise of a variable: its own where none is declared."""
+    own = getattr(variable, "noise_shape", None)
+    return variable.shape if own is None else own
+
 
 def noise_given(
     variable: Any,
@@ -59,7 +70,7 @@ def noise_given(
 ) -> Found | None:
     """Return the noise of a variable for a value and its causes; None where only draws can tell."""
     how, function, shape = variable.inverse_noise, variable.mechanism.bind(), variable.shape
-    own = shape if variable.noise_shape is None else variable.noise_shape
+    own = noise_shape(variable)
 
     def gives(noise: Value) -> Value:
         return apply(function, parents, {"noise": noise}, shape)

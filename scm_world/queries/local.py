@@ -98,12 +98,8 @@ def holds(
 ) -> Callable[[str, str], bool]:
     """Return a function of cause and effect: whether an edge by contact holds.
 
-    It does if a chain of contacts between bodies that move joins one of the cause to one of the
-    effect. A body that ``terms`` do not know joins all.
-
-    Args:
-        terms: See ``contact_terms``.
-        touching: Pairs of bodies.
+    It does if a chain of contacts (pairs of bodies) between bodies that move joins one of the cause
+    to one of the effect. A body that the ``contact_terms`` do not know joins all.
     """
     still, together = set(terms["still"]), [set(group) for group in terms["together"]]
     group = {body: bodies for bodies in together for body in bodies}
@@ -146,23 +142,17 @@ class _Listener:
 
 
 def contacts_of(world: Simulation, action: ArrayLike) -> Touching:
-    """Take a control step, and return the contacts of each of its physics steps.
-
-    Raises:
-        ModelError: A backend does not list all contacts of a physics step of this model.
-    """
+    """Take a control step, and return the contacts of each of its physics steps."""
     if getattr(world.structure, "staged", False):
-        problem = (
-            "the contacts in each stage of RK4 are not known, so that any edge by contact may act; "
-            "read the model with settings={'integrator': 'implicitfast'} to know them"
-        )
-        raise ModelError([problem])
-    engine: Any = world.backend
-    listener: Any = _Listener(engine)
+        problem = "the contacts in each stage of RK4 are not known, so that any edge may act"
+        remedy = "read the model with settings={'integrator': 'implicitfast'} to know them"
+        raise ModelError([f"{problem}; {remedy}"])
+    backend: Any = world.backend
+    listener: Any = _Listener(backend)
     world.backend = listener
     try:
         world.step(action)
     finally:
-        world.backend = engine
+        world.backend = backend
     contacts: Touching = listener.contacts
     return contacts

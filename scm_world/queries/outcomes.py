@@ -50,14 +50,7 @@ class Outcome(Frozen):
         return np.asarray(self.of_many(np.asarray(episode[self.name])[None])[0])
 
     def of_many(self, values: Value) -> Floats:
-        """Read it off the values of the variable in several episodes.
-
-        Args:
-            values: Shape (n, instants, *shape).
-
-        Returns:
-            Shape (n, ...).
-        """
+        """Read it off the values in n episodes, shape (n, instants, *shape); shape (n, ...)."""
         values = np.asarray(values, dtype=np.float64)
         n, instants = values.shape[:2]
         if self.component is not None:
@@ -86,11 +79,7 @@ class Outcome(Frozen):
 
 
 def as_outcome(given: Any) -> Any:
-    """Turn the name of a variable into its final value.
-
-    Raises:
-        UnknownOption: It is neither a name, nor an ``Outcome``, nor a function.
-    """
+    """Turn the name of a variable into its final value; refuse what is not an outcome."""
     if isinstance(given, str):
         return Outcome(given)
     if isinstance(given, Outcome) or callable(given):
@@ -113,13 +102,10 @@ def is_category(system: System, outcome: Any) -> bool:
 
 
 def usual_outcomes(world: System) -> tuple[str, ...]:
-    """Name what is read off episodes if nothing else is asked for.
+    """Return the names of what is read off episodes if nothing else is asked for.
 
     That is the fractional success of the robot's tasks, and of any other world everything that
     is computed from its states: readouts, outcomes, reward and success; of equations everything.
-
-    Raises:
-        UnknownOption: Nothing is computed from the states.
     """
     if isinstance(world, Equations):
         return tuple(name for name in world.model if name not in world.compiled.actions)
@@ -134,12 +120,7 @@ def usual_outcomes(world: System) -> tuple[str, ...]:
 
 
 def read(outcome: Any, episode: Episode) -> Floats:
-    """Read an outcome off an episode, as numbers.
-
-    Raises:
-        UnknownOption: They are not finite numbers.
-        FunctionFailure: A function raised an error.
-    """
+    """Read an outcome off an episode, as finite numbers."""
     if isinstance(outcome, Outcome):
         return as_numbers(outcome.of(episode), outcome)
     with blamed(f"the outcome {label(outcome)!r}"):

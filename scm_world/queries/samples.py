@@ -63,11 +63,7 @@ class Setting:
 
     @classmethod
     def of(cls, system: System, given: Mapping[str, Any]) -> Setting:
-        """Complete what is given: a world acts at random by default, equations with zeros.
-
-        Raises:
-            UnknownOption: The number of steps is none, or there is no such setting.
-        """
+        """Complete and check a setting: a world acts at random by default, equations with zeros."""
         for name in given:
             one_of("setting", name, [field.name for field in fields(cls)])
         defaults: dict[str, Any] = {}
@@ -82,17 +78,7 @@ class Setting:
     def unit(
         self, world: System, do: Mapping[str, Any] | None, number: int, names: Iterable[str] = ()
     ) -> Unit:
-        """Return the unit of an episode, with the intervention and what varies by itself.
-
-        Args:
-            world: Knows which names are coordinates of one quantity, and how long an episode is.
-            do: What is done.
-            number: Which unit.
-            names: Variables to record.
-
-        Raises:
-            UnknownOption: The number of steps is none.
-        """
+        """Return an episode to run, with an intervention and what varies by itself."""
         nature, acts = Plan(self.nature), Plan(do)
         for name in acts:
             if name in nature and name not in acts.at_start():
@@ -104,7 +90,7 @@ class Setting:
     def episode(
         self, twins: AnyTwins, world: System, do: Mapping[str, Any] | None, number: int, names: Any
     ) -> Episode:
-        """Run one unit; the arguments are those of ``unit``."""
+        """Run the episode of ``unit``."""
         unit = self.unit(world, do, number, names)
         with twins.twin() as twin:
             return Episode(twins, unit, unit.run(twin))
@@ -188,18 +174,9 @@ def sample(
     each: Sequence[Mapping[str, Any]] = (),
     progress: Progress | None = None,
 ) -> Samples:
-    """Run episodes under an intervention, and read outcomes off them; see ``Questions.sample``.
+    """Run episodes on twins of a system, and read outcomes off them; see ``Questions.sample``.
 
-    Args:
-        twins: Where episodes are run.
-        system: Knows what is declared; it is not touched.
-        do: What is done in all of them; None to see only.
-        n: How many.
-        outcomes: What to read off: names of variables, ``Outcome`` or functions of the episode.
-        setting: The circumstances.
-        first: Number of the first episode.
-        each: What is done in each of them besides.
-        progress: Called after each episode.
+    Each episode may have further interventions of its own (``each``).
     """
     count, first = whole_number("n", n, least=1), whole_number("first", first, least=0)
     wanted = as_outcomes(outcomes)

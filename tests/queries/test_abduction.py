@@ -171,8 +171,9 @@ def test_a_function_that_declares_nothing_is_sampled() -> None:
         ]
     )
     seen: dict[str, Any] = {"observed": {"x": 0.0, "y": 1.0}, "do": {"x": 2.0}}
-    with pytest.raises(ModelError, match="declare inverse_noise, draw more"):
+    with pytest.raises(ModelError, match=r"none of 1000 draws.*declare inverse_noise, draw more"):
         model.counterfactual(**seen)
+    assert model.counterfactual(**seen, tolerance=0.02).weights.shape == (1, 1000)
     found = model.counterfactual(**seen, n=20_000, tolerance=0.02)
     assert not found.exact
     assert found["y"] == pytest.approx(3.0, abs=0.02)
@@ -842,3 +843,20 @@ def test_a_hidden_constant_acts_from_before_the_first_step() -> None:
     found = model.counterfactual({"a": [3.0, 1.0]}, do={"k": 0.0}, n=20_000)
     assert believed(found, "k")[0, 0] == pytest.approx(4.0 / 3.0, abs=0.03)
     assert found["a"] == pytest.approx([3.0 - 4.0 / 3.0, 1.0 - 4.0 / 3.0], abs=0.03)
+
+
+@pytest.mark.parametrize("back", [None, "function"])
+def test_one_noise_of_a_vector(back: str | None) -> None:
+    """Noise without components of its own moves all numbers of a variable."""
+
+    def both(x: Any, noise: Any) -> Any:
+        return np.stack([x + noise, x - noise], axis=-1)
+
+    inverse = None if back is None else lambda v, x: 0.5 * (v[..., 0] - v[..., 1])
+    v = Derived(name="v", shape=(2,), parents=("x",), mechanism=both, noise=Normal(),
+                noise_shape=(), inverse_noise=inverse)  # fmt: skip
+    model = SCM([Exogenous(name="x", distribution=Normal()), v])
+    seen, wanted = (m.draw(3, seed=0) for m in (model, model.do({"x": 0.0})))
+    found = model.counterfactual(seen, do={"x": 0.0}, tolerance=1e-6 if back else 0.2)
+    assert found.exact == (back is not None)
+    np.testing.assert_allclose(found["v"], wanted["v"], atol=1e-9 if back else 0.3)
