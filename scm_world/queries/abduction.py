@@ -15,7 +15,7 @@ Source:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -224,6 +224,7 @@ class _Abduction:
         self.sampled = False
         self._given: list[dict[str, Value]] = []  # noise, and roots without intervention, by step
         self._values: list[dict[str, Value]] = []
+        self._first: dict[str, Value] = {}  # the instant before the first step
         self._before: Values = {}
         order = model.structure.order
         for step in range(seen.steps):
@@ -233,7 +234,8 @@ class _Abduction:
                 for name in order:
                     if per(model[name]) == "episode" and not model[name].all_parents:
                         self._find(model[name], 0)
-                self._before = self._start(model)
+                self._first = self._before = self._start(model, {})
+                self.sampled |= self._draws_before(model, model)
             for name in order:
                 if name not in self._values[-1]:
                     self._find(model[name], step)
@@ -385,7 +387,7 @@ class _Abduction:
         where = (chosen + self.n * np.arange(self._rows)[:, None]).ravel()
         self._ancestors = self._ancestors[where]
         self._before = {name: np.asarray(value)[where] for name, value in self._before.items()}
-        for instant in (*self._given, *self._values):
+        for instant in (self._first, *self._given, *self._values):
             instant.update({name: np.asarray(value)[where] for name, value in instant.items()})
 
     # --- action and prediction ------------------------------------------------------------------
@@ -396,7 +398,9 @@ class _Abduction:
         changes = [self._changed(model) for model in models]
         follow = set[str]().union(*changes)
         follow |= {n for m in models for name in follow for n in m.descendants(name)}
-        before, found = self._start(models[0]), list[dict[str, Value]]()
+        kept = {name: value for name, value in self._first.items() if name not in follow}
+        before, found = self._start(models[0], kept), list[dict[str, Value]]()
+        self.sampled |= self._draws_before(models[0], changes[0])
         for step, was in enumerate(self._values):
             model, targets, values = models[step], changes[step], dict[str, Value]()
             for name in model.structure.order:
@@ -488,12 +492,32 @@ class _Abduction:
 
         return self._each(solved, step, given, known, before)
 
-    def _start(self, model: SCM) -> dict[str, Value]:
+    def _draws_before(self, model: SCM, names: Iterable[str]) -> bool:
+        """Return whether the first step looks back at what an intervention on a variable draws."""
+        back = {edge.cause for edge in model.edges if edge.lag}
+        for name in names:
+            act, declared = model.act_on(name), model.declared(name)
+            match None if act is None else act.intervention:
+                case Draw():
+                    draws = per(declared) == "step"
+                case Mechanism(function=function):
+                    own = function is getattr(declared, "mechanism", None)
+                    draws = not own and _source(model[name]) is not None
+                case _:
+                    draws = False
+            if draws and not back.isdisjoint({name, *model.descendants(name)}):
+                return True
+        return False
+
+    def _start(self, model: SCM, kept: Values) -> dict[str, Value]:
         """Compute what the first step of a model with lagged edges looks back at."""
         values: dict[str, Value] = {}
         given = self._constants()
         for name in model.structure.order if model.is_temporal else ():
             variable = model[name]
+            if name in kept:
+                values[name] = kept[name]
+                continue
             if name in given:
                 values[name] = given[name]
             elif _is_free(variable) and not isinstance(variable, Exogenous):

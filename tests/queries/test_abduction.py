@@ -860,3 +860,57 @@ def test_one_noise_of_a_vector(back: str | None) -> None:
     found = model.counterfactual(seen, do={"x": 0.0}, tolerance=1e-6 if back else 0.2)
     assert found.exact == (back is not None)
     np.testing.assert_allclose(found["v"], wanted["v"], atol=1e-9 if back else 0.3)
+
+
+def random_model(rng: np.random.Generator) -> SCM:
+    """A few roots and lines of any lags, some with noise, some without."""
+    names = "abcde"[: rng.integers(3, 6)]
+    found: list[Any] = []
+    for place, name in enumerate(names):
+        if place == 0 or rng.random() < 0.2:
+            source = [Normal(), Laplace(), None][rng.integers(0, 3)]
+            found.append(Exogenous(name=name, distribution=source, default=1.0))
+            continue
+        lags = {other: 0 for other in names[:place] if rng.random() < 0.5}
+        lags |= {other: int(rng.integers(1, 3)) for other in names if rng.random() < 0.2}
+        parents = [Parent(other, lag) for other, lag in lags.items()]
+        weights = Linear(weights=tuple(rng.normal(size=len(parents)).tolist()))
+        noise = [Normal(), Box(-1.0, 1.0), None][rng.integers(0, 3)]
+        found.append(Derived(name=name, parents=parents, mechanism=weights, noise=noise, start=0.5))
+    return SCM(found)
+
+
+def random_request(rng: np.random.Generator, model: SCM, *kinds: Any) -> dict[str, Any]:
+    """Interventions of some kinds, none of which draws, on some variables."""
+    return {
+        name: kinds[rng.integers(0, len(kinds))](float(rng.uniform(0.5, 2.0)))
+        for name in model
+        if rng.random() < 0.4
+    }
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_what_was_observed_whole_is_that_of_the_seed(seed: int) -> None:
+    """Of any model, observed under shifts and scales, under any other intervention."""
+    rng = np.random.default_rng(seed)
+    model = random_model(rng)
+    observed = model.do(random_request(rng, model, Shift, Scale))
+    do = random_request(rng, model, float, Shift, Scale, lambda _: Natural())
+    steps = {"steps": 4} if observed.is_temporal else {}
+    if observed.do(do).is_temporal != observed.is_temporal:
+        pytest.skip("the intervention takes the last lagged edge away")
+    seen, wanted = (m.draw(3, seed=seed, **steps) for m in (observed, observed.do(do)))
+    found = observed.counterfactual(seen, do=do)
+    assert found.exact
+    for name in model:
+        np.testing.assert_allclose(found[name], wanted[name], atol=1e-9)
+
+
+def test_what_is_drawn_before_the_first_step_is_not_exact() -> None:
+    """A mechanism with noise replaces the start too, and nobody observed that draw."""
+    model = lagged()
+    seen = model.draw(2, seed=0, steps=3)
+    found = model.counterfactual(seen, do={"a": Mechanism(lambda noise: 2.0 * noise, [])})
+    assert not found.exact
+    assert found.effective == pytest.approx([1000.0, 1000.0])
+    assert model.counterfactual(seen, do={"b": Mechanism(lambda noise: noise, [])}).exact
