@@ -57,7 +57,8 @@ class Found(NamedTuple):
 def noise_shape(variable: Any) -> tuple[int, ...]:
     """Return the shape of the noise of a variable: its own where none is declared."""
     own = getattr(variable, "noise_shape", None)
-    return variable.shape if own is None else own
+    shape: tuple[int, ...] = variable.shape if own is None else own
+    return shape
 
 
 def noise_given(
