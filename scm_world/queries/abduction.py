@@ -405,8 +405,7 @@ class _Abduction:
             model, targets, values = models[step], changes[step], dict[str, Value]()
             for name in model.structure.order:
                 variable: Any = self.model[name]
-                source = getattr(variable, "distribution", None)
-                moves = source is not None and source.parents()
+                moves = isinstance(variable, Exogenous) and variable.all_parents
                 if name not in follow or (name not in targets and _is_free(variable) and not moves):
                     values[name] = was[name]
                     continue
@@ -497,14 +496,11 @@ class _Abduction:
         back = {edge.cause for edge in model.edges if edge.lag}
         for name in names:
             act, declared = model.act_on(name), model.declared(name)
-            match None if act is None else act.intervention:
-                case Draw():
-                    draws = per(declared) == "step"
-                case Mechanism(function=function):
-                    own = function is getattr(declared, "mechanism", None)
-                    draws = not own and _source(model[name]) is not None
-                case _:
-                    draws = False
+            done = None if act is None else act.intervention
+            draws = isinstance(done, Draw) and per(declared) == "step"
+            if isinstance(done, Mechanism):
+                own = done.function is getattr(declared, "mechanism", None)
+                draws = not own and _source(model[name]) is not None
             if draws and not back.isdisjoint({name, *model.descendants(name)}):
                 return True
         return False

@@ -61,13 +61,13 @@ class Comparison(Report):
     """How the effects of parameters on two backends agree.
 
     Attributes:
-        format: Of the file.
+        format: Format of the file.
         task: Name of the task.
         backends: Their names.
-        seed: Of states and values.
+        seed: Seed of states and values.
         probes: In how many states effects were compared.
         skipped: How many states one of the backends cannot be in.
-        effects: Of each parameter with a clear effect.
+        effects: Each parameter with a clear effect.
         seconds: Wall time.
     """
 

@@ -15,10 +15,7 @@ from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode
 from scm_world.queries.outcomes import Outcome, as_outcome, is_category, read
 from scm_world.queries.rollouts import as_names
-from scm_world.variables import Draw, Natural
-
-NOISY = ("sensor_noise", "actuator_noise")
-"""Parameters that add noise to an episode while they are not zero."""
+from scm_world.variables import Natural
 
 
 @final
@@ -48,12 +45,10 @@ class EpisodeDifference:
         variables: Those that do, by name, the earliest first.
         contacts: Pairs of bodies that touch in one of the two only: instant, pair, and 0 or 1 for
             the episode in which they do.
-        noise: Draws that exist in one of the two only: name, and 0 or 1 for the episode.
     """
 
     variables: Mapping[str, Divergence]
     contacts: tuple[tuple[int, tuple[str, str], int], ...]
-    noise: tuple[tuple[str, int], ...]
 
     @property
     def first(self) -> int | None:
@@ -67,7 +62,6 @@ class EpisodeDifference:
             f"{name}: from {d.first} on, at most {d.largest:.4g} (at {d.at})"
             for name, d in self.variables.items()
         ]
-        lines += [f"only in {'ab'[one]}: noise of {name}" for name, one in self.noise]
         if self.contacts:
             at, pair, one = self.contacts[0]
             lines.append(
@@ -107,10 +101,7 @@ def compare(
         for which in (0, 1)
         for pair in sorted(sets[which] - sets[1 - which])
     )
-    drawn = _noise(one), _noise(other)
-    alone = [(name, which) for which in (0, 1) for name in sorted(drawn[which] - drawn[1 - which])]
-    ordered = dict(sorted(apart, key=lambda item: item[1].first))
-    return EpisodeDifference(ordered, contacts, tuple(alone))
+    return EpisodeDifference(dict(sorted(apart, key=lambda item: item[1].first)), contacts)
 
 
 def _check_episode(given: Any) -> None:
@@ -130,13 +121,6 @@ def _divergence(first: Episode, second: Episode, name: str, tolerance: float) ->
         return None
     final = np.asarray(one[-1] - other[-1])
     return Divergence(int(np.argmax(differs)), float(sizes[at]), at, final)
-
-
-def _noise(episode: Episode) -> set[str]:
-    """Name the draws of an episode: those of interventions, and of noise that is not zero."""
-    acts = (pair for _, plan in episode.layers for pair in plan.acts())
-    there = [name for name in NOISY if name in episode.names and np.any(episode[name])]
-    return {name for name, act in acts if isinstance(act, Draw)} | set(there)
 
 
 @final
