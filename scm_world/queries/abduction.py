@@ -32,6 +32,7 @@ from scm_world.queries.inversion import Found, density_of, noise_given, noise_sh
 from scm_world.queries.observations import Observations, observations, per
 from scm_world.queries.plans import Plan, at_once, numbered
 from scm_world.variables import (
+    SOFT,
     Action,
     Box,
     Categories,
@@ -287,15 +288,20 @@ class _Abduction:
     def _without_intervention(self, name: str, value: Value) -> Value:
         """Return what a variable would have been that was observed under a shift or scale."""
         act = self.model.act_on(name)
-        match None if act is None else act.intervention:
-            case Shift(by=by):
-                return np.asarray(value - np.asarray(by))
-            case Scale(by=by):
-                if not np.all(by):
-                    said = f"{name!r} was observed under Scale(0), which tells nothing of it"
-                    raise ModelError([f"{said}: leave it out, or give NaN"])
-                return np.asarray(value / np.asarray(by))
-        return value
+        if act is None or not isinstance(act.intervention, SOFT):
+            return value
+        asked: Any = act.requested
+        done, by = act.intervention, np.asarray(act.intervention.by)
+        if isinstance(done, Scale) and not by.all():
+            said = f"{name!r} was observed under Scale(0), which tells nothing of it"
+            raise ModelError([f"{said}: leave it out, or give NaN"])
+
+        def natural(_: NoiseKey, known: Values) -> Value:
+            there = known[name] if asked.name == name else asked.mechanism.bind()(known[name])
+            there = there - by if isinstance(done, Shift) else there / by
+            return np.asarray(there if asked.name == name else asked.inverse.bind()(there))
+
+        return self._each(natural, 0, {}, {name: value})
 
     def _drawn(self, variable: Any, source: Any, step: int, there: Value) -> Value:
         """Draw the noise of a variable; weigh it where the variable was not observed."""

@@ -914,3 +914,20 @@ def test_what_is_drawn_before_the_first_step_is_not_exact() -> None:
     assert not found.exact
     assert found.effective == pytest.approx([1000.0, 1000.0])
     assert model.counterfactual(seen, do={"b": Mechanism(lambda noise: noise, [])}).exact
+
+
+@pytest.mark.parametrize("was", [{}, {"c": Shift(0.5)}, {"c": Scale(2.0)}])
+@pytest.mark.parametrize("do", [{"c": 1.0}, {"c": Shift(1.0)}, {"x": Shift(1.0)}, {"c": Natural()}])
+def test_other_coordinates_of_what_was_observed(was: Any, do: Any) -> None:
+    """They may be shifted, when the unit was observed and afterwards."""
+    model = SCM(
+        [
+            Exogenous(name="x", distribution=Normal(3.0, 0.1)),
+            Derived(name="c", parents=("x",), mechanism=np.log, inverse=np.exp),
+            Derived(name="y", parents=("x",), mechanism=ONE, noise=Normal()),
+        ]
+    ).do(was)
+    found, wanted = model.counterfactual(model.draw(3, seed=0), do=do), model.do(do)
+    assert found.exact
+    for name, values in wanted.draw(3, seed=0).items():
+        np.testing.assert_allclose(found[name], values, rtol=1e-9)
