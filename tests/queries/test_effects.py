@@ -137,7 +137,7 @@ def test_effects_over_values_and_by_a_covariate() -> None:
 
 
 def test_two_episodes_are_compared() -> None:
-    """What differs, since when, which contacts and which noise are in one only."""
+    """What differs, since when, and which contacts are in one only."""
     world = World("pushing")
     one = world.rollout(steps=10, do=SLIDE)
     assert str(compare(one, one.counterfactual({}))) == "no difference"
@@ -147,7 +147,6 @@ def test_two_episodes_are_compared() -> None:
     assert apart.variables["floor_friction"].first == 3
     assert apart.variables["tool_block.linear_velocity"].first == 4
     assert "goal_block.size" not in apart.variables
-    assert apart.noise == (("floor_friction", 1),)
     high = one.counterfactual({"tool_block.linear_velocity": [0.0, 0.0, 2.0]}, at=5)
     assert (6, ("floor", "tool_block"), 0) in compare(one, high).contacts
     assert compare(one, other, ["floor_color"], tolerance=2.0).variables == {}
