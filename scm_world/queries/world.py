@@ -14,6 +14,7 @@ from scm_world._types import ArrayLike, Floats
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
 from scm_world.queries.comparison import Comparison, compare_backends
+from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import CompiledModel, Equations, System
 from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Key, Plan
@@ -216,6 +217,22 @@ class World(Simulation, Questions):
             if due:
                 other.do(due)
         return other
+
+    def counterfactual(
+        self,
+        do: Mapping[str, Any] | None = None,
+        *,
+        at: int = 0,
+        actions: Any = "replay",
+        **options: Any,
+    ) -> Episode:
+        """Run an episode and return its counterfactual: an intervention, with the same noise.
+
+        It is ``world.rollout(**options).counterfactual(do, at=at, actions=actions)``.
+        """
+        record = options.get("record", ())
+        factual = self.rollout(**options)
+        return factual.counterfactual(do, at=at, actions=actions, record=record)
 
     def compare(
         self, backend: str, *, probes: int = 12, seed: int = 0, progress: Progress | None = None
