@@ -94,18 +94,15 @@ def _written(model: SCM) -> dict[str, Any] | None:
 
 
 def _arguments(task: Task) -> dict[str, Any] | None:
-    """Write down what a task was made with; None where it can only be given again as a world.
-
-    Raises:
-        ModelError: It is a registered task, and what it was made with cannot be written.
-    """
+    """Write down what a task was made with; None where it can only be given again as a world."""
     registered = task.name in tasks()
     problem = f"give the arguments of {task.name!r} by name, so that they can be saved"
     if task.is_named:
         try:
-            found: dict[str, Any] = json.loads(json.dumps(_plain(task.given), allow_nan=False))
+            written = json.dumps(task.given, allow_nan=False, default=lambda value: value.tolist())
+            found: dict[str, Any] = json.loads(written)
             return found
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, AttributeError) as error:
             problem = f"an argument of {task.name!r} cannot be written: {error}"
     if registered:
         raise ModelError([problem])
@@ -124,14 +121,6 @@ def _hashes(episode: Episode) -> list[str]:
         last = now
         found.append(mark.hexdigest())
     return found
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(part) for key, part in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(part) for part in value]
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
 def load_episode(
@@ -181,11 +170,7 @@ def load_episode(
 def _twins(
     about: dict[str, Any], world: Simulation | SCM | None, file: Path, trusted: Sequence[str]
 ) -> Twins:
-    """Return where the episode is run again.
-
-    Raises:
-        SnapshotMismatch: The world or model that is given is another one.
-    """
+    """Return where the episode is run again; refuse a world or a model that is another one."""
     kind, system = (SCM, world) if "equations" in about else (Simulation, world)
     if world is None and kind is Simulation:
         system = _made(about)

@@ -41,11 +41,7 @@ Pairs = frozenset[tuple[str, str]]
 
 
 def as_names(record: Iterable[str]) -> tuple[str, ...]:
-    """Read the names of variables; a text is one name.
-
-    Raises:
-        UnknownOption: It is neither.
-    """
+    """Return the names of variables; a text is one name."""
     if not isinstance(record, Iterable):
         raise UnknownOption("names", record, ("a name", "names of variables"))
     return (record,) if isinstance(record, str) else tuple(record)
@@ -83,23 +79,14 @@ class Unit:
     listens: bool = False
 
     def run(self, world: System, twins: Any = None) -> Episode:
-        """Run it in one world.
-
-        Args:
-            world: Any twin.
-            twins: Of the world, for questions to the episode.
-
-        Raises:
-            InterventionError: An intervention was refused.
-            ActionError: The policy gave no action.
-        """
+        """Run it in a twin; questions to the episode run on ``twins``."""
         episode = Episode.of(twins, self, world)
         episode.begin()
         run(episode, self.first, self.steps)
         return episode.ended()
 
     def result(self, world: System, twins: Any = None) -> Episode | Exception:
-        """Run it in one world; return the episode, or the exception that stopped it."""
+        """Run it in a twin; return the episode, or the exception that stopped it."""
         try:
             return self.run(world, twins)
         except Exception as error:
@@ -107,13 +94,9 @@ class Unit:
 
 
 def run(running: Any, first: int, steps: int) -> None:
-    """Run episodes from one instant to another: the only rollout loop of queries.
+    """Run one or several episodes from an instant to another: the only rollout loop of queries.
 
-    Args:
-        running: An episode under way, or several, at the instant ``first``, after its
-            interventions; recorded up to that instant.
-        first: Number of the first instant.
-        steps: Number of the last one.
+    They are at the instant ``first``, after what is done then, and recorded up to it.
     """
     for step in range(first, steps + 1):
         if first < step < steps:
@@ -648,12 +631,7 @@ def _instant(at: Any, last: int) -> int:
 
 
 def _chosen(policy: Policy, world: System) -> Floats:
-    """Ask a policy for an action.
-
-    Raises:
-        ActionError: It did something else to the world, or gave no numbers.
-        FunctionFailure: It raised an error.
-    """
+    """Ask a policy for an action; refuse one that does something else to the world."""
     before = world.version, world.index
     with blamed(lambda: who(policy, world)):
         given = policy(world)

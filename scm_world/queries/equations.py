@@ -365,12 +365,7 @@ System = Simulation | Equations
 
 
 def length(system: System, steps: int | None) -> int:
-    """Return the number of control steps of an episode; that of the task if None.
-
-    Raises:
-        UnknownOption: It is no possible number, or not 0 where no edges are lagged.
-        ModelError: The system has no number of its own.
-    """
+    """Return the number of control steps of an episode; that of the task if None."""
     if isinstance(system, Simulation):
         return whole_number("steps", system.max_episode_length if steps is None else steps, least=1)
     if system.model.is_temporal:

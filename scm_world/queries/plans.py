@@ -41,11 +41,7 @@ _PARTS: TypeAdapter[dict[str, tuple[Any, ...]]] = TypeAdapter(dict[str, tuple[In
 
 
 def as_act(value: Any) -> Any:
-    """Make a plain value a hard intervention, and the name of a space a draw from it.
-
-    Raises:
-        UnknownOption: It is neither numbers nor an intervention.
-    """
+    """Make a plain value a hard intervention, and the name of a space a draw from it."""
     if isinstance(value, ACTS) or (isinstance(value, dict) and "kind" in value):  # from a file
         return value
     if isinstance(value, dict):
@@ -190,10 +186,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[str, Intervention]:
         """Return what is to be done at the beginning of a control step, without times.
 
-        Args:
-            world: As it is then; events are looked for in it.
-            step: Number of the control step.
-            fired: When events happened; those of now are added.
+        Events are looked for in the world; those of now are added to ``fired``.
         """
         found: dict[str, Intervention] = {}
         ended: dict[str, Intervention] = {}
@@ -222,13 +215,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         return {**over, **found}
 
     def concerns(self, world: System, step: int, fired: Mapping[Key, int]) -> bool:
-        """Tell whether anything may be due at a control step, without a look at the present.
-
-        Args:
-            world: In the structure that there is then.
-            step: Number of the control step.
-            fired: When events happened.
-        """
+        """Return whether anything may be due at a control step, without a look at the present."""
         return any(True for _ in self._possible(world, step, fired))
 
     def _possible(
@@ -372,11 +359,7 @@ def _until(act: Any, end: int) -> list[Any]:
 
 
 def _since(name: str, act: Any, start: int) -> Any:
-    """Return an intervention of a request that begins at a control step.
-
-    Raises:
-        InterventionError: It is due before.
-    """
+    """Return an intervention of a request that begins at a control step; refuse an earlier one."""
     time = act.time
     if time is None:
         return retimed(act, at=start) if start else act
@@ -399,11 +382,7 @@ def _is_state(name: str, world: System) -> bool:
 
 
 def happens(event: Contact | Reaches, world: System) -> bool:
-    """Tell whether an event is there now.
-
-    Raises:
-        UnknownOption: There is no such body or number; equations have no bodies at all.
-    """
+    """Return whether an event is there now; refuse unknown bodies and components."""
     if isinstance(event, Reaches):
         numbers = np.ravel(world[event.name])
         if event.component >= len(numbers):

@@ -430,11 +430,7 @@ class SCM(Questions, graph.SCM):
 
 
 def planned(model: graph.SCM, do: Mapping[str, Any] | None) -> Plan:
-    """Read an intervention on equations, with labels of categories as numbers.
-
-    Raises:
-        UnknownOption: It has a time, and the model has one instant.
-    """
+    """Read an intervention on equations; labels of categories become their numbers."""
     plan = do if isinstance(do, Plan) else Plan(numbered(model, {} if do is None else do))
     if not model.is_temporal:
         for name, act in plan.timed():

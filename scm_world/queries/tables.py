@@ -20,14 +20,8 @@ Row = tuple[dict[str, Any], int]
 def read_protocol(protocol: Iterable[Mapping[str, Any]], model: SCM) -> list[Row]:
     """Read a table of settings.
 
-    Args:
-        protocol: Rows. Columns are variables, or components ``name[i]`` of them (all of them then),
-            and ``n``, the number of episodes, which is 1 without it.
-        model: Knows the shapes of the variables.
-
-    Raises:
-        UnknownOption: A cell is no number, or a component is missing.
-        UnknownVariable: A column is no variable.
+    Its columns are variables, or components ``name[i]`` of them (all of them then), and ``n``, the
+    number of episodes, which is 1 without it.
     """
     rows = list(protocol) if isinstance(protocol, Iterable) else [protocol]
     for number, row in enumerate(rows):

@@ -116,14 +116,9 @@ class Twins:
 
     @contextmanager
     def together(self, n: int, names: tuple[str, ...], threads: int) -> Iterator[Batch]:
-        """Lend twins of a world that are stepped together; one thread at a time.
+        """Lend n twins of a world that are stepped together, and compute ``names`` in every step.
 
         They share what is declared, which twins that are lent to several threads cannot.
-
-        Args:
-            n: How many.
-            names: What has to be computed in every step.
-            threads: Of the engine.
         """
         with self._batching:
             worlds, self._members = self._members[:n], self._members[n:]
@@ -223,11 +218,7 @@ class Twins:
         return True
 
     def _in_processes(self, units: Sequence[Unit], workers: int) -> Generator[Result, None, None]:
-        """Run units in other processes; yield the results in the order of the units.
-
-        Raises:
-            EngineFailure: A process ended.
-        """
+        """Run units in other processes; yield the results in the order of the units."""
         size = math.ceil(len(units) / (SHARE * workers))
         jobs = [units[i : i + size] for i in range(0, len(units), size)]
         pool = self._processes(workers)
@@ -262,11 +253,7 @@ class Twins:
     # --- equations ----------------------------------------------------------------------------
 
     def paths(self, units: Sequence[Unit]) -> Floats:
-        """Run units of equations; return all values at all instants, shape (n, steps + 1, size).
-
-        Raises:
-            Exception: What stopped a unit.
-        """
+        """Run units of equations; return all values at all instants, shape (n, steps + 1, size)."""
         with suppress(Exception):  # the unit raises it again
             if (together := self._solved_together(units)) is not None:
                 return together[0]
@@ -352,19 +339,10 @@ def is_known(unit: Unit) -> bool:
 
 
 def run_together(batch: Batch, units: Sequence[Unit], twins: Any = None) -> list[Result]:
-    """Run units in the rows of a batch.
+    """Run units in the rows of a batch of as many worlds or more.
 
-    Args:
-        batch: Of as many worlds or more, whose tables have the names of the units.
-        units: All with the same first control step, as many steps, the same names, and policies
-            whose actions are known beforehand.
-        twins: Of the world.
-
-    Returns:
-        The episode of each, or the exception that stopped it.
-
-    Raises:
-        EngineFailure: The backend lost one of the states; that stops all of them.
+    They have the same instants and names, which the tables of the batch have, too, and policies
+    whose actions are known beforehand. A backend that loses a state stops all of them.
     """
     running = _Together(batch, units, twins)
     run(running, units[0].first, units[0].steps)
@@ -503,11 +481,7 @@ _TWINS: WeakKeyDictionary[Any, Twins] = WeakKeyDictionary()
 
 
 def twins_of(system: System) -> Twins:
-    """Return the twins of a world or of equations; they are freed with it.
-
-    Raises:
-        UnknownOption: It is neither.
-    """
+    """Return the twins of a world or of equations; they are freed with it."""
     if not isinstance(system, System):
         raise UnknownOption("world", system, ("a World",))
     found = _TWINS.get(system)
@@ -517,11 +491,7 @@ def twins_of(system: System) -> Twins:
 
 
 def asked(system: Any) -> tuple[Twins, Any]:
-    """Return where episodes of a system are run, and a system that knows what is declared.
-
-    Raises:
-        UnknownOption: It is neither a world nor a model.
-    """
+    """Return where episodes of a system are run, and a system that knows what is declared."""
     if not isinstance(system, System | SCM):
         raise UnknownOption("system", system, ("a World", "an SCM"))
     found = Equations(CompiledModel(system)) if isinstance(system, SCM) else system
