@@ -379,8 +379,12 @@ class EquationWorld(Equations, Questions):
     """
 
     def given(self, do: Mapping[str, Any]) -> Self:
-        """Return another world in which this is done too; this one is not changed."""
-        return type(self)(CompiledModel(self.model.do(do)))
+        """Return another world in which this is done too, at the same instant; see ``World``."""
+        other = copy.copy(self)
+        other.compiled = CompiledModel(self.model.do(do))
+        other.model, other._models = other.compiled.model, (self.graph.do(do),)
+        other._changed()
+        return other
 
     def __enter__(self) -> Self:
         return self
