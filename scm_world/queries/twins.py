@@ -30,6 +30,7 @@ from scm_world.graph import SCM
 from scm_world.policies.scripted import OpenLoopPolicy, as_policy
 from scm_world.queries.episodes import ALL, Episode, Unit, run, who
 from scm_world.queries.equations import CompiledModel, Equations, System
+from scm_world.queries.plans import Plan
 from scm_world.work.processes import cores
 from scm_world.world import Simulation
 from scm_world.world.batch import Batch, StateTable
@@ -285,7 +286,7 @@ class Twins:
         assert compiled is not None  # noqa: S101
         one = Equations(compiled)
         policies = [as_policy(u.policy, one) for u in units] if compiled.n_actions else []
-        plans: dict[int, Any] = {id(unit.plan): unit.plan for unit in units}
+        plans = {id(unit.plan): unit.plan for unit in units}
         if (
             len(units) == 1
             or not compiled.is_vectorised
@@ -299,38 +300,24 @@ class Twins:
         for row, policy in enumerate(policies):
             one.reset(seed=first.seed, episode=units[row].number)
             actions[row] = policy.ahead(one, 0, first.steps)  # type: ignore[attr-defined] # OpenLoopPolicy
-        running = _Solving(one, units, [*plans.values()], actions)
-        run(running, 0, first.steps)
-        return np.stack(running.vectors, axis=1), actions
+        places = {key: group for group, key in enumerate(plans)}
+        together = Equations(compiled, [places[id(unit.plan)] for unit in units])
+        grouped: Any = _Groups([*plans.values()])
+        unit = replace(first, plan=grouped, policy=lambda it: actions[:, it.index], names=())
+        return np.stack(unit.run(together).vectors, axis=1), actions
 
 
 @final
-class _Solving:
-    """Episodes of equations that are solved together, for ``run``."""
+class _Groups:
+    """The plans of groups of episodes that equations solve together."""
 
-    def __init__(
-        self, system: Equations, units: Sequence[Unit], plans: Sequence[Any], actions: Floats
-    ) -> None:
-        places = {id(plan): group for group, plan in enumerate(plans)}
-        self._system = Equations(system.compiled, [places[id(unit.plan)] for unit in units])
-        self._plans, self._actions = plans, actions
-        self.vectors: list[Floats] = []
-        self._system.reset(seed=units[0].seed, episode=units[0].number)
-        self.intervene(0)
+    def __init__(self, plans: Sequence[Plan]) -> None:
+        self._plans = plans
 
-    def intervene(self, step: int) -> None:
-        """Do what is due at an instant, in each group."""
-        dues = [plan.due(self._system, step, {}) for plan in self._plans]
-        if any(dues):
-            self._system.do({group: due for group, due in enumerate(dues) if due})
-
-    def record(self, step: int) -> None:
-        """Record the values of all episodes."""
-        self.vectors.append(self._system.vector)
-
-    def act(self, step: int) -> None:
-        """Take a step in all episodes."""
-        self._system.step(self._actions[:, step])
+    def due(self, world: System, step: int, fired: Any) -> dict[int, Any]:
+        """Return what is due in each group in which something is."""
+        dues = (plan.due(world, step, fired) for plan in self._plans)
+        return {group: due for group, due in enumerate(dues) if due}
 
 
 def is_known(unit: Unit) -> bool:
