@@ -26,7 +26,7 @@ from scm_world.policies.scripted import Policy, as_policy
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.equations import System
 from scm_world.queries.local import contacts_of
-from scm_world.queries.plans import Key, Plan, at_once, targets
+from scm_world.queries.plans import Key, Plan, at_once
 from scm_world.variables import Draw, Natural
 from scm_world.world import Audit, Simulation
 
@@ -295,21 +295,19 @@ class Episode:
             InterventionError: The request was refused; nothing has changed.
         """
         world, step = self._under_way(), self.steps
-        model, asked = world.model, Plan(request)
-        plan = self.plan.then(asked, model, at=step)
-        mine = {target for name in asked for target in targets(model, name)}
-        found = plan.due(world, step, dict(self.fired))
-        due = {name: act for name, act in found.items() if mine.issuperset(targets(model, name))}
+        model = world.model
+        more = Plan().then(request, model, at=step)
+        due = more.due(world, step, {})
         audit = world.do(due) if due else None
         if audit is not None:
             self.audits[step] = audit
             drawn = {name: one.requested for name, one in audit.targets.items()}
             parts = {  # the world has given each draw at one instant a noise of its own
                 name: tuple(_drawn(act, due.get(name), drawn.get(name)) for act in acts)
-                for name, acts in plan.items()
+                for name, acts in more.items()
             }
-            plan = Plan.of(parts)
-        self.unit = replace(self.unit, plan=plan)
+            more = Plan.of(parts)
+        self.unit = replace(self.unit, plan=self.plan.then(more, model, at=step, done=True))
         return audit
 
     def step(self, action: Any = None) -> Floats:

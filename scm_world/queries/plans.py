@@ -151,7 +151,9 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
     # --- in an episode ------------------------------------------------------------------------
 
-    def then(self, request: Mapping[str, Any] | None, model: SCM, *, at: int) -> Plan:
+    def then(
+        self, request: Mapping[str, Any] | None, model: SCM, *, at: int, done: bool = False
+    ) -> Plan:
         """Return the plan that does this too, from a control step on.
 
         From then on it alone counts for the quantities that it names. What has no time is done at
@@ -161,22 +163,29 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             request: Interventions; their times count from the beginning of the episode.
             model: Knows which names are coordinates of one quantity.
             at: The control step.
+            done: Whether this plan has acted at that step already: then what it did stands where
+                the request has nothing for that step.
 
         Raises:
             InterventionError: An intervention is due before that step.
         """
-        plan = Plan(request)
-        mine = {target for name in plan for target in targets(model, name)}
+        more = {n: tuple(_since(n, act, at) for act in acts) for n, acts in Plan(request).items()}
+        mine = {target for name in more for target in targets(model, name)}
+        now = {
+            target
+            for name, acts in more.items()
+            if any(act.time is None or act.time.start == at for act in acts)
+            for target in targets(model, name)
+        }
         parts: dict[str, tuple[Any, ...]] = {}
         for name, acts in self._parts.items():
-            kept = acts
-            if mine.issuperset(targets(model, name)):
-                kept = tuple(part for act in acts for part in _until(act, at))
+            its, kept = targets(model, name), acts
+            if mine.issuperset(its):
+                end = at + 1 if done and not now.issuperset(its) else at
+                kept = tuple(part for act in acts for part in _until(act, end))
             if kept:
                 parts[name] = kept
-        for name, acts in plan.items():
-            parts[name] = (*parts.get(name, ()), *(_since(name, act, at) for act in acts))
-        return Plan.of(parts)
+        return Plan.of(parts | {n: (*parts.get(n, ()), *acts) for n, acts in more.items()})
 
     @property
     def waits(self) -> bool:
