@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
 
+import numpy as np
 import pytest
 
 from scm_world.errors import ActionError, InterventionError, UnknownOption
@@ -17,6 +20,7 @@ from scm_world.variables import (
     Natural,
     Normal,
     Parent,
+    Reaches,
     Shift,
 )
 
@@ -159,3 +163,44 @@ def test_equations_are_run_by_hand_too() -> None:
         twin.step(action)
     assert live.episode() == model.rollout(seed=4, steps=6)
     assert twin.episode() == live.episode().counterfactual({"push": 1.0}, at=2)
+
+
+def some_request(rng: np.random.Generator, now: int) -> dict[str, Hard | Shift | Draw]:
+    """Return an intervention at random, with a time from now on."""
+    times: list[dict[str, Any]] = [
+        {},
+        {"at": now + int(rng.integers(4))},
+        {"during": (now + int(rng.integers(3)), now + int(rng.integers(3, 7)))},
+        {"during": (now, None)},
+        {"at": int(rng.integers(5)), "every": int(rng.integers(1, 4))},
+        {"when": Reaches("joint_velocities", above=0.2, component=int(rng.integers(9)))},
+    ]
+    time, value = times[rng.integers(len(times))], float(rng.uniform(0.02, 0.06))
+    if rng.integers(8) == 0:
+        return {PLACE: Hard([0.0, -value, 0.0325], **time)}
+    name = (MASS, "joint_damping")[rng.integers(2)]
+    return {name: (Hard(value, **time), Shift(0.001, **time), Draw("A", **time))[rng.integers(3)]}
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_whatever_is_done_by_hand_is_in_the_plan(seed: int) -> None:
+    """Cut windows, events, repetitions and draws happen again, in rollouts, branches and splits."""
+    rng, world = np.random.default_rng(seed), World("pushing", backend="fake")
+    live = world.live("random", seed=seed)
+    for _ in range(12):
+        for _ in range(rng.integers(3)):
+            with suppress(InterventionError):
+                live.do(some_request(rng, live.steps))
+        with suppress(InterventionError):
+            live.step()
+    episode, at = live.episode(), int(rng.integers(live.steps))
+    plan = Plan.from_json(episode.plan.to_json())
+    assert world.rollout(live.actions, seed=seed, do=plan, steps=episode.steps) == episode
+    assert episode.counterfactual({}, at=at) == episode
+    other = episode.counterfactual({MASS: Hard(0.07, at=at)}, at=at)
+    assert other.counterfactual({}, at=int(rng.integers(at + 1))) == other
+    twin = live.split({MASS: 0.07}, at=at)
+    for action in live.actions[at:]:
+        with suppress(InterventionError):
+            twin.step(action)
+    assert twin.episode() == other
