@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import copyreg
 import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 SHOWN = 8
 """Near names that a message lists."""
@@ -42,6 +41,13 @@ def in_one_line(error: Exception) -> str:
     return text if text and isinstance(error, ScmWorldError) else f"{name}: {text}".rstrip(": ")
 
 
+def _rebuild(kind: type[ScmWorldError], message: str, data: dict[str, Any]) -> ScmWorldError:
+    error = kind.__new__(kind, message)
+    error.args = (message,)  # an OSError takes no message before its constructor
+    error.__dict__.update(data)
+    return error
+
+
 class ScmWorldError(Exception):
     """Anything this package raises on purpose. It can be pickled, attributes included.
 
@@ -59,7 +65,7 @@ class ScmWorldError(Exception):
         def __getattr__(self, name: str) -> Any: ...
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return copyreg.__newobj__, (type(self),), {**vars(self), "args": self.args}  # type: ignore[attr-defined] # typeshed lacks it
+        return _rebuild, (type(self), str(self), self.__dict__)
 
 
 class ModelError(ScmWorldError, ValueError):

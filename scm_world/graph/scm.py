@@ -7,6 +7,7 @@ from copy import deepcopy
 from dataclasses import replace
 from typing import Any, Self
 
+import networkx as nx
 import numpy as np
 
 from scm_world._arguments import whole_number
@@ -274,19 +275,21 @@ class SCM:
 
     def parents(self, name: str) -> tuple[str, ...]:
         """Return the direct causes, of any lag."""
-        return self.structure.parents(self.declared(name).name)
+        return tuple(self.structure.graph.predecessors(self.declared(name).name))
 
     def children(self, name: str) -> tuple[str, ...]:
         """Return the direct effects, of any lag."""
-        return self.structure.children(self.declared(name).name)
+        return tuple(self.structure.graph.successors(self.declared(name).name))
 
     def ancestors(self, name: str) -> frozenset[str]:
-        """Return the direct and indirect causes."""
-        return self.structure.ancestors(self.declared(name).name)
+        """Return the direct and indirect causes; a variable that drives itself is one of them."""
+        graph, direct = self.structure.graph, self.parents(name)
+        return frozenset(direct).union(*(nx.ancestors(graph, cause) for cause in direct))
 
     def descendants(self, name: str) -> frozenset[str]:
         """Return the direct and indirect effects."""
-        return self.structure.descendants(self.declared(name).name)
+        graph, direct = self.structure.graph, self.children(name)
+        return frozenset(direct).union(*(nx.descendants(graph, effect) for effect in direct))
 
     def __eq__(self, other: object) -> bool:
         return (

@@ -113,6 +113,11 @@ class Coupled(tuple[Parent, ...]):
         return tuple, ((*self,),)
 
 
+def own(parents: tuple[Parent, ...]) -> tuple[Parent, ...]:
+    """Return the edges that may have lag 0 or the condition "set": not those that are shared."""
+    return parents.own if isinstance(parents, Coupled) else parents
+
+
 def _without(space: Space | None, other: Space | None) -> Space | None:
     """Leave out of a set of whole numbers those that another one has too."""
     match space, other:
@@ -419,8 +424,7 @@ class Measured(_Computed):
 
     def set_parents(self) -> tuple[str, ...]:
         """Name the parents that act when the state is set."""
-        parents = self.parents.own if isinstance(self.parents, Coupled) else self.parents
-        return tuple(p.name for p in parents if p.when == "set")
+        return tuple(p.name for p in own(self.parents) if p.when == "set")
 
 
 @final
