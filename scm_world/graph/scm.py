@@ -72,29 +72,25 @@ def flatten(
     if not isinstance(request, Mapping):
         raise UnknownOption("request", request, ("a dictionary of variables and values",))
     flat: dict[str, Any] = {}
-    problems: list[InterventionError] = []
+    problems: list[InterventionError] = [] if twice is None else twice
     for name, value in request.items():
-        if isinstance(value, Frozen | float):  # an intervention
-            parts = {name: value}
+        parts = {name: value}
+        if isinstance(value, Frozen | float):
+            pass
         elif isinstance(value, Mapping):
             if not value:
                 said = f"do({name}): an empty dictionary sets nothing; leave {name!r} out"
                 problems.append(InterventionError(said, variable=name, value=value))
-            inner = flatten(value, problems)
-            parts = {f"{name}.{key}": part for key, part in inner.items()}
-        else:
-            one = value
-            if isinstance(value, tuple) and len(value) == 1 and isinstance(value[0], Frozen):
-                one = value[0]  # the only act of a plan
-            held = isinstance(one, list | tuple) or hasattr(one, "__array__")
-            parts = {name: deepcopy(one) if held else one}
+            parts = {f"{name}.{key}": part for key, part in flatten(value, problems).items()}
+        elif isinstance(value, tuple) and len(value) == 1 and isinstance(value[0], Frozen):
+            parts[name] = value[0]  # the only intervention of a plan
+        elif isinstance(value, list | tuple) or hasattr(value, "__array__"):
+            parts[name] = deepcopy(value)
         problems += [ConflictingTargets((key, key), key) for key in parts if key in flat]
         for key, part in parts.items():
             flat.setdefault(key, part)
     if twice is None:
         raise_all(problems)
-    else:
-        twice += problems
     return flat
 
 
@@ -186,41 +182,25 @@ class SCM:
         Raises:
             UnknownVariable: No variable has this name.
         """
-        variable = self.declared(name)
-        act = self._acts.get(name)
-        if act is None or isinstance(act.intervention, SOFT):
+        variable, act = self.declared(name), self._acts.get(name)
+        done = None if act is None else act.intervention
+        if act is None or isinstance(done, SOFT):
             return variable
-        common = variable.model_dump(
-            include=set(Variable.model_fields) - {"name", "bounds", "a", "b"}
+        kept = {field: getattr(variable, field) for field in Variable.model_fields}
+        if isinstance(done, Hard):
+            value = self._evaluator.forced(name, act, {}, None)
+            return Fixed(value=value, intervenable=True, **kept)
+        if not isinstance(done, Mechanism):
+            return Exogenous(default=np.zeros(variable.shape), distribution=source_of(act), **kept)
+        own = variable.noise if isinstance(variable, Derived) else None
+        noise = done.noise or (own if done.equation.takes_noise else None)
+        return Derived(
+            parents=done.parents,
+            mechanism=done.equation,
+            noise=noise,
+            inverse_noise=None if noise is None else done.inverse_noise,
+            **kept,
         )
-        spaces = {"bounds": variable.bounds, "a": variable.a, "b": variable.b}
-        if isinstance(act.intervention, Hard):
-            value = np.ravel(self._evaluator.forced(name, act, {}, None)).tolist()
-            return Fixed(
-                name=name,
-                value=value if variable.shape else value[0],
-                intervenable=True,
-                **common,
-                **spaces,
-            )
-        default = tuple([0.0] * int(np.prod(variable.shape))) if variable.shape else 0.0
-        if isinstance(act.intervention, Mechanism):
-            given = act.intervention
-            noise = given.noise
-            if isinstance(variable, Derived) and given.equation.takes_noise:
-                noise = noise or variable.noise
-            back = None if noise is None else given.inverse_noise
-            return Derived(
-                name=name,
-                parents=given.parents,
-                mechanism=given.equation,
-                noise=noise,
-                inverse_noise=back,
-                **common,
-                **spaces,
-            )
-        source = source_of(act)
-        return Exogenous(name=name, default=default, distribution=source, **common, **spaces)
 
     def declared(self, name: str) -> Variable:
         """Return the variable as it was declared, before any intervention.
@@ -260,13 +240,16 @@ class SCM:
         return self._structure
 
     def _parents(self, name: str) -> tuple[Parent, ...]:
-        """Give the edges into a variable, as ``self[name].all_parents`` does."""
+        """Return the edges into a variable, as ``self[name].all_parents`` does."""
         act = self._acts.get(name)
-        if act is None or isinstance(act.intervention, SOFT):
-            return self._declared[name].all_parents
-        if isinstance(act.intervention, Draw):
-            return tuple(map(Parent, sorted(source_of(act).parents())))
-        return () if isinstance(act.intervention, Hard) else self[name].all_parents
+        match act and act.intervention:
+            case Hard():
+                return ()
+            case Mechanism(parents=parents):
+                return parents
+            case Draw() if act is not None:
+                return tuple(map(Parent, sorted(source_of(act).parents())))
+        return self._declared[name].all_parents
 
     @property
     def edges(self) -> tuple[Edge, ...]:
@@ -275,7 +258,7 @@ class SCM:
 
     def parents(self, name: str) -> tuple[str, ...]:
         """Return the direct causes, of any lag."""
-        return tuple(self.structure.graph.predecessors(self.declared(name).name))
+        return tuple(dict.fromkeys(p.name for p in self._parents(self.declared(name).name)))
 
     def children(self, name: str) -> tuple[str, ...]:
         """Return the direct effects, of any lag."""
@@ -283,13 +266,15 @@ class SCM:
 
     def ancestors(self, name: str) -> frozenset[str]:
         """Return the direct and indirect causes; a variable that drives itself is one of them."""
-        graph, direct = self.structure.graph, self.parents(name)
-        return frozenset(direct).union(*(nx.ancestors(graph, cause) for cause in direct))
+        graph = self.structure.graph
+        found = nx.ancestors(graph, self.declared(name).name)
+        return frozenset(found | {name} if {name, *found} & {*graph.succ[name]} else found)
 
     def descendants(self, name: str) -> frozenset[str]:
         """Return the direct and indirect effects."""
-        graph, direct = self.structure.graph, self.children(name)
-        return frozenset(direct).union(*(nx.descendants(graph, effect) for effect in direct))
+        graph = self.structure.graph
+        found = nx.descendants(graph, self.declared(name).name)
+        return frozenset(found | {name} if {name, *found} & {*graph.pred[name]} else found)
 
     def __eq__(self, other: object) -> bool:
         return (
@@ -472,30 +457,17 @@ class SCM:
             raise UnknownOption("known", known, ("a dictionary of variables and values",))
         values: dict[str, Value] = dict(known or {})
         evaluate = self._evaluator.evaluate
-        if only is None:
-            self._refuse_computed(values)
+        free = () if only is not None else (n for n in values if n in self and n not in self._acts)
+        computed = [n for n in free if getattr(self._declared[n], "mechanism", None) is not None]
+        if computed:  # an observed value would be ignored
+            said = f"{', '.join(map(repr, computed))} is computed, so a value that was observed "
+            said += "would be ignored; ask counterfactual(observed, do=…), or set it with do"
+            raise ModelError([said])
         lead = self._lead(values, key, whole=only is None)
         for name in self._order if only is None else only:
             found = evaluate(name, self._acts.get(name), values, previous or {}, key)
             values[name] = self._spread(name, found, lead) if lead else found
         return values
-
-    def _refuse_computed(self, known: Values) -> None:
-        """Refuse values that would be ignored."""
-        computed = [
-            name
-            for name in known
-            if name in self
-            and name not in self._acts
-            and getattr(self._declared[name], "mechanism", None) is not None
-        ]
-        if computed:
-            raise ModelError(
-                [
-                    f"{', '.join(map(repr, computed))} is computed, so a value that was observed "
-                    "would be ignored; ask counterfactual(observed, do=…), or set it with do"
-                ]
-            )
 
     def _lead(self, known: Values, key: NoiseKey | None, *, whole: bool) -> tuple[int, ...]:
         """Give the batch axes of what is computed; without a key, those of what is known."""
