@@ -444,4 +444,5 @@ class Table(Frozen):
         return category
 
 
+EQUATIONS = (Function, Linear, Concatenation, Table)
 Equation = Annotated[Function | Linear | Concatenation | Table, Field(discriminator="kind")]
