@@ -140,7 +140,7 @@ class Mechanism(TimedIntervention):
         of: A bundle that the function returns as a whole; the variable gets its part of it.
 
     Example:
-        >>> tie = Mechanism(Function("numpy:mean"), ["floor_color"])
+        >>> tie = Mechanism(np.mean, ["floor_color"])
         >>> tie.parents[0].name, tie.parents[0].lag
         ('floor_color', 0)
     """
