@@ -49,9 +49,6 @@ class EdgeIndex:
     Args:
         parents: The edges into each variable by name, in the order of declaration.
 
-    Raises:
-        CyclicModel: Contemporaneous edges form a cycle.
-
     Attributes:
         order: The variables, causes before their contemporaneous effects.
     """
@@ -142,14 +139,7 @@ def _bundle_problems(variable: Variable, known: Mapping[str, Variable]) -> Itera
 
 
 def checked(variables: Iterable[Variable]) -> tuple[dict[str, Variable], EdgeIndex]:
-    """Index variables by name, or raise one error that lists everything that is wrong.
-
-    Returns:
-        The variables by name, and the edges among them.
-
-    Raises:
-        ModelError: Duplicate names, unknown parents, contemporaneous cycles.
-    """
+    """Return variables by name and their edges, or raise one error that lists all faults."""
     by_name: dict[str, Variable] = {}
     problems: list[str] = []
     for variable in variables:

@@ -136,7 +136,8 @@ Bound = float | Affine | Switch
 Bounds = Bound | tuple[Bound, ...]
 
 
-def _listed(bounds: Bounds) -> tuple[Bound, ...]:
+def listed(bounds: Bounds) -> tuple[Bound, ...]:
+    """Return the ends of a box as a tuple, if there is one for each component or one for all."""
     return bounds if isinstance(bounds, tuple) else (bounds,)
 
 
@@ -150,7 +151,7 @@ def _evaluate(bound: Bounds, shape: tuple[int, ...], values: Values) -> Floats:
     """Return a corner of shape ``(..., *shape)``."""
     parts = [
         part.evaluate(values) if isinstance(part, Affine | Switch) else np.float64(part)
-        for part in _listed(bound)
+        for part in listed(bound)
     ]
     if isinstance(bound, tuple):
         stacked: Floats = np.stack(np.broadcast_arrays(*parts), axis=-1)
@@ -238,7 +239,7 @@ class Box(Set):
 
     def model_post_init(self, context: Any) -> None:
         """Refuse an empty box; a validator would do so again in every declaration that has it."""
-        low, high = _listed(self.low), _listed(self.high)
+        low, high = listed(self.low), listed(self.high)
         if any(isinstance(part, float) and isnan(part) for part in (*low, *high)):
             raise ValueError(f"an end of a box is not a number: {self.low} and {self.high}")
         if len(low) != len(high) and min(len(low), len(high)) != 1:
@@ -251,7 +252,7 @@ class Box(Set):
 
     @cached_property
     def _followed(self) -> frozenset[str]:
-        ends = (*_listed(self.low), *_listed(self.high))
+        ends = (*listed(self.low), *listed(self.high))
         return frozenset(end.parent for end in ends if isinstance(end, Affine | Switch))
 
     def parents(self) -> frozenset[str]:
@@ -312,7 +313,7 @@ class Box(Set):
 def refuse_infinite(option: str, region: Any) -> None:
     """Refuse a box that cannot be drawn from: with an end that is not finite."""
     if isinstance(region, Box):
-        ends = (*_listed(region.low), *_listed(region.high))
+        ends = (*listed(region.low), *listed(region.high))
         if any(isinstance(end, float | int) and not np.isfinite(end) for end in ends):
             raise UnknownOption(option, region, ("a box with finite ends",))
 
