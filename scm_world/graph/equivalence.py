@@ -64,7 +64,7 @@ def meets(left: Bools, right: Bools) -> Bools:
 
 
 def cpdag(dag: Bools) -> Bools:
-    """Return the essential graph: edges keep the directions on which all equivalent graphs agree."""
+    """Return the essential graph: edges keep a direction on which all equivalent graphs agree."""
     return essential_graph(dag, ())
 
 
