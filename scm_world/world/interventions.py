@@ -665,7 +665,7 @@ class Candidates:
             self._numbers[:, where] = drawn.reshape(len(drawn), -1)
             return
         parents = compiled.set_parents.get(name, ()) if is_state else ()
-        for parent in parents if is_state else checked.model.structure.parents(name):
+        for parent in parents if is_state else checked.model.parents(name):
             self._compute(parent)
         for attempt, numbers in zip(self.attempts, self._numbers, strict=True):
             one = Solution(checked, replace(self._key, attempt=attempt), numbers)
