@@ -117,18 +117,16 @@ class Delta:
         if self.reads is not None:
             measured: Floats = world.evaluate((self.reads,))[self.reads]
             return measured
-        now, state = world.current()
         if world.action_mode == JOINTS and self.is_set():
-            found: Floats = world.compiled.view("joint_positions", state)
-            return found
-        return np.concatenate([np.ravel(now[name]) for name in world.compiled.actions])
+            return world.row[JOINTS]
+        return world.row.actions
 
     def is_set(self) -> bool:
         """Tell whether nothing was commanded since the joints were put where they are."""
         world = self._world
         if world.version != self._version:
             self._version = world.version
-            base = world.snapshot().base
+            base = world.base
             joints = world.model.targets("joint_positions")
             set_now = base and (base.at_start or any(j in base.pending for j in joints))
             self._fresh = world.index if set_now else -1

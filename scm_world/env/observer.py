@@ -68,7 +68,7 @@ class Goals:
 
     def read(self, world: Simulation) -> tuple[Floats, Floats]:
         """Give what is achieved and what is desired."""
-        row, (achieved, desired) = world.numbers[0], self._sides
+        row, (achieved, desired) = world.row.numbers, self._sides
         return row.take(achieved), row.take(desired)
 
     def observe(self, world: Simulation) -> dict[str, Floats]:

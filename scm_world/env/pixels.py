@@ -135,7 +135,7 @@ class Pixels:
 
     def observe(self, now: Values) -> NDArray[np.uint8]:
         """Draw; pictures of the goals are kept until someone intervenes."""
-        scene = self._world.describe(*self._world.current())  # drawn immediately: no copies
+        scene = self._world.describe(self._world.row, self._world.state)  # drawn immediately
         published, n = self._published, len(self._cameras)
         pictures: NDArray[np.uint8] = np.empty(self._shape, dtype=np.uint8)
         if not self._shows_goals:

@@ -278,13 +278,13 @@ class Vector:
         if self._version != self._world.version:
             self._version = self._world.version
             self._noise = float(now[SENSOR_NOISE]) if self._senses else 0.0
-        numbers = self._world.numbers
+        numbers = self._world.row.numbers
         found: NDArray[np.float32] = np.empty((1, self._size), dtype=np.float32)
         shown: NDArray[np.float32] = found[0]
         if self._keypoints is None and not self._noise:
-            self.write(numbers, FIRST, found)
+            self.write(numbers[None], FIRST, found)
             return shown
-        raw = numbers[0].take(self._read)
+        raw = numbers.take(self._read)
         raw[self._shifts != 0.0] += self._shift
         if self._keypoints is not None:
             raw = np.insert(raw, self._slices[KEYPOINTS].start, self._keypoints[2](now))

@@ -14,7 +14,7 @@ from scm_world.models import Difference, Parameters
 from scm_world.variables import Hard
 from scm_world.world.compiled_task import StepBase
 from scm_world.world.interventions import Solution, same
-from scm_world.world.mechanisms import Row
+from scm_world.world.mechanisms import Rows
 
 
 @final
@@ -86,7 +86,7 @@ def report(
     solution: Solution,
     change: Difference | None,
     before: StepBase,
-    now: Row,
+    now: Rows,
     inertia: Parameters,
     reported: Parameters,
     backend: Backend,
@@ -137,7 +137,7 @@ def report(
 
 
 def _asked(
-    solution: Solution, now: Row, reported: Parameters, name: str
+    solution: Solution, now: Rows, reported: Parameters, name: str
 ) -> tuple[Value | None, Value | None]:
     """Return the value that something asked for has now, and what the backend reports of it.
 

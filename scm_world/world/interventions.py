@@ -44,7 +44,7 @@ from scm_world.variables import (
 from scm_world.variables.checks import check_bounds, check_space, coerce
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import CompiledTask, PendingInterventions, StepBase
-from scm_world.world.mechanisms import Row
+from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import uniforms
 from scm_world.world.structures import StructureCache, restructured, wrong_structure
 
@@ -94,7 +94,7 @@ class Present:
 
     structures: StructureCache
     base: StepBase
-    now: Row
+    now: Rows
     structure: Structure
 
 
@@ -330,7 +330,7 @@ class Solution:
         self.asked = checked.asked
         self._base = checked.base.row
         numbers = self._base.numbers.copy() if numbers is None else numbers
-        self.row = Row(self.compiled.mechanisms, numbers, {*checked.targets})
+        self.row = Rows(self.compiled.mechanisms, numbers, {*checked.targets})
         self.problems = [*checked.problems]
         self._impossible = {*checked.impossible}
         self.changed: list[str] = []
@@ -405,7 +405,7 @@ class Solution:
         """
         acts, followed = self.checked.acts, self.compiled.set_parents
         if any(isinstance(acts[target][1], Mechanism) for target in self.checked.states):
-            self._earlier = Row(self.row.mechanisms, self.row.numbers.copy())
+            self._earlier = Rows(self.row.mechanisms, self.row.numbers.copy())
         for target in self.checked.states:
             if target not in followed:
                 self.set_state(target)
@@ -683,7 +683,7 @@ def _shapes(key: ParameterKey | None) -> bool:
 
 
 def difference(
-    compiled: CompiledTask, now: Row, structure: Structure, then: Row, changed: Iterable[str]
+    compiled: CompiledTask, now: Rows, structure: Structure, then: Rows, changed: Iterable[str]
 ) -> Difference | None:
     """Return what a backend has to change; None if nothing.
 
@@ -694,7 +694,7 @@ def difference(
         now: The present values.
         structure: What the backend has compiled.
         then: The values that are wanted.
-        changed: What ``Row.differing`` lists.
+        changed: What ``Rows.differing`` lists.
     """
     same_columns = then.mechanisms is now.mechanisms
     wanted = compiled.structure(then) if changed or not same_columns else structure
@@ -711,8 +711,8 @@ def difference(
 def overlaps(
     compiled: CompiledTask,
     base: StepBase,
-    now: Row,
-    then: Row,
+    now: Rows,
+    then: Rows,
     change: Difference,
     asked: Iterable[str] = (),
 ) -> list[Overlap]:

@@ -180,7 +180,7 @@ def _made(world: Simulation, scenario: Scenario, rng: ProbeGenerator) -> Probe:
     if scenario.fresh:
         snapshot = replace(snapshot, base=None)
     world.step(action)
-    if not np.isfinite(world.current()[1].vector).all():
+    if not np.isfinite(world.vector).all():
         raise EngineFailure("the state is lost", world.backend.name)
     return Probe(scenario.name, snapshot, action)
 
@@ -316,7 +316,7 @@ def _jittered(variable: Exogenous, world: Simulation, rng: ProbeGenerator) -> Va
     """Give another value of a parameter, or None where it keeps the one that it has."""
     if rng.random(f"{variable.name}|other or not", 1)[0] >= SHARE:
         return None
-    now = world.current()[0]
+    now = world.row
     return drawn(variable, world[variable.name], now, rng, "other", JITTER)
 
 
