@@ -76,7 +76,7 @@ class Delta:
         normalized = bool(np.any(half != 1.0) or np.any(middle != 0.0))
         reach = (self._high - self._low) / 2.0
         self._gain, self._reach = (share, reach) if normalized else (1.0, share * reach)
-        mode = world.action_mode
+        mode = world.options.action_mode
         self.reads = TIPS if mode == TIPS else None if origin == COMMAND else mode
         if self.reads not in (None, TIPS, JOINTS):
             allowed = f"{COMMAND!r}, or action_mode={PREFIX + JOINTS!r}"
@@ -117,7 +117,7 @@ class Delta:
         if self.reads is not None:
             measured: Floats = world.evaluate((self.reads,))[self.reads]
             return measured
-        if world.action_mode == JOINTS and self.is_set():
+        if world.options.action_mode == JOINTS and self.is_set():
             return world.row[JOINTS]
         return world.row.actions
 

@@ -207,7 +207,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             conventions=conventions,
             variables_space=as_region("variables_space", variables_space),
         )
-        used = {"preset": self.world.options.preset, "frame_skip": self.world.frame_skip}
+        used = {"preset": self.world.options.preset, "frame_skip": self.world.options.frame_skip}
         used["backend"] = self.world.backend.name
         Copied.__init__(self, **made_with | used | {"action_mode": mode})
         if REWARD not in self.world.model:
@@ -222,7 +222,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._choose_view(render_camera, render_size)
         self._window = Window() if render_mode == "human" else None
         modes = [one for one in RENDER_MODES if one != "human" or Window.is_possible()]
-        fps = round(1 / self.world.control_period)
+        fps = round(1 / self.world.options.control_period)
         self.metadata = {**type(self).metadata, "render_modes": modes, "render_fps": fps}
 
         # What an action means; what has no two bounds keeps its unit.
@@ -250,7 +250,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._range = (self._middle, self._half, low, high)
         self.action_space = self._delta.space() if self._delta else box(*bounds)
 
-        self.limit = self.world.max_episode_length + int(self.world.conventions.published)
+        self.limit = self.world.max_episode_length + int(self.world.options.conventions.published)
         if max_episode_steps not in (None, -1):
             self.limit = min(
                 self.limit, whole_number("max_episode_steps", max_episode_steps, least=1)

@@ -189,7 +189,7 @@ class NativeVectorEnv(ScmWorldVectorEnv):
             env = self._inner[index]
             if not env.world.has_begun:
                 continue
-            if env._delta is not None and env.world.action_mode == JOINTS:
+            if env._delta is not None and env.world.options.action_mode == JOINTS:
                 self._are_set[index] = env._delta.is_set()
             if env.world.row.get(SENSOR_NOISE):
                 self._sensed.add(index)
@@ -211,7 +211,7 @@ class NativeVectorEnv(ScmWorldVectorEnv):
                     offset = table[self._reads][members]
                 else:
                     offset = table.actions[members]
-                    if lead.world.action_mode == JOINTS:
+                    if lead.world.options.action_mode == JOINTS:
                         put = self._are_set[members, None]
                         offset = np.where(put, table[JOINTS][members], offset)
                 actions[members] = self._delta.moved(actions[members], offset)

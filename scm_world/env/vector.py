@@ -219,7 +219,7 @@ class Vector:
                 if part.name != KEYPOINTS
             ]
         )
-        self._published = world.conventions.published
+        self._published = world.options.conventions.published
         self._turns = [
             place
             for name, place in self._slices.items()
@@ -256,9 +256,9 @@ class Vector:
         self.space = box(*ends)
         world = self._world
         self._shift, self._shifts = 0.0, np.zeros(self._read.size)
-        if self._published and TIME in self._slices and world.given_length is not None:
+        if self._published and TIME in self._slices and world.options.given_length is not None:
             # The predecessor subtracts seconds from a number of steps.
-            self._shift = world.given_length * (1.0 - world.control_period)
+            self._shift = world.options.given_length * (1.0 - world.options.control_period)
             self._shifts[self._slices[TIME]] = self._shift
 
     def write(self, numbers: Floats, rows: Integers, out: NDArray[np.float32]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world._types import ArrayLike, Floats, Value, Values
+from scm_world._types import ArrayLike, Floats, Value
 from scm_world.backends import Backend, backends, make_backend
 from scm_world.backends.base import EngineSnapshot
 from scm_world.errors import (
@@ -26,10 +26,10 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.models import Difference, ParameterKey, Parameters, Scene, State, Structure
+from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Overlap
-from scm_world.tasks import Conventions, Task
+from scm_world.tasks import Task
 from scm_world.tasks.composition import Composition
 from scm_world.variables import Draw, Mechanism, Subset
 from scm_world.variables.checks import check_subset
@@ -216,7 +216,7 @@ class Simulation:
     def cameras(self) -> tuple[Camera, ...]:
         """Describe the cameras whose places are variables: the three of the robot."""
         self._require_episode()
-        return self.compiled.composition.cameras(self.row.copy())
+        return self.composition.cameras(self.row.copy())
 
     def reset(
         self,
@@ -307,18 +307,18 @@ class Simulation:
             snapshot = self.snapshot()
         except NotReset:
             snapshot = None
+        how = self.options
         options = {
             "backend": self.backend.name,
-            "preset": self.options.preset,
-            "action_mode": self.action_mode,
-            "frame_skip": self.frame_skip,
-            "max_episode_length": self.given_length,
-            "conventions": self.conventions.name,
+            "preset": how.preset,
+            "action_mode": how.action_mode,
+            "frame_skip": how.frame_skip,
+            "max_episode_length": how.given_length,
+            "conventions": how.conventions.name,
             "variables_space": self.variables_space,
         }
-        usual = self.task.choices["resolution"][0]
-        if self.resolution != usual:  # logs and files of before have none
-            options["resolution"] = self.resolution
+        if how.resolution != self.task.choices["resolution"][0]:
+            options["resolution"] = how.resolution  # logs and files of before have none
         return _copied, (type(self), self.structures.task, options, snapshot)
 
     @property
@@ -342,54 +342,9 @@ class Simulation:
         return self.compiled.composition
 
     @property
-    def slices(self) -> Mapping[str, slice]:
-        """Where each state stands in the state vector."""
-        return self.compiled.slices
-
-    @property
-    def parameter_keys(self) -> Mapping[str, ParameterKey]:
-        """Which physical parameter each variable sets."""
-        return self.compiled.parameter_keys
-
-    @property
     def static_names(self) -> tuple[str, ...]:
         """Everything that interventions alone decide, causes before effects."""
         return self.compiled.static_names
-
-    @property
-    def computed(self) -> tuple[str, ...]:
-        """Variables that are computed from what moves, causes before effects."""
-        return self.compiled.computed
-
-    @property
-    def conventions(self) -> Conventions:
-        """Ours or the predecessor's."""
-        return self.options.conventions
-
-    @property
-    def action_mode(self) -> str:
-        """How the system is commanded."""
-        return self.options.action_mode
-
-    @property
-    def resolution(self) -> str:
-        """How finely the variables are cut."""
-        return self.options.resolution
-
-    @property
-    def frame_skip(self) -> int:
-        """Length of a control step in units of the task; 4 ms for the robot."""
-        return self.options.frame_skip
-
-    @property
-    def control_period(self) -> float:
-        """Length of a control step [s]."""
-        return self.options.control_period
-
-    @property
-    def given_length(self) -> int | None:
-        """Length of an episode in control steps, if one was given."""
-        return self.options.given_length
 
     @property
     def max_episode_length(self) -> int:
@@ -431,24 +386,22 @@ class Simulation:
 
     @property
     def _settings(self) -> tuple[Any, ...]:
-        numbers = (self.frame_skip, self.max_episode_length)
-        options = (self.options.preset, self.action_mode, self.conventions.name)
-        usual = self.task.choices["resolution"][0]
-        finer = () if self.resolution == usual else (self.resolution,)
-        return (self.task.name, *options, *numbers, *finer)
+        how, usual = self.options, self.task.choices["resolution"][0]
+        numbers = (how.frame_skip, self.max_episode_length)
+        finer = () if how.resolution == usual else (how.resolution,)
+        return (
+            self.task.name,
+            how.preset,
+            how.action_mode,
+            how.conventions.name,
+            *numbers,
+            *finer,
+        )
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return what decides what happens here, except versions: the task, and the options."""
         options = (self.backend.name, self.variables_space, self._settings)
         return {**self.structures.__fingerprint__(), "options": options}
-
-    def describe(self, values: Values, state: State) -> Scene:
-        """Describe the scene that some values stand for."""
-        return self.compiled.describe(values, state)
-
-    def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
-        """Name some variables and what follows them at lag 0, without physics, causes first."""
-        return self.compiled.static_order(targets)
 
     # --- a control step -----------------------------------------------------------------------
 
@@ -492,7 +445,7 @@ class Simulation:
         """Name the state with the largest number, as it was before a step."""
         vector = self.state.vector
         worst = int(np.abs(vector).argmax())
-        places = self.compiled.composition.system.layout.slices.items()
+        places = self.composition.system.layout.slices.items()
         name = next((name for name, where in places if where.start <= worst < where.stop), "")
         return f"before that step, the largest number was {vector[worst]:.3g}, of {name}"
 
@@ -512,7 +465,7 @@ class Simulation:
         """Compute the command of an action; it is valid until the next call."""
         if not self._translates:
             return action
-        commands: Any = self.compiled.composition.commands
+        commands: Any = self.composition.commands
         key = self.noise_key(self.index)
         found: Floats = commands.command(action, self.row, self.state.vector, key)
         return found
@@ -687,7 +640,7 @@ class Simulation:
             return {}
         if not self.compiled.movers:
             return {}
-        bodies -= {*self.compiled.composition.bodies} - self.compiled.movers
+        bodies -= {*self.composition.bodies} - self.compiled.movers
         return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
     def _applied(self, change: Difference) -> Parameters:
@@ -746,7 +699,7 @@ class Simulation:
                 kept[name][...] = before[name]
 
     def _adopt_structure(self, structure: Structure) -> None:
-        commands = self.compiled.composition.commands
+        commands = self.composition.commands
         self._translates = commands is not None and commands.applies(self.row)
         self.structure = structure
         self.substeps = max(1, round(self.options.control_period / float(structure.timestep)))

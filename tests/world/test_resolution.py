@@ -127,13 +127,13 @@ def test_the_parts_are_those_of_the_whole() -> None:
 def test_the_default_has_the_variables_that_it_always_had() -> None:
     """Worlds, snapshots and copies are those of before where no resolution is asked for."""
     world = World("pushing", backend="fake")
-    assert world.resolution == "vector"
+    assert world.options.resolution == "vector"
     assert not world.compiled.bundles
     for resolution in FINER:
         finer = World("pushing", backend="fake", resolution=resolution)
         assert [n for n in finer.model if n not in finer.compiled.parts] == list(world.model)
     assert len(world.identity) == 7
-    assert copy.copy(world).resolution == "vector"
+    assert copy.copy(world).options.resolution == "vector"
     with pytest.raises(UnknownOption, match="finger"):
         World("pushing", backend="fake", resolution="arm")
 

@@ -69,7 +69,7 @@ class Markov:
         self._targets = tuple(
             name
             for name in settable(model)
-            if not deciding or deciding.isdisjoint({name, *world.static_order((name,))})
+            if not deciding or deciding.isdisjoint({name, *world.compiled.static_order((name,))})
         )
         self._geometry = {
             v.name for v in model.variables if v.unit in GEOMETRY or isinstance(v.bounds, Rotations)

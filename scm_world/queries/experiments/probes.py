@@ -295,7 +295,7 @@ def set_others(world: Simulation, rng: ProbeGenerator) -> None:
         (v.name, _jittered(v, world, rng))
         for v in world.model.variables
         if isinstance(v, Exogenous) and v.settable and v.dtype == "real"
-        if not deciding or deciding.isdisjoint(world.static_order((v.name,)))
+        if not deciding or deciding.isdisjoint(world.compiled.static_order((v.name,)))
     )
     request = {name: value for name, value in drawn if value is not None}
     while request:
