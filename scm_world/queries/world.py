@@ -10,7 +10,7 @@ from typing import Any, Self, final
 
 import networkx as nx
 
-from scm_world._types import ArrayLike, Floats
+from scm_world._types import ArrayLike
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
 from scm_world.queries.comparison import Comparison, compare_backends
@@ -23,7 +23,7 @@ from scm_world.queries.questions import Questions
 from scm_world.queries.twins import AnyTwins, twins_of
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion
-from scm_world.world import Audit, Simulation, WorldSnapshot
+from scm_world.world import Audit, Batch, Simulation, WorldSnapshot
 from scm_world.world.interventions import merged
 
 
@@ -43,7 +43,26 @@ class World(Simulation, Questions):
         0.05
         >>> episode.counterfactual({}) == episode
         True
+
+    With ``num_worlds=n`` it makes n worlds in one ``scm_world.world.Batch``, which are stepped
+    together, and read as arrays with a leading axis:
+
+        >>> worlds = World("pushing", backend="fake", num_worlds=3)
+        >>> _ = worlds.reset(seed=0, do={"tool_block.mass": [0.02, 0.05, 0.08]})
+        >>> worlds.step(np.zeros((3, 9)))
+        >>> worlds["tool_block.mass"], worlds["tool_block.cartesian_position"].shape
+        (array([0.02, 0.05, 0.08]), (3, 3))
+        >>> worlds.world(1).effect("reward", do={"floor_friction": 0.9}, n=2, steps=3).n
+        2
+        >>> worlds.close()
     """
+
+    def __new__(cls, *args: Any, num_worlds: int | None = None, **options: Any) -> Self:
+        """Make one world, or several."""
+        if num_worlds is None:
+            return super().__new__(cls)
+        batch: Any = Batch.of(cls, num_worlds, *args, **options)
+        return batch  # type: ignore[no-any-return] # types of Python know no such case
 
     @classmethod
     def of(cls, world: Simulation) -> Self:
@@ -331,15 +350,19 @@ class World(Simulation, Questions):
         due = self._schedule.due(self, 0, fired)
         return self.do(due, space=space) if due else None
 
-    def advance(self, command: Floats) -> None:
-        """Advance one control step, with what is due at its beginning."""
+    def do_due(self) -> None:
+        """Do what is due at the beginning of a control step."""
         if self._schedule.layers and self.index:
             fired = dict(self._fired)
             due = self._schedule.due(self, self.index, fired)
             self._fired = fired
             if due:
                 self.do(due)
-        super().advance(command)
+
+    @property
+    def acts_alone(self) -> bool:
+        """Whether a plan acts, or what the backend is told is computed from the present."""
+        return bool(self._schedule.layers) or super().acts_alone
 
     def snapshot(self) -> WorldSnapshot:
         """Save everything, with the events that have happened."""

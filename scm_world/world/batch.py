@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from inspect import signature
 from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import whole_number
-from scm_world._types import Floats, Integers
-from scm_world.errors import EngineFailure, UnknownOption
+from scm_world._arguments import real_numbers, whole_number
+from scm_world._types import ArrayLike, Floats, Integers, Value
+from scm_world.backends import Backend
+from scm_world.errors import ActionError, EngineFailure, ScmWorldError, UnknownOption
+from scm_world.graph import flatten
+from scm_world.variables.subsets import AnyRegion
 from scm_world.work.processes import cores
+from scm_world.world.audit import Audit
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.mechanisms import Rows
 from scm_world.world.simulation import Simulation
+
+OF_WORLD = frozenset(signature(Simulation).parameters)
+"""Options of a world; others are those of its task."""
+
+Mask = NDArray[np.bool_]
 
 
 @final
@@ -23,6 +33,7 @@ class Batch:
 
     The present of each world is a row of the values of all worlds of its structure. A world in a
     batch is bit-identical to one that is stepped alone, and can be used alone at any time.
+    ``World(task, num_worlds=n)`` makes one.
 
     Args:
         worlds: They belong to the batch from now on.
@@ -38,7 +49,7 @@ class Batch:
         ...     world.reset(seed=seed)
         >>> batch = Batch(worlds, names=["reward"])
         >>> batch.advance(np.zeros((3, 9)))
-        >>> batch.table(0)["reward"].shape, batch.world(2).index
+        >>> batch["reward"].shape, batch.world(2).index
         ((3,), 1)
     """
 
@@ -61,9 +72,163 @@ class Batch:
         self._acts_alone: set[int] = set()
         self._all = np.arange(n)
 
+    @classmethod
+    def of(
+        cls,
+        kind: type[Simulation],
+        num_worlds: int,
+        task: Any = "pushing",
+        *,
+        threads: int | None = None,
+        **options: Any,
+    ) -> Batch:
+        """Make worlds that share what is declared.
+
+        Args:
+            kind: ``Simulation`` or ``World``.
+            num_worlds: How many.
+            task: As in ``Simulation``.
+            threads: Of the backend; as many as there are cores if None.
+            options: Of ``Simulation``; a backend is given by its name.
+
+        Raises:
+            UnknownOption: An option does not exist, or the number is none.
+        """
+        n = whole_number("num_worlds", num_worlds, least=1)
+        backend = options.get("backend")
+        if isinstance(backend, Backend) and n > 1:
+            raise UnknownOption("backend of many worlds", backend, ("the name of one",))
+        first = kind(task, **options)
+        of_world = {name: value for name, value in options.items() if name in OF_WORLD}
+        return cls(
+            [first, *(kind(first.structures, **of_world) for _ in range(n - 1))], threads=threads
+        )
+
     def __len__(self) -> int:
         """Count the worlds."""
         return len(self._worlds)
+
+    def __getitem__(self, name: str) -> Value:
+        """Return the present values of a variable, shape (n, *shape), as a copy.
+
+        Raises:
+            UnknownVariable: No variable has this name in one of the worlds.
+            NotReset: One of the worlds has no episode yet.
+        """
+        parts = []
+        for table, rows in self.tables(self._all):
+            self._worlds[rows[0]].model.declared(name)
+            table.evaluate((name,), rows)
+            parts.append((table[name][rows], rows))
+        if len(parts) == 1:
+            return parts[0][0]
+        found = np.empty((len(self), *parts[0][0].shape[1:]), parts[0][0].dtype)
+        for values, rows in parts:
+            found[rows] = values
+        return found
+
+    @property
+    def index(self) -> Integers:
+        """How many control steps of each episode are over, shape (n,)."""
+        return np.array([world.index for world in self._worlds])
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        which: Any = None,
+        do: Mapping[str, Any] | None = None,
+        space: AnyRegion | None = None,
+    ) -> dict[int, Audit | None]:
+        """Begin an episode in some worlds; in all of them, or in none; see ``Simulation.reset``.
+
+        Args:
+            seed: Of the first world, the next one gets the next number; or one for each.
+            which: Truth values, shape (n,): who is reset; all if None.
+            do: As in ``do``.
+            space: As in ``do``.
+
+        Raises:
+            InterventionError: The intervention was refused; the message says by which world.
+        """
+        seeds, asked = read_seeds(seed, len(self)), self._each(do or {})
+
+        def begin(row: int) -> Audit | None:
+            return self._worlds[row].reset(seed=seeds[row], do=asked(row), space=space)
+
+        return self._everywhere(which, begin)
+
+    def do(
+        self, request: Mapping[str, Any], *, which: Any = None, space: AnyRegion | None = None
+    ) -> dict[int, Audit]:
+        """Intervene now in some worlds; in all of them, or in none; see ``Simulation.do``.
+
+        Args:
+            request: Values, or interventions, by name. A value with a leading axis of n worlds has
+                one for each of them; else it holds in all.
+            which: Truth values, shape (n,): where; everywhere if None.
+            space: In which every target must lie.
+
+        Returns:
+            What it did, by the number of the world.
+
+        Raises:
+            InterventionError: It was refused; the message says by which world. Nothing has changed.
+            NotReset: One of the worlds has no episode yet.
+        """
+        asked = self._each(request)
+        return self._everywhere(which, lambda row: self._worlds[row].do(asked(row), space=space))
+
+    def _each(self, request: Mapping[str, Any]) -> Callable[[int], dict[str, Any]]:
+        """Return what gives the request of one world."""
+        flat = flatten(request)
+
+        def asked(row: int) -> dict[str, Any]:
+            model = self._worlds[row].model
+            return {
+                name: value[row]
+                if isinstance(value, list | np.ndarray)
+                and name in model
+                and np.shape(value) == (len(self), *model.declared(name).shape)
+                else value
+                for name, value in flat.items()
+            }
+
+        return asked
+
+    def _everywhere(self, which: Any, act: Callable[[int], Any]) -> dict[int, Any]:
+        """Change some worlds, all of them or none."""
+        found: dict[int, Any] = {}
+        back: list[Callable[[], None]] = []
+        row = 0
+        try:
+            for row in np.flatnonzero(read_mask("which", which, len(self))).tolist():
+                back.append(self._worlds[row].way_back())
+                found[row] = act(row)
+        except BaseException as error:
+            for undo in back:
+                undo()
+            if isinstance(error, ScmWorldError):
+                located(error, row, "world")
+            raise
+        return found
+
+    def step(self, actions: ArrayLike, *, which: Any = None) -> None:
+        """Advance some worlds one control step.
+
+        Args:
+            actions: Shape (n, n_actions) in SI units; clipped to their range.
+            which: Truth values, shape (n,): who is stepped; all if None.
+
+        Raises:
+            ActionError: Wrong shape, or a number that is not finite. No world was stepped.
+            NotReset: One of them has no episode yet.
+            EngineFailure: The backend lost a state; all other worlds are one step further.
+        """
+        mask = read_mask("which", which, len(self))
+        given = read_actions(actions, mask, self._worlds[0].compiled.n_actions, "world")
+        low, high = self._worlds[0].compiled.action_bounds
+        self.advance(np.clip(given, low, high), None if which is None else mask)
 
     def world(self, index: int) -> Simulation:
         """Give a world."""
@@ -84,7 +249,7 @@ class Batch:
         return [(self._tables[one], np.sort(np.concatenate(members))) for one, members in parts]
 
     def advance(
-        self, commands: Floats, which: NDArray[np.bool_] | None = None, *, evaluate: bool = True
+        self, commands: Floats, which: Mask | None = None, *, evaluate: bool = True
     ) -> None:
         """Advance worlds one control step; see ``Simulation.advance``.
 
@@ -102,6 +267,9 @@ class Batch:
         self.fill(rows)
         sent = commands
         if self._acts_alone:
+            for row in rows.tolist():
+                self._worlds[row].do_due()
+            self.fill(rows)
             commands = commands.copy()
             sent = np.zeros((len(self), self._worlds[0].structure.n_commands))
             for row in rows.tolist():
@@ -178,3 +346,68 @@ class Batch:
         """Free the backends of all worlds."""
         for world in self._worlds:
             world.close()
+
+
+# --- arguments of many worlds ---------------------------------------------------------------------
+
+
+def located(error: ScmWorldError, index: int, what: str) -> ScmWorldError:
+    """Say in an error in which world it happened.
+
+    Example:
+        >>> print(located(ScmWorldError("the block is in the table"), 3, "world"))
+        world 3: the block is in the table
+    """
+    error.args = (f"{what} {index}: {error}",)
+    return error
+
+
+def read_seeds(seed: Any, size: int) -> list[Any]:
+    """Return the seed of each world.
+
+    Example:
+        >>> read_seeds(7, 3)
+        [7, 8, 9]
+    """
+    if seed is None:
+        return [None] * size
+    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
+        return [whole_number("seed", seed, least=0) + index for index in range(size)]
+    if len(seed) != size:
+        raise UnknownOption("seed", seed, ("a whole number", f"a list of {size} of them or None"))
+    return [*seed]
+
+
+def read_mask(name: str, mask: Any, size: int) -> Mask:
+    """Read which worlds are meant; all if None."""
+    if mask is None:
+        return np.ones(size, bool)
+    read = isinstance(mask, np.ndarray) and mask.shape == (size,) and mask.dtype == np.bool_
+    if not (read and mask.any()):
+        allowed = (f"an array of {size} truth values, at least one of them true",)
+        raise UnknownOption(name, mask, allowed)
+    return np.array(mask)
+
+
+def read_actions(actions: Any, which: Mask, size: int, what: str) -> Floats:
+    """Read the actions of all worlds, shape (n, size).
+
+    Args:
+        actions: One for each.
+        which: The worlds that are stepped, shape (n,).
+        size: How many numbers an action has.
+        what: The name of a world in errors.
+    """
+    try:
+        given = real_numbers(actions)
+    except (TypeError, ValueError):  # text, or a ragged list
+        given = np.empty(0)
+    if given.shape != (which.size, size):
+        shape = f"actions of {which.size} {what}s have shape ({which.size}, {size})"
+        raise ActionError(f"{shape}, got {given.shape}", actions)
+    wrong = np.flatnonzero(which & ~np.isfinite(given).all(axis=1))
+    if wrong.size:
+        numbers = "a finite number" if size == 1 else f"{size} finite numbers"
+        text = f"{what} {wrong[0]}: an action is {numbers}, got {given[wrong[0]]!r}"
+        raise ActionError(text, actions)
+    return given

@@ -422,6 +422,7 @@ class Simulation:
     def advance(self, command: Floats) -> None:
         """Advance one control step with finite numbers in their range; see ``step``."""
         self._require_state()
+        self.do_due()
         command = self.decided(command)
         row = self.row
         kept = row.numbers.copy()
@@ -448,6 +449,9 @@ class Simulation:
         places = self.composition.system.layout.slices.items()
         name = next((name for name, where in places if where.start <= worst < where.stop), "")
         return f"before that step, the largest number was {vector[worst]:.3g}, of {name}"
+
+    def do_due(self) -> None:
+        """Do what is due at the beginning of a control step: nothing here."""
 
     def decided(self, command: Floats) -> Floats:
         """Return the action that is taken: the command, where no action has a mechanism."""
@@ -796,12 +800,19 @@ class Simulation:
             >>> world.noise.seed, world.index
             (5, 0)
         """
-        started, lost = self._started, self._lost
-        noise = self.noise, self.episode, self._offset
-        before = self.snapshot() if started and not lost else None
+        back = self.way_back()
         try:
             yield
         finally:
+            back()
+
+    def way_back(self) -> Callable[[], None]:
+        """Return what goes back to the present, bit for bit; see ``unchanged``."""
+        started, lost = self._started, self._lost
+        noise = self.noise, self.episode, self._offset
+        before = self.snapshot() if started and not lost else None
+
+        def back() -> None:
             if before is not None:
                 self.restore(before)
             elif not started:
@@ -809,6 +820,8 @@ class Simulation:
             else:
                 self._lost, self._base = lost, None
                 self.noise, self.episode, self._offset = noise
+
+        return back
 
     def close(self) -> None:
         """Free the engine. There is no episode any more."""
