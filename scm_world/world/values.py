@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import final
 
 import numpy as np
@@ -61,13 +62,13 @@ class PresentValues:
         self.now |= {name: whole for name, (whole, _) in counted.items()}
         self.before = {n: mechanisms.view(row, n, earlier=True) for n in mechanisms.earlier}
 
-    def put(self, row: Row, changed: list[str]) -> None:
+    def put(self, row: Row, changed: Iterable[str]) -> None:
         """Take over a row; ``changed``: what ``Row.differing`` lists."""
         self.matrix[0] = row.numbers
         self._decide(changed)
         self.be_at(int(self._clock[0]))
 
-    def _decide(self, names: tuple[str, ...] | list[str]) -> None:
+    def _decide(self, names: Iterable[str]) -> None:
         for name in names:
             self.now[name] = value = np.array(self.row[name])
             value.flags.writeable = False
