@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -18,6 +19,7 @@ from scm_world.backends.base import EngineSnapshot
 from scm_world.errors import (
     CyclicModel,
     EngineFailure,
+    Infeasible,
     InterventionError,
     NotReset,
     SnapshotMismatch,
@@ -28,12 +30,10 @@ from scm_world.errors import (
 from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
-from scm_world.models.scene import Overlap
 from scm_world.tasks import Task
 from scm_world.tasks.composition import Composition
 from scm_world.variables import Draw, Mechanism, Subset
 from scm_world.variables.checks import check_subset
-from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Audit, report
 from scm_world.world.compiled_task import (
@@ -43,16 +43,7 @@ from scm_world.world.compiled_task import (
     beginning,
     check_functions,
 )
-from scm_world.world.interventions import (
-    CheckedRequest,
-    Present,
-    Solution,
-    difference,
-    feasible,
-    overlaps,
-    refusal,
-    same,
-)
+from scm_world.world.interventions import Transaction, difference, feasible, overlaps, same
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.snapshot import WorldSnapshot
@@ -260,7 +251,7 @@ class Simulation:
             self.backend.restore(self._origin)
         else:
             row = beginning(origin, None)
-            self.backend.build(origin.describe(row, origin.state_of(row)))
+            self.backend.build(origin.scene(row))
             self._origin, self._origin_row = self.backend.snapshot(), row
             self._started = True
         self._adopt(origin, origin.model, row)
@@ -277,20 +268,16 @@ class Simulation:
         compiled = self.structures.natural(key)
         if not compiled.random:
             return
-        row, present, base = beginning(compiled, key), self.row, self._step_base()
-        change = difference(compiled, present, self.structure, row, present.differing(row))
-        problems: list[Overlap] = []
+        row, now = beginning(compiled, key), self._step_base()
+        changed = now.row.differing(row)
+        change = difference(now, compiled, row, changed)
         if change is not None and compiled.composition.solid:
-            problems = overlaps(compiled, base, present, row, change)
-        if problems:
-            checked = CheckedRequest(
-                self.structures, base, {compiled.random[0]: Draw("A")}, None, key
-            )
-            here = Present(self.structures, base, present, self.structure)
-            raise refusal(here, checked, problems, key)
+            reasons = [*map(str, overlaps(now, now, compiled, row, change))]
+            if reasons:
+                raise Infeasible(compiled.random[0], Draw("A"), reasons)
         if change is not None:
             self.backend.apply(change)
-        self._adopt(compiled, compiled.model, row)
+        self._adopt(compiled, compiled.model, row, changed)
 
     def noise_key(self, index: int) -> NoiseKey:
         """Return the noise key of a control step of this episode.
@@ -506,22 +493,19 @@ class Simulation:
             InterventionError: The request was refused; the world is bit-identical to before.
             NotReset: There is no episode yet.
         """
-        if not self._started or self._lost:
-            self._require_state()
-        twice: list[InterventionError] = []
-        flat = flatten(request, twice)
-        base, drawn = self.base or self._step_base(), dict[str, int]()
+        self._require_state()
+        problems: list[InterventionError] = []
+        flat, before = flatten(request, problems), self._step_base()
+        base = self.base or before
+        drawn = base.drawn
         if any(isinstance(act, Draw | Mechanism) for act in flat.values()):
-            twice += self._wrong_actions(flat)
+            problems += self._wrong_actions(flat)
             flat, drawn = self._anew(flat, base)
         region = self.variables_space if space is None else as_region("space", space)
         key = self.noise_key(self.index)
-        here = Present(self.structures, base, self.row, self.structure)
-        solution, change = feasible(here, flat, region, key, twice)
-        audit = self._commit(solution, change, flat, check, at_start=base.at_start)
-        self._keep_base(
-            replace(base, pending=solution.kept(), drawn=drawn or base.drawn, fresh=frozenset())
-        )
+        done = feasible(self.structures, base, before, flat, region, key, problems)
+        audit = self._commit(done, before, flat, check, at_start=base.at_start)
+        self._keep_base(replace(base, pending=done.kept(), drawn=drawn))
         return audit
 
     def _anew(
@@ -586,40 +570,42 @@ class Simulation:
 
     def _commit(
         self,
-        solution: Solution,
-        change: Difference | None,
+        done: Transaction,
+        before: StepBase,
         request: Mapping[str, Any],
         check: Callable[[], object] | None,
         *,
         at_start: bool,
     ) -> Audit:
-        """Apply what was computed, read it back, and report; or put everything back and raise."""
-        before, index = self._step_base(), self.index
+        """Apply what was computed, and read it back; or put everything back and raise."""
+        index, change, backend = self.index, done.change or Difference(), self.backend
+        compiled, keys = done.compiled, done.compiled.parameter_keys
 
         def undo() -> None:
-            there = solution.compiled.structure(solution.row)
-            lost = difference(before.compiled, solution.row, there, before.row, solution.changed)
+            after = StepBase(compiled, self.graph, done.row)
+            lost = difference(after, before.compiled, before.row, done.changed)
             if lost is not None:
-                self.backend.apply(lost)
+                backend.apply(lost)
 
         with self._all_or_nothing(before, undo):
-            inertia: Parameters = {}
-            reported: Parameters = {}
-            if change is not None:
-                inertia = self._inertia(change)
-                self.backend.apply(change)
-                reported = self._applied(change)
-            row, changed = solution.row, solution.changed
-            stays = solution.compiled is self.compiled and row[CONTROL_INDEX] == index
-            if stays and change is None and not changed:
-                self._adopt_model(solution.model)
-                self.version += 1
-            else:
-                self._adopt(solution.compiled, solution.model, row, changed, change)
-            backend, now = self.backend, self.row
-            audit = report(request, solution, change, before, now, inertia, reported, backend)
+            inertia = self._inertia(change)
+            if change:
+                backend.apply(change)
+            targets = (t for name in done.asked for t in compiled.model.targets(name))
+            wanted = {keys[target] for target in targets if target in keys}
+            reported = backend.parameters({*change.parameters, *inertia, *wanted})
+            self._refuse_other(change, reported)
+            self._adopt(compiled, done.held(), done.row, done.changed)
+            remarks: tuple[str, ...] = ()
+            if change.structure is None and any(
+                "friction" in what for _, what in change.parameters
+            ):
+                frictions = {keys[n]: before.row[n] for n in done.changed if n in keys}
+                remarks = backend.capabilities.remarks(backend, frictions)
+            now = self.row.copy()
+            audit = Audit(partial(report, request, done, before, now, inertia, reported, remarks))
             self._offset += self.index - index
-            if at_start and not (stays and change is None and not changed):
+            if at_start:
                 self._forget()
             if check is not None:
                 check()
@@ -640,16 +626,14 @@ class Simulation:
 
     def _inertia(self, change: Difference) -> Parameters:
         bodies = {body for body, what in change.parameters if what in ("mass", "size")}
-        if change.structure is not None or not bodies:
+        movers = self.compiled.movers
+        if change.structure is not None or not bodies or not movers:
             return {}
-        if not self.compiled.movers:
-            return {}
-        bodies -= {*self.composition.bodies} - self.compiled.movers
+        bodies -= {*self.composition.bodies} - movers
         return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
-    def _applied(self, change: Difference) -> Parameters:
-        """Read back what was applied."""
-        reported = self.backend.parameters(change.parameters)
+    def _refuse_other(self, change: Difference, reported: Parameters) -> None:
+        """Refuse what the backend did not take over."""
         values = change.parameters.items()
         wrong = [".".join(key) for key, value in values if not _close(value, reported[key])]
         if change.state is not None:
@@ -660,15 +644,13 @@ class Simulation:
         if wrong:
             problem = f"the engine did not take over {', '.join(wrong)}"
             raise EngineFailure(problem, self.backend.name)
-        return reported
 
     def _adopt(
         self,
         compiled: CompiledTask,
         model: SCM,
         row: Rows,
-        changed: list[str] | None = None,
-        change: Difference | None = None,
+        changed: Iterable[str] | None = None,
         *,
         moved: bool = True,
     ) -> None:
@@ -679,20 +661,16 @@ class Simulation:
             model: With the interventions that hold.
             row: The values.
             changed: What only interventions decide and differs from the present, if known.
-            change: What the backend had to change.
             moved: Whether the backend reports where everything is; else the row does.
         """
         last, anew = self.row, compiled is not self.compiled
-        if changed is None:
-            changed, structure = last.differing(row), compiled.structure(row)
-        else:
-            structure = change.structure if change and change.structure else self.structure
+        changed = last.differing(row) if changed is None else changed
         if anew:
             self._hold(compiled, row.copy())
         self.row.take(row)
         self._adopt_model(model)
         if changed or anew:
-            self._adopt_structure(structure)
+            self._adopt_structure(compiled.structure(row))
         self.version += 1
         if moved:
             self.backend.read(self.state)
