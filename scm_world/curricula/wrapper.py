@@ -299,8 +299,8 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return not over and self._turn.stepped(self._inner, step)
 
     def act(self) -> bool:
-        """Do what is due; tell whether that was anything."""
-        return self._turn.act(self._inner)
+        """Do what is due, after the plan of the reset; return whether that was anything."""
+        return self._inner.act() | self._turn.act(self._inner)
 
 
 def place(given: Any) -> tuple[int, int] | None:

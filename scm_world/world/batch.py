@@ -227,6 +227,8 @@ class Batch:
         """
         mask = read_mask("which", which, len(self))
         given = read_actions(actions, mask, self._worlds[0].compiled.n_actions, "world")
+        for row in np.flatnonzero(mask).tolist():
+            self._worlds[row].act()
         low, high = self._worlds[0].compiled.action_bounds
         self.advance(np.clip(given, low, high), None if which is None else mask)
 
@@ -267,9 +269,6 @@ class Batch:
         self.fill(rows)
         sent = commands
         if self._acts_alone:
-            for row in rows.tolist():
-                self._worlds[row].do_due()
-            self.fill(rows)
             commands = commands.copy()
             sent = np.zeros((len(self), self._worlds[0].structure.n_commands))
             for row in rows.tolist():

@@ -409,7 +409,6 @@ class Simulation:
     def advance(self, command: Floats) -> None:
         """Advance one control step with finite numbers in their range; see ``step``."""
         self._require_state()
-        self.do_due()
         command = self.decided(command)
         row = self.row
         kept = row.numbers.copy()
@@ -437,8 +436,9 @@ class Simulation:
         name = next((name for name, where in places if where.start <= worst < where.stop), "")
         return f"before that step, the largest number was {vector[worst]:.3g}, of {name}"
 
-    def do_due(self) -> None:
-        """Do what is due at the beginning of a control step: nothing here."""
+    def act(self) -> Audit | None:
+        """Do what the plan of the episode contains for this instant: there is none here."""
+        return None
 
     def decided(self, command: Floats) -> Floats:
         """Return the action that is taken: the command, where no action has a mechanism."""
