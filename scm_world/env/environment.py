@@ -12,7 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of, whole_number
-from scm_world._types import Floats, Values
+from scm_world._types import Floats, Value, Values
 from scm_world.env.arguments import (
     RESETS,
     action_scale,
@@ -54,6 +54,7 @@ from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.interventions import merged
+from scm_world.world.mechanisms import Rows
 
 RENDER_MODES = ("rgb_array", "human")
 SINGLE = np.dtype(np.float32)
@@ -338,13 +339,26 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         goals = self._goals.names if self._how.goals and self._goals is not None else ()
         return (*self._observer.names, *goals)
 
-    def _look(self) -> Values:
+    def _look(self) -> Rows:
         """Compute what is needed of the present."""
+        self._follow()
+        return self.world.evaluate(self._needed)
+
+    def _follow(self) -> None:
+        """Observe the structure that there is, if it has changed."""
         if self._version != self.world.version:
             self._version = self.world.version
             if self.world.compiled is not self._declaration:
                 self._arrange(self.world.compiled)
-        return self.world.evaluate(self._needed)
+
+    def read(self, now: Rows) -> tuple[Any, dict[str, Any]]:
+        """Return observation and info of the values of its world, or of several like it.
+
+        Those of several have a leading axis; ``None`` where they cannot be read in one call.
+        """
+        self._follow()
+        together = now.numbers.ndim == 1 or self._observer.together
+        return self._observer.observe(now) if together else None, self._info(now)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -482,20 +496,19 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
 
     def present(self) -> tuple[Observation, dict[str, Any]]:
         """Give the observation and the info of the present, as after an intervention."""
-        now = self._look()
-        return self._observer.observe(now), self._info(now)
+        return self.read(self._look())
 
-    def _info(self, now: Values) -> dict[str, Any]:
+    def _info(self, now: Rows) -> dict[str, Any]:
+        """Return the info of one world, or of several as columns."""
+        truth, number = (bool, float) if now.numbers.ndim == 1 else (_truths, np.asarray)
         info: dict[str, Any] = {}
         if SUCCESS in self._counted:
-            info["is_success"] = info["success"] = bool(now[SUCCESS])
+            info["is_success"] = info["success"] = truth(now[SUCCESS])
         if FRACTION in self._counted:
-            info["fractional_success"] = float(now[FRACTION])
+            info["fractional_success"] = number(now[FRACTION])
         if self._goals is not None:
-            info["achieved_goal"], info["desired_goal"] = self._goals.read(self.world)
-        info["reward_terms"] = terms = {}
-        for name in self._terms:
-            terms[name] = float(now[name])
+            info["achieved_goal"], info["desired_goal"] = self._goals.read(now)
+        info["reward_terms"] = {name: number(now[name]) for name in self._terms}
         return info
 
     @property
@@ -531,3 +544,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         if self._window is not None:
             self._window.close()
         self.world.close()
+
+
+def _truths(values: Value) -> NDArray[np.bool_]:
+    found: NDArray[np.bool_] = values != 0
+    return found

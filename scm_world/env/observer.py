@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of
-from scm_world._types import Floats, Values
+from scm_world._types import Floats
 from scm_world.env.vector import (
     CORNERS,
     KEYPOINTS,
@@ -31,7 +31,7 @@ from scm_world.tasks.base import finite_numbers
 from scm_world.variables import Linear
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
-from scm_world.world.mechanisms import places
+from scm_world.world.mechanisms import Rows, places
 
 BOUND = 10.0
 """Goals that saturate are positions [m], sizes [m] and unit quaternions; beyond they saturate."""
@@ -66,14 +66,14 @@ class Goals:
             for name, side in zip(("achieved_goal", "desired_goal"), self._sides, strict=True)
         }
 
-    def read(self, world: Simulation) -> tuple[Floats, Floats]:
-        """Give what is achieved and what is desired."""
-        row, (achieved, desired) = world.row.numbers, self._sides
-        return row.take(achieved), row.take(desired)
+    def read(self, now: Rows) -> tuple[Floats, Floats]:
+        """Return what is achieved and what is desired, of one world or of several."""
+        achieved, desired = self._sides
+        return now.numbers.take(achieved, axis=-1), now.numbers.take(desired, axis=-1)
 
-    def observe(self, world: Simulation) -> dict[str, Floats]:
-        """Give both vectors, by name."""
-        pair = zip(self.spaces, self.read(world), strict=True)
+    def observe(self, now: Rows) -> dict[str, Floats]:
+        """Return both vectors, by name."""
+        pair = zip(self.spaces, self.read(now), strict=True)
         return {name: np.clip(goal, -self.bound, self.bound) for name, goal in pair}
 
 
@@ -158,8 +158,12 @@ class Observer(Protocol):
     space: gymnasium.Space[Any]
     layouts: Layouts
 
-    def observe(self, now: Values) -> Any:
-        """Give the observation of the present values."""
+    @property
+    def together(self) -> bool:
+        """Whether it looks at several worlds in one call too."""
+
+    def observe(self, now: Rows) -> Any:
+        """Return the observation of the present values; with a leading axis, those of several."""
 
 
 @final
@@ -204,13 +208,13 @@ class DictObserver:
     """Several observations in a dictionary.
 
     Args:
-        world: That is observed.
         parts: By name.
         goals: What is achieved and what is desired, if that is asked for.
     """
 
-    def __init__(self, world: Simulation, parts: dict[str, Observer], goals: Goals | None) -> None:
-        self._world, self._parts, self._goals = world, parts, goals
+    def __init__(self, parts: dict[str, Observer], goals: Goals | None) -> None:
+        self._parts, self._goals = parts, goals
+        self.together = all(part.together for part in parts.values())
         self.names = tuple(name for part in parts.values() for name in part.names)
         self.layouts: Layouts = {
             name: layout for name, part in parts.items() for layout in part.layouts.values()
@@ -220,10 +224,10 @@ class DictObserver:
             spaces | (goals.spaces if goals else {})
         )
 
-    def observe(self, now: Values) -> dict[str, NDArray[Any]]:
-        """Give all of them."""
+    def observe(self, now: Rows) -> dict[str, NDArray[Any]]:
+        """Return all of them."""
         found = {name: part.observe(now) for name, part in self._parts.items()}
-        return found if self._goals is None else found | self._goals.observe(self._world)
+        return found if self._goals is None else found | self._goals.observe(now)
 
 
 def observer(
@@ -253,9 +257,7 @@ def observer(
             world, declaration, about, normalize=how.normalize, padded=how.pad is not None
         )
     return (
-        DictObserver(world, parts, goals if how.goals else None)
-        if len(parts) > 1 or how.goals
-        else main
+        DictObserver(parts, goals if how.goals else None) if len(parts) > 1 or how.goals else main
     )
 
 

@@ -94,6 +94,7 @@ class Pixels:
     """
 
     names: tuple[str, ...] = ()
+    together = False
 
     def __init__(
         self,
