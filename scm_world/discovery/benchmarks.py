@@ -175,7 +175,7 @@ class BenchmarkResult:
 
     def write(self, folder: Location | str) -> None:
         """Write ``benchmark.json``, ``results.csv``, a picture and a report."""
-        from scm_world.discovery.benchmark_report import write_files
+        from scm_world.discovery.benchmark_summary import write_files
 
         plain = {
             "format": FORMAT,
@@ -260,7 +260,7 @@ def benchmark(
         progress: Called with (done, planned) after each run.
 
     Returns:
-        All runs and scores; in ``out`` also ``results.csv``, ``budget.png`` and ``report.html``.
+        All runs and scores; in ``out`` also ``results.csv`` and ``budget.png``.
 
     Raises:
         UnknownOption: Something does not exist, or a learner cannot use a kind of data.
