@@ -21,8 +21,9 @@ from scm_world.env.vector import KEYPOINTS, Vector
 from scm_world.errors import EngineFailure, FunctionFailure, ScmWorldError
 from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED, one_number
 from scm_world.variables.reserved import CONTROL_INDEX, SENSOR_NOISE
-from scm_world.world.batch import Batch, StateTable
-from scm_world.world.mechanisms import places
+from scm_world.world.batch import Batch
+from scm_world.world.compiled_task import CompiledTask
+from scm_world.world.mechanisms import Rows, places
 
 
 @final
@@ -80,11 +81,12 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         names = (*lead._needed, *(() if self._reads is None else (self._reads,)))
         worlds = [inner.world for inner in self._inner]
         self._batch = Batch(worlds, threads=threads, names=names)
-        self._readers: WeakKeyDictionary[StateTable, ObservationReader] = WeakKeyDictionary()
+        self._readers: WeakKeyDictionary[CompiledTask, ObservationReader] = WeakKeyDictionary()
         self._commands = np.empty((count, self._action_size))
         # Where joints were put since the last command: relative actions are relative to them.
         self._are_set = np.zeros(count, dtype=np.bool_)
         self._sensed: set[int] = set()
+        self._planned: set[int] = set()  # with a plan that acts within the episode
         self._alone: set[int] = set()  # they were used by themselves since they were stepped
         self._acting: Any = self.envs if hasattr(first, "stepped") else ()
 
@@ -159,11 +161,12 @@ class NativeVectorEnv(ScmWorldVectorEnv):
             raise
         self._are_set[rows] = False
         for table, members in self._batch.tables(rows):
-            reader = self._readers.get(table)
+            first = self._inner[int(members[0])]
+            reader = self._readers.get(first.world.compiled)
             if reader is None:
-                reader = ObservationReader(self._inner[int(members[0])], table)
-                self._readers[table] = reader
-            numbers = table.matrix
+                reader = ObservationReader(first, table)
+                self._readers[first.world.compiled] = reader
+            numbers = table.numbers
             rewards = reader.scale * numbers[members, reader.reward]
             for row in members[~np.isfinite(rewards)].tolist():
                 self._explain(row)
@@ -178,8 +181,9 @@ class NativeVectorEnv(ScmWorldVectorEnv):
                 if which[row]:
                     self._bring(row)
                     self._write(row, *self._inner[row].present())
-            for row in members.tolist() if self._acting else ():
-                self._intervene(row, int(numbers[row, reader.clock]))
+        for row in rows.tolist() if self._acting or self._planned else ():
+            if self._acting or row in self._planned:
+                self._intervene(row, self._inner[row].world.index)
 
     def _look(self) -> None:
         """Note what was changed in environments that were used by themselves."""
@@ -187,12 +191,16 @@ class NativeVectorEnv(ScmWorldVectorEnv):
             env = self._inner[index]
             if not env.world.has_begun:
                 continue
-            if env._delta is not None and env.world.action_mode == JOINTS:
+            if env._delta is not None and env.world.options.action_mode == JOINTS:
                 self._are_set[index] = env._delta.is_set()
-            if env.world.current()[0].get(SENSOR_NOISE):
-                self._sensed.add(index)
-            else:
-                self._sensed.discard(index)
+            for which, belongs in (
+                (self._sensed, env.world.row.get(SENSOR_NOISE)),
+                (self._planned, env.world.is_planned),
+            ):
+                if belongs:
+                    which.add(index)
+                else:
+                    which.discard(index)
         self._alone.clear()
 
     def _commanded(self, rows: Integers, actions: Floats) -> Floats:
@@ -206,24 +214,26 @@ class NativeVectorEnv(ScmWorldVectorEnv):
             actions = np.array(actions)
             for table, members in self._batch.tables(rows):
                 if self._reads is not None:
-                    offset = table.column(self._reads)[members]
+                    offset = table[self._reads][members]
                 else:
-                    offset = table.actions()[members]
-                    if lead.world.action_mode == JOINTS:
+                    offset = table.actions[members]
+                    if lead.world.options.action_mode == JOINTS:
                         put = self._are_set[members, None]
-                        offset = np.where(put, table.column(JOINTS)[members], offset)
+                        offset = np.where(put, table[JOINTS][members], offset)
                 actions[members] = self._delta.moved(actions[members], offset)
         scaled, world = lead._middle + lead._half * actions[rows], lead.world
         self._commands[rows] = np.minimum(np.maximum(scaled, world.action_low), world.action_high)
         return self._commands
 
     def _intervene(self, row: int, step: int) -> None:
-        """Do what the curriculum of one environment asks for after a control step."""
+        """Do what a plan or the curriculum of one environment contains after a control step."""
         over = bool(self._terminations[row] or self._truncations[row])
-        success: Any = self._known.get("is_success")
-        if not self._acting[row].stepped(
-            step, over=over, success=success is not None and bool(success[row])
-        ):
+        acts = not over and self._inner[row].world.may_act(step)
+        if self._acting:
+            success: Any = self._known.get("is_success")
+            succeeded = success is not None and bool(success[row])
+            acts |= self._acting[row].stepped(step, over=over, success=succeeded)
+        if not acts:
             return
         terms = self._known["reward_terms"]
         earned = {name: column[row] for name, column in terms.items()}
@@ -252,7 +262,7 @@ class ObservationReader:
 
     Args:
         env: Of this structure.
-        table: In which its world is.
+        table: The values of its world, and of others.
 
     Attributes:
         is_partial: Whether observation and info have to be read in each environment by itself.
@@ -263,7 +273,7 @@ class ObservationReader:
         terminated: Column of the variable that ends episodes, if there is one.
     """
 
-    def __init__(self, env: ScmWorldEnv, table: StateTable) -> None:
+    def __init__(self, env: ScmWorldEnv, table: Rows) -> None:
         seen: Any = env._observer
         goals = env._goals
         together = isinstance(seen, DictObserver)
@@ -274,7 +284,7 @@ class ObservationReader:
             if isinstance(part, Vector) and KEYPOINTS not in part._slices
         }
         self.is_partial = len(self._vectors) < len(parts)
-        where = {name: place.start for name, place in table.where.items()}
+        where = {name: place.start for name, place in table.mechanisms.where.items()}
         self.reward, self.terminated = where[REWARD], where.get(TERMINATED)
         self.clock, self.scale, self.limit = where[CONTROL_INDEX], env._scale, env.limit
         self._success, self._fraction = where.get(SUCCESS), where.get(FRACTION)
@@ -283,7 +293,7 @@ class ObservationReader:
         goal, self._bound = env.world.task.goal, 0.0 if goals is None else goals.bound
         sides = {"achieved_goal": goal.achieved, "desired_goal": goal.desired}
         self._goals = {
-            name: places(table.where[one] for one in side)
+            name: places(table.mechanisms.where[one] for one in side)
             for name, side in (sides.items() if goals is not None else ())
         }
 

@@ -68,7 +68,7 @@ class Goals:
 
     def read(self, world: Simulation) -> tuple[Floats, Floats]:
         """Give what is achieved and what is desired."""
-        row, (achieved, desired) = world.numbers[0], self._sides
+        row, (achieved, desired) = world.row.numbers, self._sides
         return row.take(achieved), row.take(desired)
 
     def observe(self, world: Simulation) -> dict[str, Floats]:
@@ -136,7 +136,7 @@ def goal_reward(world: Simulation) -> Callable[[ArrayLike, ArrayLike, Any], Any]
 
 def reward_scale(world: Simulation) -> float:
     """Give what rewards are multiplied by."""
-    return world.control_period if world.conventions.published else 1.0
+    return world.options.control_period if world.options.conventions.published else 1.0
 
 
 MODES = ("structured", "full", "pixel", "custom")
@@ -267,8 +267,8 @@ def context(declaration: CompiledTask) -> tuple[str, ...]:
 
 def published(world: Simulation, declaration: CompiledTask) -> dict[str, Observed]:
     """List the parts of the structured observation, by variable."""
-    length = world.max_episode_length * world.control_period
-    end = length if world.given_length is None else float(world.given_length)
+    length = world.max_episode_length * world.options.control_period
+    end = length if world.options.given_length is None else float(world.options.given_length)
     return {
         part.variable: replace(part, published=part.published or (0.0, end))
         for part in declaration.task.observation.rows
@@ -315,7 +315,7 @@ def _parts(
     soft = frozenset[str]()
     if not declaration.task.observation.saturates:
         soft = frozenset(declaration.slices)
-    as_published = world.conventions.published
+    as_published = world.options.conventions.published
     parts = []
     for name in names:
         low, high = bounds(declaration.model, name)

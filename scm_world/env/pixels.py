@@ -101,7 +101,7 @@ class Pixels:
         cameras: Sequence[str | Camera] | None,
         size: Size | None,
     ) -> None:
-        views, published = views_of(world.structure), world.conventions.published
+        views, published = views_of(world.structure), world.options.conventions.published
         self._world, self._shows_goals = world, views is not None
         own: tuple[Camera, ...] = ()
         if views is not None:
@@ -135,7 +135,9 @@ class Pixels:
 
     def observe(self, now: Values) -> NDArray[np.uint8]:
         """Draw; pictures of the goals are kept until someone intervenes."""
-        scene = self._world.describe(*self._world.current())  # drawn immediately: no copies
+        scene = self._world.compiled.describe(
+            self._world.row, self._world.state
+        )  # drawn immediately
         published, n = self._published, len(self._cameras)
         pictures: NDArray[np.uint8] = np.empty(self._shape, dtype=np.uint8)
         if not self._shows_goals:

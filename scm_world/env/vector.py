@@ -219,7 +219,7 @@ class Vector:
                 if part.name != KEYPOINTS
             ]
         )
-        self._published = world.conventions.published
+        self._published = world.options.conventions.published
         self._turns = [
             place
             for name, place in self._slices.items()
@@ -256,9 +256,9 @@ class Vector:
         self.space = box(*ends)
         world = self._world
         self._shift, self._shifts = 0.0, np.zeros(self._read.size)
-        if self._published and TIME in self._slices and world.given_length is not None:
+        if self._published and TIME in self._slices and world.options.given_length is not None:
             # The predecessor subtracts seconds from a number of steps.
-            self._shift = world.given_length * (1.0 - world.control_period)
+            self._shift = world.options.given_length * (1.0 - world.options.control_period)
             self._shifts[self._slices[TIME]] = self._shift
 
     def write(self, numbers: Floats, rows: Integers, out: NDArray[np.float32]) -> None:
@@ -278,13 +278,13 @@ class Vector:
         if self._version != self._world.version:
             self._version = self._world.version
             self._noise = float(now[SENSOR_NOISE]) if self._senses else 0.0
-        numbers = self._world.numbers
+        numbers = self._world.row.numbers
         found: NDArray[np.float32] = np.empty((1, self._size), dtype=np.float32)
         shown: NDArray[np.float32] = found[0]
         if self._keypoints is None and not self._noise:
-            self.write(numbers, FIRST, found)
+            self.write(numbers[None], FIRST, found)
             return shown
-        raw = numbers[0].take(self._read)
+        raw = numbers.take(self._read)
         raw[self._shifts != 0.0] += self._shift
         if self._keypoints is not None:
             raw = np.insert(raw, self._slices[KEYPOINTS].start, self._keypoints[2](now))

@@ -13,7 +13,7 @@ from scm_world.models import Parameters
 from scm_world.variables import Hard
 from scm_world.world.compiled_task import StepBase
 from scm_world.world.interventions import Transaction, same
-from scm_world.world.mechanisms import Row
+from scm_world.world.mechanisms import Rows
 
 
 @final
@@ -99,7 +99,7 @@ def report(
     request: Mapping[str, Any],
     done: Transaction,
     before: StepBase,
-    now: Row,
+    now: Rows,
     inertia: Parameters,
     reported: Parameters,
     remarks: tuple[str, ...],
@@ -132,7 +132,7 @@ def report(
 
 
 def _values(
-    done: Transaction, now: Row, reported: Parameters, name: str
+    done: Transaction, now: Rows, reported: Parameters, name: str
 ) -> tuple[Value | None, Value | None]:
     """Return the value that a target has now, and what the backend reports of it.
 

@@ -22,7 +22,7 @@ from scm_world.models.scene import SURFACES, Overlap
 from scm_world.tasks import Conventions, Task, Timing
 from scm_world.variables import Action, Box, Derived, Exogenous, Intervention, Measured
 from scm_world.variables.checks import check_bounds, coerce
-from scm_world.world.mechanisms import Mechanisms, Row, wrong_value
+from scm_world.world.mechanisms import Mechanisms, Rows, wrong_value
 
 Plan = tuple[Hashable, frozenset[str]]
 """A structure: which bodies the task asks for, and the names of those that were taken away."""
@@ -375,7 +375,7 @@ class CompiledTask(ActionVector):
         """Give a state to read into, or one with some numbers."""
         return self._start.copy() if vector is None else self._start.with_vector(vector)
 
-    def state_of(self, row: Row) -> State:
+    def state_of(self, row: Rows) -> State:
         """Return where everything is in a row, as a view of it."""
         return self._start.with_vector(row.numbers[: self.mechanisms.state_size])
 
@@ -398,7 +398,7 @@ class CompiledTask(ActionVector):
             function = self._coordinates[name] = variable.mechanism.bind()
         return np.asarray(function(*values))
 
-    def coordinates(self, name: str, row: Row) -> Value:
+    def coordinates(self, name: str, row: Rows) -> Value:
         """Return a parameter or a state of a row, also in other coordinates, or a bundle."""
         targets = self.model.targets(name)
         if targets == (name,):
@@ -415,7 +415,7 @@ class CompiledTask(ActionVector):
             parameters[key] = values[name]
         return Scene(structure, parameters, state, *self.composition.looks(values))
 
-    def scene(self, row: Row) -> Scene:
+    def scene(self, row: Rows) -> Scene:
         """Describe the scene of a row."""
         return self.describe(row, self.state_of(row))
 
@@ -471,7 +471,7 @@ class StepBase:
 
     compiled: CompiledTask
     model: SCM
-    row: Row
+    row: Rows
     pending: PendingInterventions = field(default_factory=dict)
     drawn: Mapping[str, int] = field(default_factory=dict)
     at_start: bool = False
@@ -498,7 +498,7 @@ class StepBase:
         return self.row[name] if name in compiled.slices else compiled.coordinates(name, self.row)
 
 
-def beginning(compiled: CompiledTask, key: NoiseKey | None) -> Row:
+def beginning(compiled: CompiledTask, key: NoiseKey | None) -> Rows:
     """Compute where an episode begins without interventions.
 
     Args:
@@ -508,7 +508,7 @@ def beginning(compiled: CompiledTask, key: NoiseKey | None) -> Row:
     Returns:
         A row with everything that physics does not move, and the states.
     """
-    row = Row(compiled.mechanisms, compiled.mechanisms.start.copy())
+    row = Rows(compiled.mechanisms, compiled.mechanisms.start.copy())
     static = compiled.model.solve(only=compiled.static_names, key=key)
     for name in compiled.static_names:
         row[name] = static[name]

@@ -44,7 +44,7 @@ from scm_world.variables import (
 from scm_world.variables.checks import check_bounds, check_space, coerce
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import CompiledTask, PendingInterventions, StepBase
-from scm_world.world.mechanisms import Row
+from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import uniforms
 from scm_world.world.structures import StructureCache, restructured, wrong_structure
 
@@ -105,7 +105,7 @@ class Transaction:
         change: What the backend has to change; None if nothing.
     """
 
-    row: Row
+    row: Rows
     change: Difference | None = None
 
     def __init__(
@@ -277,7 +277,7 @@ class Transaction:
         return self._as_asked() if self._wrong else []
 
     def _begin(self, key: NoiseKey, numbers: Floats) -> None:
-        self._key, self.row = key, Row(self.compiled.mechanisms, numbers, self._targets)
+        self._key, self.row = key, Rows(self.compiled.mechanisms, numbers, self._targets)
         self._wrong, self._impossible = [*self.problems], {*self._whatever}
         self._whole: dict[str, Value] = {}  # what bundles are to be
 
@@ -408,7 +408,7 @@ class Transaction:
                 variable=requested.name,
                 value=act,
             )
-        values = Row(self.row.mechanisms, self.row.numbers.copy())
+        values = Rows(self.row.mechanisms, self.row.numbers.copy())
         states = slice(0, self.row.mechanisms.state_size)
         values.numbers[states] = self.base.row.numbers[states]
         given = (np.array(values[p.name]) for p in act.parents)
@@ -588,7 +588,7 @@ class Transaction:
 
 
 def difference(
-    now: StepBase, compiled: CompiledTask, then: Row, changed: Iterable[str]
+    now: StepBase, compiled: CompiledTask, then: Rows, changed: Iterable[str]
 ) -> Difference | None:
     """Return what a backend has to change; None if nothing.
 
@@ -598,7 +598,7 @@ def difference(
         now: The present.
         compiled: The task in the structure that is wanted.
         then: The values that are wanted.
-        changed: What ``Row.differing`` lists.
+        changed: What ``Rows.differing`` lists.
     """
     if changed or compiled is not now.compiled:
         structure = compiled.composition.structure(then)
@@ -616,7 +616,7 @@ def overlaps(
     base: StepBase,
     now: StepBase,
     compiled: CompiledTask,
-    then: Row,
+    then: Rows,
     change: Difference,
     asked: Iterable[str] = (),
 ) -> list[Overlap]:

@@ -173,7 +173,7 @@ def test_every_settable_variable_is_applied_and_read_back(backend: str, task: st
         np.testing.assert_allclose(world[name], wanted, atol=1e-12)
         np.testing.assert_array_equal(entry.requested, wanted)
         target = world.model.target(name)
-        known = target in world.parameter_keys or target in world.slices
+        known = target in world.compiled.parameter_keys or target in world.compiled.slices
         assert (entry.read_back is not None) == (known or name == "control_index")
         if entry.read_back is not None:
             np.testing.assert_allclose(entry.read_back, wanted, atol=1e-6)

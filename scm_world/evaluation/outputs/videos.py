@@ -127,7 +127,7 @@ def _film(
     shard, video = shard_runner.setup.shard_of(row), list[Any]()
 
     def watch(env: ScmWorldEnv) -> None:
-        step, period = env.world.index, env.world.control_period
+        step, period = env.world.index, env.world.options.control_period
         every = math.ceil(round(1.0 / (FASTEST * period), 9))
         if step % every == 0:
             scene = env.world.scene()
