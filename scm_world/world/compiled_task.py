@@ -478,6 +478,11 @@ class StepBase:
     fresh: frozenset[str] = frozenset()
 
     @cached_property
+    def structure(self) -> Structure:
+        """What is compiled."""
+        return self.compiled.composition.structure(self.row)
+
+    @cached_property
     def overlaps(self) -> tuple[Overlap, ...]:
         """What lies in one another, however little."""
         return self.compiled.composition.overlaps(self.compiled.scene(self.row), 0.0)

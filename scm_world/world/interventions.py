@@ -24,7 +24,7 @@ from scm_world.errors import (
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.acceptance import refuse_time
 from scm_world.graph.evaluate import AppliedIntervention, noise_of, source_of
-from scm_world.models import Difference, Structure
+from scm_world.models import Difference
 from scm_world.models.scene import SURFACES, Overlap
 from scm_world.variables import (
     SOFT,
@@ -120,7 +120,7 @@ class Transaction:
         self.problems = [*found]
         self.request, self.space, self._deciding = request, space, structures.deciding
         asked = (*base.pending.values(), *request.items())
-        if any(isinstance(act, Null) or name in structures.deciding for name, act in asked):
+        if any(type(act) is Null or name in structures.deciding for name, act in asked):
             wrong = wrong_structure(structures, base, request)
             request = {name: act for name, act in request.items() if name not in wrong}
             base = restructured(structures, base, request, key)
@@ -144,11 +144,11 @@ class Transaction:
         asked: dict[str, str] = {}
         for name, value in request.items():
             try:
-                if isinstance(value, Null | Natural):
+                if type(value) in (Null, Natural):
                     if name not in model:
                         refuse_time(name, value)
                     # A removal is of an entity; see ``restructured``. Who comes back is there.
-                    if isinstance(value, Null) or name in compiled.entity_names:
+                    if type(value) is Null or name in compiled.entity_names:
                         continue
                 kept, act = self._checked(name, value)
                 targets = model.targets(name)
@@ -184,7 +184,7 @@ class Transaction:
                 raise
             act = Hard(problem.value)
         target = model.targets(name)[0]
-        if name != target and isinstance(act, Hard) and name not in self.compiled.bundles:
+        if name != target and type(act) is Hard and name not in self.compiled.bundles:
             quantity, present = base.value(target), base.value(name)
             if present is not None and np.array_equal(act.value, np.ravel(present)):
                 return target, Hard(quantity)
@@ -194,8 +194,8 @@ class Transaction:
         """Mutilate the model, and order the descendants of the targets."""
         compiled = self.compiled
         moving = self._moving(acts)
-        held = chain(self.base.model.interventions.values(), (act for _, act in acts.values()))
-        adds = any(isinstance(act, Mechanism) for act in held)
+        held = (*self.base.model.interventions.values(), *(act for _, act in acts.values()))
+        adds = any(type(act) is Mechanism for act in held)
         # Where nothing follows others than before, draws from boxes can wait for their values.
         later = () if adds else self._boxes[0]
         kept = dict([acts[t] for t in acts if t not in moving and t not in later])
@@ -204,7 +204,7 @@ class Transaction:
         self._impossible = {*moving, *chain(*(problem.cycle for problem in cycles))}
         static, out = compiled.static, self._impossible
         self._targets = tuple([t for t in acts if t in static and t not in out])
-        self._draws = [t for t in self._targets if isinstance(acts[t][1], Draw)]
+        self._draws = [t for t in self._targets if type(acts[t][1]) is Draw]
         others = (t for t in self._draws if t not in self._boxes[0])
         if adds or any(self._source(*acts[t]).parents() for t in others):
             structure = self.model.structure
@@ -220,7 +220,7 @@ class Transaction:
         """
         found: dict[str, InterventionError] = {}
         for target, (name, act) in acts.items():
-            if not isinstance(act, Mechanism):
+            if type(act) is not Mechanism:
                 continue
             known, who, what = self.compiled.static, "a parameter", "parameters of the same instant"
             if target in self.compiled.actions:
@@ -246,7 +246,7 @@ class Transaction:
         wanted = [
             (name, act.source, name if act.stream is None else f"{act.stream}/{name}")
             for name, (asked, act) in self.acts.items()
-            if isinstance(act, Draw) and asked == name and act.of is None
+            if type(act) is Draw and asked == name and act.of is None
         ]
         return self.compiled.boxes(tuple(wanted)) if wanted else ((), ())
 
@@ -291,7 +291,7 @@ class Transaction:
         asked, act = self.acts.get(name, (name, None))
         bounds = variable.bounds
         follows = bounds is not None and bool(bounds.parents())
-        if isinstance(act, Hard) and asked == name and not follows:
+        if type(act) is Hard and asked == name and not follows:
             self.row[name] = act.value  # it has been checked
             return
         impossible = self._impossible
@@ -573,15 +573,15 @@ class Transaction:
         by_hand, actions = self.compiled.set_by_hand, self.compiled.actions
         found: PendingInterventions = {}
         for target, named in self.pending.items():
-            lasting = target not in by_hand and isinstance(named[1], (*SOFT, Mechanism, Natural))
-            stays = isinstance(named[1], Hard) or lasting or target in actions
-            if stays or target not in self.acts:
+            kind = type(named[1])
+            lasting = kind is not Draw and target not in by_hand
+            if kind is Hard or lasting or target in actions or target not in self.acts:
                 found[target] = named
             else:
                 value = self._fixed.get(target) or Hard(self.row[target].tolist())
                 found[target] = target, value
         removals = self.request.items()
-        return found | {name: (name, act) for name, act in removals if isinstance(act, Null)}
+        return found | {name: (name, act) for name, act in removals if type(act) is Null}
 
 
 # --- bodies ----------------------------------------------------------------------------------
@@ -600,10 +600,9 @@ def difference(
         then: The values that are wanted.
         changed: What ``Rows.differing`` lists.
     """
-    structure: Structure = None
     if changed or compiled is not now.compiled:
         structure = compiled.composition.structure(then)
-        if structure is not now.compiled.composition.structure(now.row):
+        if structure is not now.structure:
             scene = compiled.scene(then)
             return Difference(structure, scene.parameters, scene.state)
     keys, size = compiled.parameter_keys, compiled.mechanisms.state_size
@@ -664,7 +663,7 @@ def feasible(
         Infeasible: With the bodies, the depths, and the nearest value that is feasible; or no
             draw was.
     """
-    draws = [name for name, act in request.items() if isinstance(act, Draw)]
+    draws = [name for name, act in request.items() if type(act) is Draw]
     deciding = structures.deciding.intersection(draws)
     first, turn, tried, named = 0, 0, "", frozenset[str]()
     while first < ATTEMPTS:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -498,14 +497,15 @@ class Simulation:
         flat, before = flatten(request, problems), self._step_base()
         base = self.base or before
         drawn = base.drawn
-        if any(isinstance(act, Draw | Mechanism) for act in flat.values()):
+        if any(type(act) in (Draw, Mechanism) for act in flat.values()):
             problems += self._wrong_actions(flat)
             flat, drawn = self._anew(flat, base)
         region = self.variables_space if space is None else as_region("space", space)
         key = self.noise_key(self.index)
         done = feasible(self.structures, base, before, flat, region, key, problems)
         audit = self._commit(done, before, flat, check, at_start=base.at_start)
-        self._keep_base(replace(base, pending=done.kept(), drawn=drawn))
+        base = StepBase(base.compiled, base.model, base.row, done.kept(), drawn, base.at_start)
+        self._keep_base(base)
         return audit
 
     def _anew(
@@ -595,11 +595,11 @@ class Simulation:
             wanted = {keys[target] for target in targets if target in keys}
             reported = backend.parameters({*change.parameters, *inertia, *wanted})
             self._refuse_other(change, reported)
-            self._adopt(compiled, done.held(), done.row, done.changed)
+            structure = change.structure or self.structure
+            self._adopt(compiled, done.held(), done.row, done.changed, structure)
             remarks: tuple[str, ...] = ()
-            if change.structure is None and any(
-                "friction" in what for _, what in change.parameters
-            ):
+            set_here = () if change.structure is not None else change.parameters
+            if any(what.endswith("friction") for _, what in set_here):
                 frictions = {keys[n]: before.row[n] for n in done.changed if n in keys}
                 remarks = backend.capabilities.remarks(backend, frictions)
             now = self.row.copy()
@@ -625,11 +625,12 @@ class Simulation:
             raise
 
     def _inertia(self, change: Difference) -> Parameters:
+        """Read the moments of inertia that a change of masses and sizes will change."""
+        compiled = self.compiled
         bodies = {body for body, what in change.parameters if what in ("mass", "size")}
-        movers = self.compiled.movers
-        if change.structure is not None or not bodies or not movers:
+        if change.structure is not None or not bodies or not compiled.movers:
             return {}
-        bodies -= {*self.composition.bodies} - movers
+        bodies.difference_update(n for n in compiled.composition.bodies if n not in compiled.movers)
         return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
     def _refuse_other(self, change: Difference, reported: Parameters) -> None:
@@ -651,6 +652,7 @@ class Simulation:
         model: SCM,
         row: Rows,
         changed: Iterable[str] | None = None,
+        structure: Structure | None = None,
         *,
         moved: bool = True,
     ) -> None:
@@ -661,6 +663,7 @@ class Simulation:
             model: With the interventions that hold.
             row: The values.
             changed: What only interventions decide and differs from the present, if known.
+            structure: Of the row, if known.
             moved: Whether the backend reports where everything is; else the row does.
         """
         last, anew = self.row, compiled is not self.compiled
@@ -670,7 +673,7 @@ class Simulation:
         self.row.take(row)
         self._adopt_model(model)
         if changed or anew:
-            self._adopt_structure(compiled.structure(row))
+            self._adopt_structure(compiled.structure(row) if structure is None else structure)
         self.version += 1
         if moved:
             self.backend.read(self.state)
