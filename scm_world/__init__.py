@@ -123,7 +123,7 @@ for _task in (
     if _id not in gymnasium.registry:
         gymnasium.register(
             id=_id,
-            entry_point="scm_world.env:make_env",
+            entry_point="scm_world.env:ScmWorldEnv",
             vector_entry_point="scm_world.env:vector_env",
             kwargs={"task": _task},
             order_enforce=False,  # it refuses steps before a reset itself

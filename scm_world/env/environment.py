@@ -195,11 +195,15 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         render_mode: str | None = None,
         render_camera: str | Camera | Mapping[str, Any] | None = None,
         render_size: int | tuple[int, int] | None = None,
+        **unknown: Any,
     ) -> None:
+        for name in unknown:
+            raise UnknownOption("option of the environment", name, OPTIONS)
         options = {name: value for name, value in locals().items() if name in OPTIONS}
         self._how = Observing(**{name: options[name] for name in Observing.__dataclass_fields__})
         made = task if isinstance(task, StructureCache) else as_task(task, task_options or {})
-        mode = checked_mode(action_mode, made)
+        kind = made.task if isinstance(made, StructureCache) else made
+        mode = checked_mode(action_mode, kind.choices["action_mode"])
         self.world = World(
             made,
             backend=backend,
@@ -262,7 +266,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             allowed = (f"none, or an action_mode that begins with {PREFIX!r}",)
             raise UnknownOption(f"relative actions of {mode}", given, allowed)
         ends = ((end - self._middle) / self._half for end in (low, high))
-        self.action_space = self._delta.space() if self._delta else box(*ends)
+        self.action_space = self._delta.space if self._delta else box(*ends)
         self._given = np.empty(low.size)
         self._range = (self._middle, self._half, low, high)
 
@@ -456,7 +460,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         given = self._read(action)
         if self._delta is not None:
-            given = self._delta.absolute(np.array(given, dtype=np.float64))
+            given = self._delta.moved(np.array(given, np.float64), self._delta.offset())
         self._given[...] = given  # every 32-bit number is a 64-bit one
         command = np.empty(given.shape)  # the world keeps it
         if not scaled_clip_kernel(self._given, *self._range, command):
@@ -634,5 +638,5 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self.world.close()
 
 
-OPTIONS = frozenset(inspect.signature(ScmWorldEnv).parameters)
+OPTIONS = tuple(inspect.signature(ScmWorldEnv).parameters)[:-1]
 """Names of the options of an environment."""

@@ -8,7 +8,7 @@ from inspect import signature
 from typing import Any
 
 from scm_world._arguments import whole_number
-from scm_world.env.environment import ScmWorldEnv
+from scm_world.env.environment import OPTIONS, ScmWorldEnv
 from scm_world.env.many import ScmWorldVectorEnv
 from scm_world.env.native import NativeVectorEnv
 from scm_world.env.processes import ProcessVectorEnv
@@ -19,7 +19,7 @@ from scm_world.world.structures import as_task
 
 MODEL_ID = "scm_world/Model-v0"
 
-OF_ENV, OF_VECTOR = ([*signature(made).parameters] for made in (ScmWorldEnv, NativeVectorEnv))
+OF_VECTOR = tuple(signature(NativeVectorEnv).parameters)
 
 
 def make_env(model: Any = None, **options: Any) -> ScmWorldEnv:
@@ -110,8 +110,8 @@ def _of_env(model: Any, options: Mapping[str, Any], others: tuple[str, ...] = ()
         own.remove("observe")
     found = {name: value for name, value in options.items() if name not in own}
     for name in found:
-        if name not in OF_ENV:
-            raise UnknownOption("option of the environment", name, [*own, *OF_ENV, *others])
+        if name not in OPTIONS:
+            raise UnknownOption("option of the environment", name, (*own, *OPTIONS, *others))
     if model is None:
         return found
     of_task = {name: options[name] for name in own if name in options}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, final
+from typing import Any, final
 
 import gymnasium
 import numpy as np
@@ -109,23 +109,6 @@ CONTEXTS = ("none", "observation", "privileged")
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
 
 
-class Observer(Protocol):
-    """Something that looks at a world.
-
-    Attributes:
-        names: The variables that have to be computed before it looks.
-        space: In which all observations lie.
-        layouts: Where each variable stands, in every vector that is observed.
-    """
-
-    names: tuple[str, ...]
-    space: gymnasium.Space[Any]
-    layouts: Layouts
-
-    def observe(self, now: Values) -> Any:
-        """Return the observation of the present values."""
-
-
 @final
 @dataclass(frozen=True)
 class Observing:
@@ -169,7 +152,9 @@ class Observing:
 class DictObserver:
     """Several observations in a dictionary, with the goals if they are observed too."""
 
-    def __init__(self, world: Simulation, parts: dict[str, Observer], goals: Goals | None) -> None:
+    def __init__(
+        self, world: Simulation, parts: dict[str, Vector | Pixels], goals: Goals | None
+    ) -> None:
         self._world, self._parts, self._goals = world, parts, goals
         self.names = tuple(name for part in parts.values() for name in part.names)
         self.layouts: Layouts = {
@@ -184,6 +169,10 @@ class DictObserver:
         """Return all of them."""
         found = {name: part.observe(now) for name, part in self._parts.items()}
         return found if self._goals is None else found | self._goals.observe(self._world)
+
+
+Observer = Vector | Pixels | DictObserver
+"""Something that looks at a world: it has ``names``, ``space``, ``layouts`` and ``observe``."""
 
 
 def observer(
@@ -202,14 +191,14 @@ def observer(
         goals: Those of the structure, if it has some.
         largest: Of the structure whose bodies have places in the vector.
     """
-    main: Observer
+    main: Vector | Pixels
     if how.goal_env:
         _check_goals(declaration, goals)
     if how.observation_mode == "pixel":
         main = Pixels(world, how.cameras, how.image_size)
     else:
         main = _vector(world, declaration, how, largest)
-    parts: dict[str, Observer] = {"observation": main}
+    parts: dict[str, Vector | Pixels] = {"observation": main}
     if how.context == "privileged":
         about = _parts(world, largest, _context(largest), sensed=False)
         parts["context"] = Vector(
