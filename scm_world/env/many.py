@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space, create_empty_array
 
 from scm_world._types import Floats
 from scm_world.env.arguments import RESETS, limited, reset_options
-from scm_world.env.copies import EnvSnapshot
+from scm_world.env.environment import EnvSnapshot
 from scm_world.errors import (
     ActionError,
     InterventionError,

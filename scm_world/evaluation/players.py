@@ -274,7 +274,7 @@ def _network(policy: MlpPolicy | OnnxPolicy, name: str, env: ScmWorldEnv) -> Act
 def _of_world(make: Any, name: str, env: ScmWorldEnv) -> Actor:
     """Give actions that lead as near to the command of a world policy as one action can."""
     policy = _function(make(), env)
-    return lambda _: env.toward(checked(policy(env.world), env, name))
+    return lambda _: env.as_action(checked(policy(env.world), env, name))
 
 
 def _named(name: str) -> Policy:
