@@ -198,8 +198,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         **unknown: Any,
     ) -> None:
         for name in unknown:
-            raise UnknownOption("option of the environment", name, OPTIONS)
-        options = {name: value for name, value in locals().items() if name in OPTIONS}
+            raise UnknownOption("option of the environment", name, ENV_OPTIONS)
+        options = {name: value for name, value in locals().items() if name in ENV_OPTIONS}
         self._how = Observing(**{name: options[name] for name in Observing.__dataclass_fields__})
         made = task if isinstance(task, StructureCache) else as_task(task, task_options or {})
         kind = made.task if isinstance(made, StructureCache) else made
@@ -638,5 +638,5 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self.world.close()
 
 
-OPTIONS = tuple(inspect.signature(ScmWorldEnv).parameters)[:-1]
+ENV_OPTIONS = tuple(inspect.signature(ScmWorldEnv).parameters)[:-1]
 """Names of the options of an environment."""
