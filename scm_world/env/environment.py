@@ -122,7 +122,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             vector always has the places of these bodies then, with zeros where one is missing.
         cameras: Names (``"60"``, ``"120"``, ``"300"``, ``"overview"``) or cameras, for
             ``"pixel"``; the three of the robot if None.
-        image_size: Height and width of pictures, or both in one [pixels].
+        image_size: Height and width of pictures, or both in one [pixels]; 128 if None.
         normalize_observations: Give numbers in [-1, 1] instead of SI units.
         goal_env: Give a dictionary with ``observation``, ``achieved_goal``, ``desired_goal``, as
             ``compute_reward`` takes them.
