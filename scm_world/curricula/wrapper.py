@@ -102,7 +102,7 @@ class CurriculumRunner:
         for step in self._due:
             due = self._schedule.due(world, step, self._fired)
             if any(name in world.structures.head for name in due):  # names mean what there is then
-                now = world.current()[0], world.noise_key(world.index)
+                now = world.row, world.noise_key(world.index)
                 found = structure_after(world.structures, due, world.graph, *now)
                 self._schedule = Schedule([(0, self._plan(found or world.compiled))])
                 due = self._schedule.due(world, step, self._fired)

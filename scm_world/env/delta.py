@@ -63,7 +63,7 @@ class Delta:
         reach = (self._high - self._low) / 2.0
         self._gain, self._reach = (scale, reach) if normalized else (1.0, scale * reach)
         self.space = box(-self._reach, self._reach)
-        mode = world.action_mode
+        mode = world.options.action_mode
         self.reads = TIPS if mode == TIPS else None if origin == COMMAND else mode
         if self.reads not in (None, TIPS, JOINTS):
             allowed = f"{COMMAND!r}, or action_mode={PREFIX + JOINTS!r}"
@@ -89,18 +89,16 @@ class Delta:
         if self.reads is not None:
             measured: Floats = world.evaluate((self.reads,))[self.reads]
             return measured
-        now, state = world.current()
-        if world.action_mode == JOINTS and self.is_set():
-            found: Floats = world.compiled.view("joint_positions", state)
-            return found
-        return np.concatenate([np.ravel(now[name]) for name in world.compiled.actions])
+        if world.options.action_mode == JOINTS and self.is_set():
+            return world.row[JOINTS]
+        return world.row.actions
 
     def is_set(self) -> bool:
         """Return whether nothing was commanded since the joints were put where they are."""
         world = self._world
         if world.version != self._version:
             self._version = world.version
-            base = world.snapshot().base
+            base = world.base
             joints = world.model.targets("joint_positions")
             set_now = base and (base.at_start or any(j in base.pending for j in joints))
             self._fresh = world.index if set_now else -1

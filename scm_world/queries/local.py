@@ -62,7 +62,11 @@ def contact_terms(world: Simulation) -> dict[str, Any]:
         Plain data. ``"together"``: groups of bodies that are coupled in every step. ``"still"``:
         bodies that never move. ``"of"``: the bodies of each variable, one of each group.
     """
-    model, touched, shaped = world.model, world.composition.touched(), world.composition.shaped()
+    model, touched, shaped = (
+        world.model,
+        world.composition.touched(),
+        world.composition.shaped(),
+    )
     states = {v.name for v in model.variables if v.role == "state"}
     after, before = dict[str, list[str]](), dict[str, list[str]]()
     coupled = nx.Graph()

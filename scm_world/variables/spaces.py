@@ -258,7 +258,8 @@ class Box(Source):
         """Return whether a value lies inside, borders included."""
         if self._widened is not None and np.ndim(value) < 2:
             low, high = self._widened
-            return bool((value >= low).all() and (value <= high).all())
+            inside = (value >= low) & (value <= high)
+            return bool(inside.all() if inside.ndim else inside)
         low, high = _widened(*self.bounds(np.shape(value), values or {}))
         return bool(np.all(value >= low) and np.all(value <= high))
 

@@ -18,14 +18,17 @@ from scm_world.errors import ActionError, InterventionError, ModelError, Unknown
 from scm_world.geometry.numbers import clip_kernel
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
-from scm_world.models.scene import SURFACES
+from scm_world.models.scene import SURFACES, Overlap
 from scm_world.tasks import Conventions, Task, Timing
 from scm_world.variables import Action, Box, Derived, Exogenous, Intervention, Measured
 from scm_world.variables.checks import check_bounds, coerce
-from scm_world.world.mechanisms import Mechanisms, Row, wrong_value
+from scm_world.world.mechanisms import Mechanisms, Rows, wrong_value
 
 Plan = tuple[Hashable, frozenset[str]]
 """A structure: which bodies the task asks for, and the names of those that were taken away."""
+
+BOXES = 64
+"""How many requests with draws are kept for when they come again."""
 
 PendingInterventions = dict[str, tuple[str, Intervention]]
 """By target: the name that was asked for (the target, or coordinates of it), and what for."""
@@ -231,7 +234,7 @@ class CompiledTask(ActionVector):
             if (isinstance(v, Exogenous) and v.distribution) or (isinstance(v, Derived) and v.noise)
         )
         self._coordinates: dict[str, Callable[..., Any]] = {}
-        self._boxes: dict[Any, tuple[Integers, Floats, Floats] | None] = {}
+        self._boxes: dict[Any, tuple[frozenset[str], list[Any]]] = {}
         self._reached: dict[frozenset[str], frozenset[str]] = {}
         self._material: dict[str, bool] = {}
         self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
@@ -298,25 +301,41 @@ class CompiledTask(ActionVector):
             self._follow[key] = tuple(name for name in self.static_names if name in follow)
         return self._follow[key]
 
-    def box(self, name: str, source: Any) -> tuple[Integers, Floats, Floats] | None:
-        """Return columns, lower ends and edges of a box that a variable is drawn from.
+    def boxes(self, draws: tuple[tuple[str, Any, str], ...]) -> tuple[frozenset[str], list[Any]]:
+        """Find the parameters that are drawn from boxes which follow nothing.
 
-        None where the source is no box, follows other variables or reaches beyond the bounds.
+        Args:
+            draws: Names, sources and streams.
+
+        Returns:
+            Their names; and by size their names, streams, columns, lower ends and edges, the last
+            three of shape (draws, size).
         """
-        key = name, source
-        if key not in self._boxes:
-            variable: Any = self.model.declared(name)
-            space: Any = variable.space(source) if isinstance(source, str) else source
-            self._boxes[key] = None
-            ends = []
-            for one in (space, variable.bounds or space):
-                if isinstance(one, Box) and not one.parents() and variable.dtype == "real":
-                    ends += [np.ravel(end) for end in one.bounds(variable.shape, {})]
-            if len(ends) == 4 and (ends[0] >= ends[2]).all() and (ends[1] <= ends[3]).all():
-                where = self.mechanisms.where[name]
-                columns = np.arange(where.start, where.stop)
-                self._boxes[key] = columns, ends[0], ends[1] - ends[0]
-        return self._boxes[key]
+        if draws not in self._boxes:
+            if len(self._boxes) == BOXES:
+                self._boxes.clear()
+            sizes = dict[int, list[Any]]()
+            for name, source, stream in draws:
+                box = self._box(name, source)
+                if box is not None:
+                    sizes.setdefault(len(box[0]), []).append((name, stream, *box))
+            names = frozenset(one[0] for group in sizes.values() for one in group)
+            groups = [(*zip(*group, strict=True),) for group in sizes.values()]
+            self._boxes[draws] = names, [(*g[:2], *map(np.stack, g[2:])) for g in groups]
+        return self._boxes[draws]
+
+    def _box(self, name: str, source: Any) -> tuple[Integers, Floats, Floats] | None:
+        """Return columns, lower ends and edges; None of a source that reaches beyond the bounds."""
+        variable: Any = self.model.declared(name)
+        space: Any = variable.space(source) if isinstance(source, str) else source
+        ends = []
+        for one in (space, variable.bounds or space) if name in self.static else ():
+            if isinstance(one, Box) and not one.parents() and variable.dtype == "real":
+                ends += [np.ravel(end) for end in one.bounds(variable.shape, {})]
+        if len(ends) < 4 or (ends[0] < ends[2]).any() or (ends[1] > ends[3]).any():
+            return None
+        where = self.mechanisms.where[name]
+        return np.arange(where.start, where.stop), ends[0], ends[1] - ends[0]
 
     def reached(self, names: Iterable[str]) -> frozenset[str]:
         """Name the parameters and states that change at an instant with some targets."""
@@ -356,7 +375,7 @@ class CompiledTask(ActionVector):
         """Give a state to read into, or one with some numbers."""
         return self._start.copy() if vector is None else self._start.with_vector(vector)
 
-    def state_of(self, row: Row) -> State:
+    def state_of(self, row: Rows) -> State:
         """Return where everything is in a row, as a view of it."""
         return self._start.with_vector(row.numbers[: self.mechanisms.state_size])
 
@@ -379,7 +398,7 @@ class CompiledTask(ActionVector):
             function = self._coordinates[name] = variable.mechanism.bind()
         return np.asarray(function(*values))
 
-    def coordinates(self, name: str, row: Row) -> Value:
+    def coordinates(self, name: str, row: Rows) -> Value:
         """Return a parameter or a state of a row, also in other coordinates, or a bundle."""
         targets = self.model.targets(name)
         if targets == (name,):
@@ -395,6 +414,10 @@ class CompiledTask(ActionVector):
         for name, key in self.parameter_keys.items():
             parameters[key] = values[name]
         return Scene(structure, parameters, state, *self.composition.looks(values))
+
+    def scene(self, row: Rows) -> Scene:
+        """Describe the scene of a row."""
+        return self.describe(row, self.state_of(row))
 
 
 def _computed(model: SCM) -> tuple[str, ...]:
@@ -448,11 +471,21 @@ class StepBase:
 
     compiled: CompiledTask
     model: SCM
-    row: Row
+    row: Rows
     pending: PendingInterventions = field(default_factory=dict)
     drawn: Mapping[str, int] = field(default_factory=dict)
     at_start: bool = False
     fresh: frozenset[str] = frozenset()
+
+    @cached_property
+    def structure(self) -> Structure:
+        """What is compiled."""
+        return self.compiled.composition.structure(self.row)
+
+    @cached_property
+    def overlaps(self) -> tuple[Overlap, ...]:
+        """What lies in one another, however little."""
+        return self.compiled.composition.overlaps(self.compiled.scene(self.row), 0.0)
 
     def value(self, name: str) -> Value | None:
         """Return a parameter or a state, also in other coordinates; None for anything else."""
@@ -465,7 +498,7 @@ class StepBase:
         return self.row[name] if name in compiled.slices else compiled.coordinates(name, self.row)
 
 
-def beginning(compiled: CompiledTask, key: NoiseKey | None) -> Row:
+def beginning(compiled: CompiledTask, key: NoiseKey | None) -> Rows:
     """Compute where an episode begins without interventions.
 
     Args:
@@ -475,7 +508,7 @@ def beginning(compiled: CompiledTask, key: NoiseKey | None) -> Row:
     Returns:
         A row with everything that physics does not move, and the states.
     """
-    row = Row(compiled.mechanisms, compiled.mechanisms.start.copy())
+    row = Rows(compiled.mechanisms, compiled.mechanisms.start.copy())
     static = compiled.model.solve(only=compiled.static_names, key=key)
     for name in compiled.static_names:
         row[name] = static[name]
@@ -513,7 +546,7 @@ def refuse_impossible(compiled: CompiledTask) -> None:
                 check_bounds(variable, values[variable.name], values)
             except InterventionError as problem:
                 problems.append(str(problem).replace(f"do({variable.name}):", variable.name + " ="))
-    found = compiled.composition.overlaps(compiled.describe(values, compiled.state_of(values)))
+    found = compiled.composition.overlaps(compiled.scene(values))
     problems += map(str, found)
     if problems:
         advice = f"choose other arguments of the task {compiled.task.name!r}"

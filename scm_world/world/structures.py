@@ -28,7 +28,7 @@ from scm_world.world.compiled_task import (
     StepBase,
     refuse_impossible,
 )
-from scm_world.world.mechanisms import Row
+from scm_world.world.mechanisms import Rows
 
 KEPT = 8
 """Compiled tasks that are kept for structures that come again."""
@@ -233,7 +233,7 @@ def restructured(
         for v in model.variables
         if isinstance(v, Exogenous) and v.name in present.static and v.name not in held
     }
-    row = Row(compiled.mechanisms, compiled.mechanisms.start.copy())
+    row = Rows(compiled.mechanisms, compiled.mechanisms.start.copy())
     solved = model.solve(known, key=key, only=compiled.static_names)
     for name in compiled.static_names:
         row[name] = solved[name]
