@@ -211,7 +211,7 @@ class _Abduction:
         self._together = Layout(model).is_vectorised
         self._seen, self._rows, self._size = seen, seen.rows, seen.rows * self.n
         if self._size * seen.steps > MOST:
-            said = f"{seen.rows} units with {self.n} draws each of {seen.steps} instants are too many"
+            said = f"{seen.rows} units of {seen.steps} instants with {self.n} draws are too many"
             raise ModelError([f"{said}: give fewer rows at once, or a smaller n"])
         self._log_weights = np.zeros(self._size)
         self._ancestors = np.tile(np.arange(self.n), self._rows)
