@@ -33,12 +33,11 @@ from scm_world.queries.observations import Observations, observations, per
 from scm_world.queries.plans import Plan, at_once, numbered
 from scm_world.variables import (
     SOFT,
-    Action,
     Box,
     Categories,
     Draw,
     Exogenous,
-    Measured,
+    Fixed,
     Mechanism,
     Noise,
     Scale,
@@ -190,7 +189,7 @@ def counterfactuals(
     tolerance = real_number("tolerance", tolerance, least=0.0)
     seen = observations(model, observed)
     if n is None:
-        sure = _Abduction(model, seen, 1, seed, tolerance, certain=True)
+        sure = _Abduction(model, seen, None, seed, tolerance)
         answer = None if sure.sampled else sure.answer(do)
         if answer is not None and answer.exact:
             return answer
@@ -200,28 +199,22 @@ def counterfactuals(
 
 @final
 class _Abduction:
-    """The noise of observed units, in ``n`` draws each; with ``certain`` up to the first draw."""
+    """The noise of observed units, in ``n`` draws each; up to the first draw if None."""
 
     def __init__(
-        self,
-        model: SCM,
-        seen: Observations,
-        n: int,
-        seed: int,
-        tolerance: float,
-        *,
-        certain: bool = False,
+        self, model: SCM, seen: Observations, n: int | None, seed: int, tolerance: float
     ) -> None:
-        self.model, self.n, self._tolerance, self._certain = model, n, tolerance, certain
+        self._certain, self.n = n is None, n or 1
+        self.model, self._tolerance = model, tolerance
         own = np.random.SeedSequence((whole_number("seed", seed, least=0), 1))  # not that of data
         self._noise = Noise(int(own.generate_state(1)[0]))
         self._together = CompiledModel(model).is_vectorised
-        self._seen, self._rows, self._size = seen, seen.rows, seen.rows * n
+        self._seen, self._rows, self._size = seen, seen.rows, seen.rows * self.n
         if self._size * seen.steps > MOST:
-            said = f"{seen.rows} units with {n} draws each of {seen.steps} instants are too many"
+            said = f"{seen.rows} units of {seen.steps} instants with {self.n} draws are too many"
             raise ModelError([f"{said}: give fewer rows at once, or a smaller n"])
         self._log_weights = np.zeros(self._size)
-        self._ancestors = np.tile(np.arange(n), self._rows)
+        self._ancestors = np.tile(np.arange(self.n), self._rows)
         self.sampled = False
         self._given: list[dict[str, Value]] = []  # noise, and roots without intervention, by step
         self._values: list[dict[str, Value]] = []
@@ -240,7 +233,7 @@ class _Abduction:
             for name in order:
                 if name not in self._values[-1]:
                     self._find(model[name], step)
-                if certain and self.sampled:
+                if self._certain and self.sampled:
                     return
             self._before = model.remembered(self._values[-1], self._before)
             if step < seen.steps - 1:
@@ -401,24 +394,25 @@ class _Abduction:
     def answer(self, do: Mapping[str, Any]) -> Counterfactuals:
         """Solve the model again under an intervention, with the same noise."""
         models = self._models(do)
-        changes = [self._changed(model) for model in models]
+        was = self.model.act_on
+        changes = [{name for name in model if model.act_on(name) != was(name)} for model in models]
         follow = set[str]().union(*changes)
         follow |= {n for m in models for name in follow for n in m.descendants(name)}
         kept = {name: value for name, value in self._first.items() if name not in follow}
         before, found = self._start(models[0], kept), list[dict[str, Value]]()
         self.sampled |= self._draws_before(models[0], changes[0])
-        for step, was in enumerate(self._values):
+        for step, factual in enumerate(self._values):
             model, targets, values = models[step], changes[step], dict[str, Value]()
             for name in model.structure.order:
                 variable: Any = self.model[name]
                 moves = isinstance(variable, Exogenous) and variable.all_parents
                 if name not in follow or (name not in targets and _is_free(variable) and not moves):
-                    values[name] = was[name]
+                    values[name] = factual[name]
                     continue
                 if name in targets:
                     self._renew(model, name, values, step)
                 elif moves:
-                    self._given[step][name] = _moved(variable, was, values)
+                    self._given[step][name] = _moved(variable, factual, values)
                 values[name] = self._computed(model, name, values, before, step)
             found.append(values)
             before = model.remembered(values, before)
@@ -455,12 +449,6 @@ class _Abduction:
             }
             found.append(model.with_interventions(new) if new else model)
         return found
-
-    def _changed(self, model: SCM) -> set[str]:
-        """Return the variables on which is done something else than when they were observed."""
-        was, now = self.model.interventions, model.interventions
-        other = {name for name in {**was, **now} if was.get(name) != now.get(name)}
-        return {target for name in other for target in self.model.targets(name)}
 
     def _renew(self, model: SCM, name: str, values: Values, step: int) -> None:
         """Draw what an intervention draws anew: a value, another noise, or one that was cut off."""
@@ -575,6 +563,4 @@ def _source(variable: Any) -> Any:
 
 def _is_free(variable: Any) -> bool:
     """Return whether nothing but an observation says what a variable is."""
-    return isinstance(variable, Exogenous | Action) or (
-        isinstance(variable, Measured) and variable.mechanism is None
-    )
+    return not isinstance(variable, Fixed) and getattr(variable, "mechanism", None) is None

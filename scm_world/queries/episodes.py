@@ -226,7 +226,7 @@ class Episode:
         world, names = self.world, self.unit.names
         if world.version != self._version:
             self._version = world.version
-            now = world.current()[0] if world.static_names else {}
+            now = world.row if world.static_names else {}
             self.statics.append((step, {name: np.array(now[name]) for name in world.static_names}))
             if not self.declarations or self.declarations[-1][1].plan != world.compiled.plan:
                 self.declarations.append((step, world.compiled))

@@ -227,7 +227,7 @@ class Equations:
             ]
             self._models = tuple(models)
             self._changed()
-            return Audit({}, {}, {})
+            return Audit(lambda: ({}, {}, {}, (), (), ()))
         flat, drawn = flatten(request), dict(self._drawn)
         for name, act in flat.items():
             if isinstance(act, Draw) and act.stream is None and act.of is None:
@@ -246,7 +246,7 @@ class Equations:
             for name in self.model
             if name not in targets and not same(earlier[name], now[name])
         }
-        return Audit(targets, moved, {})
+        return Audit(lambda: (targets, moved, {}, (), (), ()))
 
     def step(self, action: ArrayLike) -> None:
         """Take a step.

@@ -103,16 +103,23 @@ def difference(
     """Return the mean difference of two samples, shape (n, ...), with its interval.
 
     The four results are the mean, the ends of the interval of Student's t (NaN where nothing
-    varies but by rounding), and the ratio of the variances unpaired : paired.
+    varies but by rounding), and the ratio of the variances unpaired : paired. Unpaired samples may
+    have different variances.
+
+    Source:
+        Welch, *The generalization of "Student's" problem when several different population
+        variances are involved*, Biometrika 1947, for the degrees of freedom.
     """
     from scipy.special import stdtrit
 
     n = len(treated)
-    apart = treated.var(axis=0, ddof=1) + control.var(axis=0, ddof=1)
+    first, second = treated.var(axis=0, ddof=1), control.var(axis=0, ddof=1)
+    apart = first + second
     together = (treated - control).var(axis=0, ddof=1)
     mean = treated.mean(axis=0) - control.mean(axis=0)
     spread = together if paired else apart
-    degrees = n - 1 if paired else 2 * n - 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        degrees = (n - 1) * (1.0 if paired else apart**2 / (first**2 + second**2))
     reach = stdtrit(degrees, 0.5 + 0.5 * CONFIDENCE) * np.sqrt(spread / n)
     rounding = 1e-14 * np.maximum(np.abs(treated).max(axis=0), np.abs(control).max(axis=0))
     reach = np.where(np.sqrt(spread) > rounding, reach, np.nan)

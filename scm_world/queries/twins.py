@@ -23,7 +23,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world._types import Floats, Integers
+from scm_world._types import Floats
 from scm_world.backends.base import EngineBatch
 from scm_world.errors import EngineFailure, UnknownOption, blamed
 from scm_world.graph import SCM
@@ -33,7 +33,8 @@ from scm_world.queries.equations import CompiledModel, Equations, System
 from scm_world.queries.plans import Plan
 from scm_world.work.processes import cores
 from scm_world.world import Simulation
-from scm_world.world.batch import Batch, StateTable
+from scm_world.world.batch import Batch
+from scm_world.world.mechanisms import Mechanisms, Rows
 from scm_world.world.structures import StructureCache
 
 R = TypeVar("R")
@@ -350,7 +351,7 @@ class _Together:
         n_actions = self._rows[0].world.compiled.n_actions
         self._commands = np.zeros((self._steps, len(batch), n_actions))
         self._numbers: list[list[Floats]] = [[] for _ in units]  # not in the episode yet
-        self._tables: dict[int, StateTable] = {}  # of the rows that have such numbers
+        self._mechanisms: dict[int, Mechanisms] = {}  # of the rows that have such numbers
         for row in range(len(units)):
             self._alone(row, self._first)
 
@@ -365,9 +366,8 @@ class _Together:
         """Record an instant of those rows that have not been recorded by themselves."""
         rows = np.flatnonzero(self._pending)
         for table, members in self._batch.tables(rows) if len(rows) else ():
-            numbers = table.matrix[members[:, None], _columns(table, self._names)]
-            for row, mine in zip(members.tolist(), numbers, strict=True):
-                self._tables[row] = table
+            for row, mine in zip(members.tolist(), table.numbers[members], strict=True):
+                self._mechanisms[row] = table.mechanisms
                 self._numbers[row].append(mine)
 
     def act(self, step: int) -> None:
@@ -407,26 +407,12 @@ class _Together:
         """Move the numbers of a row into its episode."""
         if not self._numbers[row]:
             return
-        table, episode = self._tables[row], self._rows[row]
-        numbers, self._numbers[row] = np.array(self._numbers[row]), []
-        width = table.state_size
-        episode.vectors.extend(numbers[:, :width].copy())
+        mechanisms, episode = self._mechanisms[row], self._rows[row]
+        rows, self._numbers[row] = Rows(mechanisms, np.array(self._numbers[row])), []
+        episode.vectors.extend(rows.numbers[:, : mechanisms.state_size].copy())
         for name in self._names:
-            if name in table.compiled.model:
-                shape = table.compiled.model.declared(name).shape
-                size = table.where[name].stop - table.where[name].start
-                found = numbers[:, width : width + size].reshape(-1, *shape)
-                width += size
-                values = episode.values[name]
-                cast = found.astype(values[-1].dtype)  # recorded by the world itself
-                values.extend(cast if np.array_equal(cast, found, equal_nan=True) else found)
-
-
-def _columns(table: StateTable, names: Sequence[str]) -> Integers:
-    """Return the columns of a table that are recorded: the state, and variables by name."""
-    places = [table.where[name] for name in names if name in table.compiled.model]
-    found: Integers = np.r_[slice(0, table.state_size), *places]
-    return found
+            if name in rows:
+                episode.values[name].extend(np.array(rows[name]))
 
 
 # --- what is sent to other processes --------------------------------------------------------------

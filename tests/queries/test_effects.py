@@ -48,6 +48,16 @@ def test_intervals_cover_the_truth() -> None:
     assert hits[0] / 400 > 0.98  # of pairs taken for strangers: too wide
 
 
+def test_an_arm_without_variance_does_not_lend_its_degrees_of_freedom() -> None:
+    """What is held at a value, compared with five units that vary: Student's t of four degrees."""
+    random, held = np.random.default_rng(0), np.ones(5)
+    hits = 0
+    for _ in range(2000):
+        _, low, high, _ = difference(random.normal(1.0, 2.0, 5), held, paired=False)
+        hits += low <= 0.0 <= high
+    assert 0.94 < hits / 2000 < 0.96
+
+
 @pytest.mark.parametrize("backend", ["mujoco", "bullet"])
 def test_more_friction_stops_a_block_sooner(backend: str) -> None:
     """The effect has its sign, the pairs need far fewer units, and both agree."""

@@ -635,7 +635,7 @@ def test_the_world_is_one_of_a_step_function() -> None:
 def test_equations_are_a_world() -> None:
     """They are reset, stepped, intervened on and asked; what is given leaves the first as it is."""
     model = equations()
-    with World.of(model) as world:
+    with World(model) as world:
         assert world.action_space.shape == (world.compiled.n_actions,)
         assert {*world.observation_space} == {*model}
         world.reset(seed=3)

@@ -179,7 +179,7 @@ class Kind:
     def system(self) -> Any:
         """Return a system of its own to reset, step and intervene on."""
         made = self.make()
-        return World.of(made) if isinstance(made, SCM) else made
+        return World(made) if isinstance(made, SCM) else made
 
 
 @cache
