@@ -62,7 +62,11 @@ def contact_terms(world: Simulation) -> dict[str, Any]:
         Plain data. ``"together"``: groups of bodies that are coupled in every step. ``"still"``:
         bodies that never move. ``"of"``: the bodies of each variable, one of each group.
     """
-    model, touched, shaped = world.model, world.composition.touched(), world.composition.shaped()
+    model, touched, shaped = (
+        world.model,
+        world.composition.touched(),
+        world.composition.shaped(),
+    )
     states = {v.name for v in model.variables if v.role == "state"}
     coupled, ahead, back = nx.Graph(), nx.DiGraph(), nx.DiGraph()  # until the next states
     coupled.add_nodes_from((name, "state") for name in states)
