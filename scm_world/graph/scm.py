@@ -413,7 +413,7 @@ class SCM:
     ) -> dict[str, Value]:
         """Compute every variable from the exogenous ones, shape ``(..., *shape)`` each.
 
-        Every value has the batch axes that lead in what is known, or in what the key draws.
+        Every value has the leading batch axes of the known values, or of the draws of the key.
 
         Args:
             known: Values of exogenous and measured variables and of actions; batch axes may lead.

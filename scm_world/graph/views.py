@@ -171,7 +171,7 @@ def d_separated(
     """Return whether ``given`` blocks every path between ``x`` and ``y``.
 
     In a model with lagged edges a plain name means the present slice and ``(name, -1)`` the one
-    before. What a common past connects, however long ago, is connected.
+    before. A common past connects two nodes, however long ago it was.
 
     Raises:
         UnknownVariable: A node is not in the model.
