@@ -124,9 +124,9 @@ for _task in (
         _model = _task == "model"
         gymnasium.register(
             id=_id,
-            entry_point=f"scm_world.env:{'model_env' if _model else 'ScmWorldEnv'}",
-            vector_entry_point=f"scm_world.env:{'model_vector_env' if _model else 'vector_env'}",
-            kwargs={} if _model else {"task": _task},
+            entry_point=f"scm_world.env:{'make_env' if _model else 'ScmWorldEnv'}",
+            vector_entry_point="scm_world.env:vector_env",
+            kwargs={"task": None if _model else _task},  # a model takes its place
             order_enforce=False,  # it refuses steps before a reset itself
             disable_env_checker=True,  # tests check it; wrappers would hide compute_reward
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 SHOWN = 8
@@ -230,14 +231,27 @@ class Infeasible(InterventionError):
 
     Attributes:
         problems: One sentence for each pair of bodies that would overlap.
-        nearest: The nearest value that is feasible, where one was found.
+        nearest: The nearest value that is feasible, where one was found; it is searched for when
+            it, or the message, is first read.
     """
 
     def __init__(self, name: str, value: Any, problems: Sequence[str], nearest: Any = None) -> None:
-        hint = f"; the nearest feasible value is {nearest!r}" if nearest is not None else ""
-        message = f"do({name}): {value!r} is not feasible: {'; '.join(problems)}{hint}"
-        data = {"problems": tuple(problems), "nearest": nearest}
-        super().__init__(message, variable=name, value=value, **data)
+        message = f"do({name}): {value!r} is not feasible: {'; '.join(problems)}"
+        super().__init__(message, variable=name, value=value, problems=tuple(problems))
+        self._search = nearest if callable(nearest) else lambda: nearest
+
+    @cached_property
+    def nearest(self) -> Any:
+        """The nearest value that is feasible, or None."""
+        return self._search()
+
+    def __str__(self) -> str:
+        hint = f"; the nearest feasible value is {self.nearest!r}"
+        return super().__str__() + (hint if self.nearest is not None else "")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        data = {**vars(self), "nearest": self.nearest}
+        return _rebuild, (type(self), *self.args, {n: data[n] for n in data if n != "_search"})
 
 
 class SeveralProblems(InterventionError):

@@ -23,7 +23,7 @@ from scm_world.errors import (
     UnknownVariable,
     raise_all,
 )
-from scm_world.graph.acceptance import accepted, adds_edges, settable_causes
+from scm_world.graph.acceptance import accepted, settable_causes
 from scm_world.graph.evaluate import AppliedIntervention, Evaluator, NoiseKey, earlier, source_of
 from scm_world.graph.structure import Edge, EdgeIndex, checked
 from scm_world.variables import (
@@ -347,18 +347,17 @@ class SCM:
             if replaced is not None:
                 asked = replaced.requested
                 model._interventions.pop(target if asked.parts else asked.name, None)
-            if isinstance(intervention, Natural):
+            if type(intervention) is Natural:
                 continue
-            drawn = isinstance(intervention, Draw | Mechanism)
-            requested = self._declared[whole_of(intervention, name) if drawn else name]
+            requested = self._declared[whole_of(intervention, name)]
             model._acts[target] = AppliedIntervention(intervention, requested)
             model._interventions[name] = intervention
         model._structure = None if acts else self._structure
         # Cutting edges keeps every causal order valid.
-        adds = any(
-            isinstance(act.intervention, Draw | Mechanism) and adds_edges(act)
-            for act in model._acts.values()
-        )
+        adds = False
+        for held in model._acts.values():
+            kind = type(held.intervention)
+            adds |= kind is Mechanism or (kind is Draw and bool(source_of(held).parents()))
         model._order = model.structure.order if adds else self._order
         return model
 
@@ -388,7 +387,7 @@ class SCM:
             settable = (n for n, v in self._declared.items() if v.settable or any_variable)
             raise UnknownVariable(name, settable)
         target = self._declared[self.targets(name)[0]]
-        whole = whole_of(value, name) if isinstance(value, Frozen) else name
+        whole = whole_of(value, name)
         if whole != name and name not in self.declared(whole).parts:
             raise InterventionError(
                 f"do({name}): it is not a part of the bundle {whole!r}", variable=name, value=value
@@ -396,7 +395,7 @@ class SCM:
         if not any_variable and not target.settable:
             reason = "is a constant" if isinstance(target, Fixed) else "is measured, not set"
             raise NotIntervenable(name, reason, settable_causes(self._declared, target.name))
-        if not (isinstance(value, Draw) and isinstance(value.source, str)):
+        if type(value) is not Draw or not isinstance(value.source, str):
             return accepted(self._declared, self._declared[whole], value)
         if (whole, value.source) not in self._drawable:
             accepted(self._declared, self._declared[whole], value)

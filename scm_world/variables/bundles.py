@@ -107,4 +107,4 @@ def divided(variable: Variable, act: Intervention) -> dict[str, Intervention]:
 
 def whole_of(act: Any, name: str) -> str:
     """Name the bundle that an intervention is a part of; the variable itself if there is none."""
-    return (isinstance(act, Draw | Mechanism) and vars(act).get("of")) or name
+    return (type(act) in (Draw, Mechanism) and act.of) or name

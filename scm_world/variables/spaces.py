@@ -277,7 +277,8 @@ class Box(Set):
     def contains(self, value: Value, values: Values | None = None) -> bool:
         if self._constant is not None and np.ndim(value) < 2:
             low, high = self._constant
-            return bool((value >= low).all() and (value <= high).all())
+            inside = (value >= low) & (value <= high)
+            return bool(inside.all() if inside.ndim else inside)
         low, high = _widened(*self.bounds(np.shape(value), values or {}))
         return bool(np.all(value >= low) and np.all(value <= high))
 
