@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.errors import FunctionFailure, ModelError, ScmWorldError, WrongValue
+from scm_world.errors import FunctionFailure, ModelError, ScmWorldError, WrongValue, in_one_line
 from scm_world.variables import (
     SOFT,
     Categories,
@@ -118,7 +118,7 @@ def source_of(act: AppliedIntervention) -> Distribution:
     space = act.requested.space(draw.source) if named else draw.source
     if space is None:
         raise ModelError([f"{act.requested.name!r} has no space {draw.source}"])
-    return space  # type: ignore[no-any-return]
+    return space
 
 
 def noise_of(
@@ -299,13 +299,12 @@ class Evaluator:
         except ScmWorldError:
             raise
         except Exception as error:
-            raise FunctionFailure.of(f"the function of {variable.name!r}", error) from error
+            problem = f"the function of {variable.name!r} raised {in_one_line(error)}"
+            raise FunctionFailure(problem) from error
         if own is None:
             return value
-        if (
-            value.dtype.kind not in "biuf"
-            or value.shape[value.ndim - len(own.shape) :] != own.shape
-        ):
+        shape = value.shape[value.ndim - len(own.shape) :]
+        if value.dtype.kind not in "biuf" or shape != own.shape:
             wanted = f"numbers of shape {own.shape}" if own.shape else "a number"
             raise FunctionFailure(f"the function of {own.name!r} gives {value!r}, not {wanted}")
         _check_kind(own, value)
