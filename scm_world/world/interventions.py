@@ -10,7 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._types import Floats, Value
+from scm_world._types import Value
 from scm_world.errors import (
     ConflictingTargets,
     Infeasible,
@@ -192,19 +192,20 @@ class Transaction:
     def _mutilate(self, acts: PendingInterventions) -> None:
         """Mutilate the model, and order the descendants of the targets."""
         compiled = self.compiled
-        moving = self._moving(acts)
-        held = (*self.base.model.interventions.values(), *(act for _, act in acts.values()))
-        adds = any(type(act) is Mechanism for act in held)
+        held = (*self.base.model.interventions.values(), *[act for _, act in acts.values()])
+        adds = Mechanism in map(type, held)
+        moving = self._moving(acts) if adds else {}
         # Where nothing follows others than before, draws from boxes can wait for their values.
-        later = () if adds else self._boxes[0]
+        draws = [t for t, (_, act) in acts.items() if type(act) is Draw]
+        later = self._boxes[0] if draws and not adds else ()
         kept = dict([acts[t] for t in acts if t not in moving and t not in later])
         self.model, cycles = self.base.model.without_cycles(kept)
         self.problems += [*{p.variable: p for p in moving.values()}.values(), *cycles]
         self._impossible = {*moving, *chain(*(problem.cycle for problem in cycles))}
         static, out = compiled.static, self._impossible
         self._targets = tuple([t for t in acts if t in static and t not in out])
-        self._draws = [t for t in self._targets if type(acts[t][1]) is Draw]
-        others = (t for t in self._draws if t not in self._boxes[0])
+        self._draws = [target for target in draws if target in self._targets]
+        others = [t for t in self._draws if t not in self._boxes[0]]
         if adds or any(self._source(*acts[t]).parents() for t in others):
             structure = self.model.structure
             follow = {*self._targets, *structure.instant_descendants(self._targets)}
@@ -261,7 +262,10 @@ class Transaction:
             key: Where to draw.
         """
         drawn, groups = self._boxes if self._draws else ((), ())
-        self._begin(key, self.base.row.numbers.copy())
+        self._key, numbers = key, self.base.row.numbers.copy()
+        self.row = Rows(self.compiled.mechanisms, numbers, self._targets)
+        self._wrong, self._impossible = [*self.problems], {*self._whatever}
+        self._whole: dict[str, Value] = {}  # what bundles are to be
         for names, asked, columns, low, edges in groups:
             streams = (key.stream(*one, key.attempt) for one in zip(names, asked, strict=True))
             self.row.numbers[columns] = low + edges * uniforms(key, streams, columns.shape[1])
@@ -274,11 +278,6 @@ class Transaction:
         if self.space is not None:
             self._check_space(self.space)
         return self._as_asked() if self._wrong else []
-
-    def _begin(self, key: NoiseKey, numbers: Floats) -> None:
-        self._key, self.row = key, Rows(self.compiled.mechanisms, numbers, self._targets)
-        self._wrong, self._impossible = [*self.problems], {*self._whatever}
-        self._whole: dict[str, Value] = {}  # what bundles are to be
 
     def _compute(self, name: str) -> None:
         """Compute a parameter, whose parents have been."""
@@ -584,11 +583,12 @@ def difference(
         if structure is not now.structure:
             scene = compiled.scene(then)
             return Difference(structure, scene.parameters, scene.state)
-    keys, state = compiled.parameter_keys, compiled.state_of(then)
+    keys, size = compiled.parameter_keys, compiled.mechanisms.state_size
     parameters = {keys[name]: then[name] for name in changed if name in keys}
-    moves = now.row.numbers[: len(state.vector)] != state.vector
-    moved = state if (moves & state.layout.can_be_set).any() else None
-    return Difference(None, parameters, moved) if parameters or moved is not None else None
+    moves = now.row.numbers[:size] != then.numbers[:size]
+    moved = (moves & compiled.composition.system.layout.can_be_set).any()
+    state = compiled.state_of(then) if moved else None
+    return Difference(None, parameters, state) if parameters or moved else None
 
 
 def overlaps(
@@ -662,7 +662,9 @@ def feasible(
         end = min(first + CHUNK, ATTEMPTS) if deciding else ATTEMPTS
         attempts = range(first, end if again else first + 1)
         for attempt in done.promising(key, attempts, again) if again else attempts:
-            raise_all(done.solve(replace(key, attempt=attempt) if attempt else key))
+            wrong = done.solve(replace(key, attempt=attempt) if attempt else key)
+            if wrong:
+                raise_all(wrong)
             problems = done.compare(now)
             composition = done.compiled.composition
             if draws and not problems and composition.hides_goals:
