@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -71,9 +70,6 @@ def evaluate(
         raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")
     one_of("metric", metric, (None, *METRICS))
     one_of("format", format_, CODECS)
-    if format_ == "parquet" and find_spec("pyarrow") is None:
-        allowed = ("csv", "parquet after: pip install 'scm-world[data]'")
-        raise UnknownOption("format", "parquet", allowed)
     agents = policies_of(policy)
     task = task or task_of(agents)
     made = load_task(task, option)

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from scm_world._arguments import load as load_library
 from scm_world._arguments import one_of
 from scm_world.errors import DAMAGED, UnreadableFile
 from scm_world.evaluation.results import KEYS, TEXTS, WHOLE, Columns, Evaluation
@@ -102,8 +101,9 @@ def _said(error: Exception) -> str:
 
 
 def _to_parquet(columns: Columns) -> bytes:
-    arrow = load_library("pyarrow", "pyarrow", "data")
-    parquet = load_library("pyarrow.parquet", "pyarrow", "data")
+    import pyarrow as arrow
+    from pyarrow import parquet
+
     table = arrow.table({n: arrow.array(c, from_pandas=False) for n, c in columns.items()})
     sink = arrow.BufferOutputStream()
     parquet.write_table(table, sink, compression="zstd", use_dictionary=list(TEXTS))
