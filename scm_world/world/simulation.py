@@ -46,7 +46,7 @@ from scm_world.world.interventions import Transaction, difference, feasible, ove
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.snapshot import WorldSnapshot
-from scm_world.world.structures import StructureCache, as_structures, as_task
+from scm_world.world.structures import StructureCache, as_task
 
 READ_BACK = 1e-6  # how far a backend may report a number from what it was given
 
@@ -119,7 +119,10 @@ class Simulation:
             max_episode_length=max_episode_length,
             conventions_name=conventions,
         )
-        self.structures = as_structures(shared or kind, self.options)
+        if shared is not None and shared.options != self.options:
+            name, allowed = "options of a world with these structures", (str(shared.options),)
+            raise UnknownOption(name, self.options, allowed)
+        self.structures = shared or StructureCache(kind, self.options)
         self._checked = self._closed = False
         self.version = 0  # counts changes of anything but what physics moves
         self._origin: EngineSnapshot | None = None
@@ -140,7 +143,7 @@ class Simulation:
         compiled = self.structures.natural(None)
         self._hold(compiled, beginning(compiled, None))
         self._adopt_model(compiled.model)
-        self._adopt_structure(compiled.structure(self.row))
+        self._adopt_structure(compiled.composition.structure(self.row))
         self.version += 1
 
     def _hold(self, compiled: CompiledTask, row: Rows) -> None:
@@ -667,7 +670,7 @@ class Simulation:
         self.row.take(row)
         self._adopt_model(model)
         if changed or anew:
-            self._adopt_structure(compiled.structure(row) if structure is None else structure)
+            self._adopt_structure(structure or compiled.composition.structure(row))
         self.version += 1
         if moved:
             self.backend.read(self.state)
