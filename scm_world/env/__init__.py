@@ -2,7 +2,7 @@
 
 import gymnasium
 
-from scm_world.env.environment import ScmWorldEnv
+from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.env.many import ScmWorldVectorEnv
 from scm_world.env.models import MODEL_ID, make_env, vector_env
 from scm_world.env.observer import CONTEXTS, MODES, Observation
@@ -17,6 +17,7 @@ IDS = {
 
 __all__ = [
     "CONTEXTS",
+    "ENV_OPTIONS",
     "IDS",
     "MODEL_ID",
     "MODES",

@@ -68,7 +68,6 @@ class Delta:
         if self.reads not in (None, TIPS, JOINTS):
             allowed = f"{COMMAND!r}, or action_mode={PREFIX + JOINTS!r}"
             raise UnknownOption(f"delta_origin of {PREFIX}{mode}", origin, (allowed,))
-        self._version = self._fresh = -1
 
     def moved(self, action: Floats, offset: Floats) -> Floats:
         """Add what actions are relative to, shape (..., n) [SI units]; clip to the range."""
@@ -95,11 +94,8 @@ class Delta:
 
     def is_set(self) -> bool:
         """Return whether nothing was commanded since the joints were put where they are."""
-        world = self._world
-        if world.version != self._version:
-            self._version = world.version
-            base = world.base
-            joints = world.model.targets("joint_positions")
-            set_now = base and (base.at_start or any(j in base.pending for j in joints))
-            self._fresh = world.index if set_now else -1
-        return self._fresh == world.index
+        base = self._world.base
+        if base is None:  # a step was taken since
+            return False
+        joints = self._world.model.targets("joint_positions")
+        return base.at_start or any(joint in base.pending for joint in joints)

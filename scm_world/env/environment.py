@@ -123,7 +123,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             vector always has the places of these bodies then, with zeros where one is missing.
         cameras: Names (``"60"``, ``"120"``, ``"300"``, ``"overview"``) or cameras, for
             ``"pixel"``; the three of the robot if None.
-        image_size: Height and width of pictures, or both in one [pixels].
+        image_size: Height and width of pictures, or both in one [pixels]; 128 if None.
         normalize_observations: Give numbers in [-1, 1] instead of SI units.
         goal_env: Give a dictionary with ``observation``, ``achieved_goal``, ``desired_goal``, as
             ``compute_reward`` takes them.
@@ -199,8 +199,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         **unknown: Any,
     ) -> None:
         for name in unknown:
-            raise UnknownOption("option of the environment", name, OPTIONS)
-        options = {name: value for name, value in locals().items() if name in OPTIONS}
+            raise UnknownOption("option of the environment", name, ENV_OPTIONS)
+        options = {name: value for name, value in locals().items() if name in ENV_OPTIONS}
         self._how = Observing(**{name: options[name] for name in Observing.__dataclass_fields__})
         made = task if isinstance(task, StructureCache) else as_task(task, task_options or {})
         kind = made.task if isinstance(made, StructureCache) else made
@@ -658,5 +658,5 @@ def _truths(values: Value) -> NDArray[np.bool_]:
     return found
 
 
-OPTIONS = tuple(inspect.signature(ScmWorldEnv).parameters)[:-1]
+ENV_OPTIONS = tuple(inspect.signature(ScmWorldEnv).parameters)[:-1]
 """Names of the options of an environment."""

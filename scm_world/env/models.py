@@ -8,7 +8,7 @@ from inspect import signature
 from typing import Any
 
 from scm_world._arguments import whole_number
-from scm_world.env.environment import OPTIONS, ScmWorldEnv
+from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.env.many import ScmWorldVectorEnv
 from scm_world.env.native import NativeVectorEnv
 from scm_world.env.processes import ProcessVectorEnv
@@ -110,8 +110,8 @@ def _of_env(model: Any, options: Mapping[str, Any], others: tuple[str, ...] = ()
         own.remove("observe")
     found = {name: value for name, value in options.items() if name not in own}
     for name in found:
-        if name not in OPTIONS:
-            raise UnknownOption("option of the environment", name, (*own, *OPTIONS, *others))
+        if name not in ENV_OPTIONS:
+            raise UnknownOption("option of the environment", name, (*own, *ENV_OPTIONS, *others))
     if model is None:
         return found
     of_task = {name: options[name] for name in own if name in options}

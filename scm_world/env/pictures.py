@@ -106,8 +106,7 @@ class Pixels:
         world: That is observed.
         cameras: Cameras or names. None: of the robot's tasks those of policies, of a model
             ``"automatic"``.
-        size: Height and width of the pictures, or both in one [pixels]; if None those of cameras
-            that are given, and 128 of others.
+        size: Height and width of the pictures, or both in one [pixels]; 128 if None.
 
     Attributes:
         names: The variables that have to be computed: none.
@@ -125,29 +124,21 @@ class Pixels:
     ) -> None:
         views, self._published = views_of(world.structure), world.options.conventions.published
         self._world, self._cameras = world, Cameras(world)
-        self._shows_goals = views is not None
-        given: Sequence[Any] = (AUTOMATIC,) if cameras is None else cameras
-        if views is not None:
-            own = views.original_cameras if self._published else views.cameras
-            given = [camera.name for camera in own] if cameras is None else cameras
+        self._size = height_and_width("image_size", size) or (Camera.height, Camera.width)
+        own = () if views is None else views.cameras
+        if views is not None and self._published:
+            own = views.original_cameras
+        given = [camera.name for camera in own] or [AUTOMATIC] if cameras is None else cameras
         if isinstance(given, str) or not len(given):
             raise UnknownOption("list of cameras", cameras, ("one or more names or cameras",))
-        given = [read_camera(camera) for camera in given]
-        if views is not None and self._published:  # these do not follow their variables
-            known = {camera.name: camera for camera in own}
-            given = [known.get(camera, camera) for camera in given]
-        usual = (Camera.height, Camera.width)
-        sizes = height_and_width("image_size", size)
-        self._given = [
-            (one, sizes or (None if isinstance(one, Camera) else usual)) for one in given
-        ]
+        fixed = {camera.name: camera for camera in own if self._published}
+        read = [read_camera(camera) for camera in given]
+        self._given = [fixed.get(camera, camera) for camera in read]
         scene = world.structure.default_scene()
-        found = [scene_camera(scene, *one) for one in self._given]
-        if len({(camera.height, camera.width) for camera in found}) > 1:
-            raise UnknownOption("image_size", size, ("one size for all cameras",))
-        self._placed = found
+        self._placed = [scene_camera(scene, camera, self._size) for camera in self._given]
         self.layouts: Layouts = {}
-        one, n = shape_of_pixels(found[0], published=self._published), len(given)
+        one, n = shape_of_pixels(self._placed[0], published=self._published), len(given)
+        self._shows_goals = views is not None
         self._goals: NDArray[np.uint8] = np.empty((n, *one), dtype=np.uint8)
         self._shape = (2 * n if self._shows_goals else n, *one)
         self.space: gymnasium.Space[NDArray[np.uint8]] = gymnasium.spaces.Box(
@@ -162,7 +153,7 @@ class Pixels:
         pictures: NDArray[np.uint8] = np.empty(self._shape, dtype=np.uint8)
         if self._version != self._world.version or not self._shows_goals:
             self._version = self._world.version
-            self._placed = [self._cameras.now(scene, *one) for one in self._given]
+            self._placed = [self._cameras.now(scene, one, self._size) for one in self._given]
             if self._shows_goals:
                 camera_pixels(scene, self._placed, self._goals, goals=True, published=published)
         camera_pixels(scene, self._placed, pictures[:n], published=published)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, final
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from scm_world._arguments import one_of, whole_number
 from scm_world._fingerprint import differing, fingerprint
 from scm_world._types import Floats
-from scm_world.env import ScmWorldEnv
+from scm_world.env import ENV_OPTIONS, ScmWorldEnv
 from scm_world.env.arguments import doubles
 from scm_world.env.observer import Observation
 from scm_world.env.wrappers import unwrapped_env
@@ -151,7 +150,7 @@ class Recording:
             refuse_untrusted(_name(self.environment), self.trusted)
         kept = {name: v for name, v in self.environment.items() if name not in _GONE}
         arguments = {**kept, **_UNUSED}
-        unknown = arguments.keys() - inspect.signature(ScmWorldEnv.__init__).parameters.keys()
+        unknown = arguments.keys() - {*ENV_OPTIONS}
         if unknown:
             raise SnapshotMismatch(
                 "the recording is one of another version: environments have no option "

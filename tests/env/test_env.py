@@ -16,7 +16,6 @@ from gymnasium.utils.env_checker import check_env
 from scm_world.env import IDS, ScmWorldEnv
 from scm_world.errors import ActionError, InterventionError, UnknownOption
 from scm_world.tasks import TASKS
-from scm_world.tasks.trifinger.cameras import OVERVIEW
 
 
 def test_there_is_an_environment_for_every_task() -> None:
@@ -253,7 +252,6 @@ def test_observation_follows_an_intervention() -> None:
         ({"observation_mode": "pixel", "keypoints": True}, UnknownOption),
         ({"observation_mode": "pixel", "cameras": ["61"]}, UnknownOption),
         ({"observation_mode": "pixel", "cameras": []}, UnknownOption),
-        ({"observation_mode": "pixel", "cameras": ["60", OVERVIEW]}, UnknownOption),
         ({"observation_mode": "pixel", "image_size": 0}, UnknownOption),
         ({"cameras": ["60"]}, UnknownOption),
         ({"context": "visible"}, UnknownOption),
