@@ -15,7 +15,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of, whole_number
-from scm_world._types import Floats, Value, Values
+from scm_world._types import Floats, Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
 from scm_world.env.arguments import (
     RESETS,
@@ -278,7 +278,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._version = -1
         self._done: list[tuple[int, dict[str, Any]]] = []
         self._observers: WeakKeyDictionary[
-            CompiledTask, tuple[Observer, Goals | None, frozenset[str], tuple[str, ...]]
+            CompiledTask, tuple[Observer, Goals | None, dict[str, int], tuple[str, ...]]
         ] = WeakKeyDictionary()
         self._largest = None
         if pad is not None:
@@ -348,13 +348,15 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             goals = Goals(declaration) if declaration.task.goal.achieved else None
             largest = self._largest or declaration
             made = observer(self.world, declaration, self._how, goals, largest)
-            counted = [n for n in (FRACTION, SUCCESS, TERMINATED) if n in declaration.model]
+            where = declaration.mechanisms.where
+            told = (*self._terms, FRACTION, SUCCESS, TERMINATED)
+            columns = {name: where[name].start for name in told if name in where}
             wanted = () if goals is None else goals.names
-            needed = (*made.names, *wanted, *self._terms, *counted, REWARD)
-            found = made, goals, frozenset(counted), tuple(dict.fromkeys(needed))
+            needed = (*made.names, *wanted, *columns, REWARD)
+            found = made, goals, columns, tuple(dict.fromkeys(needed))
             self._observers[declaration] = found
         self._declaration = declaration
-        self._observer, self._goals, self._counted, self._needed = found
+        self._observer, self._goals, self._columns, self._needed = found
         self.observation_space = self._observer.space
 
     @property
@@ -445,7 +447,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self.world.advance(self.command(action))
         now = self._look()
         reward = self._scale * one_number(now, REWARD, self._terms)
-        terminated = TERMINATED in self._counted and bool(now[TERMINATED])
+        terminated = TERMINATED in self._columns and bool(now[TERMINATED])
         truncated = self.world.index >= self.limit
         info = self._info(now)
         if self.world.is_planned and not (terminated or truncated) and self.act():
@@ -526,15 +528,20 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _info(self, now: Rows) -> dict[str, Any]:
         """Return the info of one world, or of several as columns."""
-        truth, number = (bool, float) if now.numbers.ndim == 1 else (_truths, np.asarray)
+        numbers, columns = now.numbers, self._columns.items()
+        found: dict[str, Any]
+        if numbers.ndim == 1:
+            found = {name: numbers.item(column) for name, column in columns}
+        else:
+            found = {name: numbers[:, column] for name, column in columns}
         info: dict[str, Any] = {}
-        if SUCCESS in self._counted:
-            info["is_success"] = info["success"] = truth(now[SUCCESS])
-        if FRACTION in self._counted:
-            info["fractional_success"] = number(now[FRACTION])
+        if SUCCESS in found:
+            info["is_success"] = info["success"] = found[SUCCESS] != 0.0
+        if FRACTION in found:
+            info["fractional_success"] = found[FRACTION]
         if self._goals is not None:
             info["achieved_goal"], info["desired_goal"] = self._goals.read(now)
-        info["reward_terms"] = {name: number(now[name]) for name in self._terms}
+        info["reward_terms"] = {name: found[name] for name in self._terms}
         return info
 
     @property
@@ -542,8 +549,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """The shape of each entry of ``info``, without ``reward_terms``, which is a dictionary."""
         goals = () if self._goals is None else self._goals.spaces.items()
         return {
-            **({"is_success": (), "success": ()} if SUCCESS in self._counted else {}),
-            **({"fractional_success": ()} if FRACTION in self._counted else {}),
+            **({"is_success": (), "success": ()} if SUCCESS in self._columns else {}),
+            **({"fractional_success": ()} if FRACTION in self._columns else {}),
             **{name: space.shape or () for name, space in goals},
         }
 
@@ -651,11 +658,6 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         if self._viewer is not None:
             self._viewer.close()
         self.world.close()
-
-
-def _truths(values: Value) -> NDArray[np.bool_]:
-    found: NDArray[np.bool_] = values != 0
-    return found
 
 
 ENV_OPTIONS = tuple(inspect.signature(ScmWorldEnv).parameters)[:-1]

@@ -68,8 +68,10 @@ class Goals:
 
     def read(self, now: Rows) -> tuple[Floats, Floats]:
         """Return what is achieved and what is desired, of one world or of several."""
-        achieved, desired = self._sides
-        return now.numbers.take(achieved, axis=-1), now.numbers.take(desired, axis=-1)
+        numbers, (achieved, desired) = now.numbers, self._sides
+        if numbers.ndim == 1:
+            return numbers.take(achieved), numbers.take(desired)
+        return numbers[:, achieved], numbers[:, desired]
 
     def observe(self, now: Rows) -> dict[str, Floats]:
         """Return both vectors, by name."""
