@@ -148,13 +148,7 @@ class NativeVectorEnv(ScmWorldVectorEnv):
                 self._intervene(row)
 
     def _take(self, lead: ScmWorldEnv, now: Rows, rows: Integers) -> None:
-        """Write what a step led to in environments of one structure.
-
-        Args:
-            lead: One of them.
-            now: Their values.
-            rows: Which ones they are, shape (m,).
-        """
+        """Write what a step led to in environments of one structure; ``lead`` is one of them."""
         rewards = lead._scale * now[REWARD]
         for row in rows[~np.isfinite(rewards)].tolist():
             self._explain(row)

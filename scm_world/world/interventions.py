@@ -46,7 +46,7 @@ from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import CompiledTask, PendingInterventions, StepBase
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import uniforms
-from scm_world.world.structures import StructureCache, restructured, wrong_structure
+from scm_world.world.structures import StructureCache, restructured
 
 ATTEMPTS = 1000
 """How often is drawn; one in sixty draws of the joints from A leaves all fingers apart."""
@@ -121,9 +121,8 @@ class Transaction:
         self.request, self.space, self._deciding = request, space, structures.deciding
         asked = (*base.pending.values(), *request.items())
         if any(type(act) is Null or name in structures.deciding for name, act in asked):
-            wrong = wrong_structure(structures, base, request)
+            base, wrong = restructured(structures, base, request, key)
             request = {name: act for name, act in request.items() if name not in wrong}
-            base = restructured(structures, base, request, key)
             self.problems += wrong.values()
         self.base, self.compiled, self.model = base, base.compiled, base.model
         self.pending = {**base.pending, **self._accepted(request)}
@@ -320,8 +319,7 @@ class Transaction:
             if target not in followed:
                 self._set_state(target)
         moved = {*self._order, *self._states}
-        for variable in self.compiled.carried:
-            name = variable.name
+        for name in self.compiled.carried:
             if name in moved or name in fresh or not moved.isdisjoint(followed[name]):
                 self._set_state(name)
                 moved.add(name)
@@ -351,7 +349,7 @@ class Transaction:
 
     def _carry(self, name: str) -> None:
         """Move a state with the parents that act on it when set (a block that grows)."""
-        variable, base = self.compiled.carried_by_name[name], self.base
+        variable, base = self.compiled.carried[name], self.base
         parents, fresh = self.compiled.set_parents[name], name in base.fresh
         moved = [p for p in parents if not same(base.row[p], self.row[p])]
         if not (moved or fresh):
@@ -490,7 +488,8 @@ class Transaction:
 
     def redraws(self, name: str) -> bool:
         """Return whether a draw takes part in where bodies are; what is wrong is drawn once."""
-        return not self.problems and self.compiled.is_material(name)
+        compiled = self.compiled
+        return not (self.problems or compiled.material.isdisjoint(compiled.reached((name,))))
 
     def anyhow(self, draws: Iterable[str], problems: Iterable[Overlap]) -> bool:
         """Return whether bodies overlap that follow no draw, although they could be moved."""
@@ -503,7 +502,8 @@ class Transaction:
         bodies = {body for overlap in problems for body in overlap.bodies}
 
         def blame(name: str) -> tuple[bool, bool]:
-            moved = self.compiled.surfaces((name,)) if name in self.compiled.model else ()
+            known = name in self.compiled.model
+            moved = self.compiled.surfaces & self.compiled.reached((name,)) if known else ()
             return bool({part.partition(".")[0] for part in moved} & bodies), bool(moved)
 
         return max(self.request, key=blame)
@@ -605,11 +605,11 @@ def difference(
         if structure is not now.structure:
             scene = compiled.scene(then)
             return Difference(structure, scene.parameters, scene.state)
-    keys, size = compiled.parameter_keys, compiled.mechanisms.state_size
+    keys, state = compiled.parameter_keys, compiled.state_of(then)
     parameters = {keys[name]: then[name] for name in changed if name in keys}
-    moves = (now.row.numbers[:size] != then.numbers[:size]) & compiled.can_be_set
-    state = compiled.state_of(then) if moves.any() else None
-    return Difference(None, parameters, state) if parameters or state is not None else None
+    moves = now.row.numbers[: len(state.vector)] != state.vector
+    moved = state if (moves & state.layout.can_be_set).any() else None
+    return Difference(None, parameters, moved) if parameters or moved is not None else None
 
 
 def overlaps(

@@ -312,15 +312,7 @@ class _Compiled:
 
 @final
 class _Python:
-    """A function of Python, called for one row after another.
-
-    Args:
-        mechanisms: Of the structure.
-        name: Of the variable.
-        variable: The variable.
-        parents: What it is given.
-        columns: Of the parents.
-    """
+    """A function of Python, called for one row after another."""
 
     def __init__(
         self,
@@ -338,12 +330,7 @@ class _Python:
         self._arguments = partial(mechanisms.arguments, parents=parents, columns=columns)
 
     def __call__(self, row: Floats) -> None:
-        """Compute, into a row.
-
-        Raises:
-            FunctionFailure: The function raised an error or, if it is a user's, gave something
-                else than finite numbers of the declared shape; or numba cannot compile it.
-        """
+        """Compute, into a row; what a function of a user gives is checked."""
         try:
             value = self._function(*self._arguments(row))
         except ScmWorldError:

@@ -46,7 +46,7 @@ from scm_world.world.interventions import Transaction, difference, feasible, ove
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.snapshot import WorldSnapshot
-from scm_world.world.structures import StructureCache, as_structures, as_task
+from scm_world.world.structures import StructureCache, as_task
 
 READ_BACK = 1e-6  # how far a backend may report a number from what it was given
 
@@ -119,7 +119,10 @@ class Simulation:
             max_episode_length=max_episode_length,
             conventions_name=conventions,
         )
-        self.structures = as_structures(shared or kind, self.options)
+        if shared is not None and shared.options != self.options:
+            name, allowed = "options of a world with these structures", (str(shared.options),)
+            raise UnknownOption(name, self.options, allowed)
+        self.structures = shared or StructureCache(kind, self.options)
         self._checked = self._closed = False
         self.version = 0  # counts changes of anything but what physics moves
         self._origin: EngineSnapshot | None = None
@@ -140,7 +143,7 @@ class Simulation:
         compiled = self.structures.natural(None)
         self._hold(compiled, beginning(compiled, None))
         self._adopt_model(compiled.model)
-        self._adopt_structure(compiled.structure(self.row))
+        self._adopt_structure(compiled.composition.structure(self.row))
         self.version += 1
 
     def _hold(self, compiled: CompiledTask, row: Rows) -> None:
@@ -511,11 +514,7 @@ class Simulation:
     def _anew(
         self, request: Mapping[str, Any], base: StepBase
     ) -> tuple[dict[str, Any], dict[str, int]]:
-        """Give draws noise that no earlier draw of the variable had at this instant.
-
-        Returns:
-            The request, and how often each variable has been drawn then.
-        """
+        """Give draws noise that no earlier draw at this instant had; count the draws."""
         drawn, found = dict(base.drawn), dict(request)
         for name, act in request.items():
             if not (isinstance(act, Draw) and act.stream is None and act.of is None):
@@ -533,15 +532,13 @@ class Simulation:
         for name, act in request.items():
             if not isinstance(act, Mechanism) or name not in self.model:
                 continue
-            targets, parents = self.model.targets(name), [p.name for p in act.parents if not p.lag]
+            targets = self.model.targets(name)
+            parents = tuple(p.name for p in act.parents if not p.lag)
             known = len(parents) == len(act.parents) and all(p in self.model for p in parents)
             if not known or not self.compiled.actions.keys() >= {*targets}:
                 continue  # parents are refused with the reason
             try:
-                model, values = (
-                    self.model.with_interventions({name: act}),
-                    self.evaluate((*parents,)),
-                )
+                model, values = self.model.with_interventions({name: act}), self.evaluate(parents)
                 for target in targets:
                     value, declared = model.evaluate(target, values), model.declared(target)
                     if np.shape(value) != declared.shape:
@@ -673,7 +670,7 @@ class Simulation:
         self.row.take(row)
         self._adopt_model(model)
         if changed or anew:
-            self._adopt_structure(compiled.structure(row) if structure is None else structure)
+            self._adopt_structure(structure or compiled.composition.structure(row))
         self.version += 1
         if moved:
             self.backend.read(self.state)
