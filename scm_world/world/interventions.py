@@ -547,7 +547,7 @@ class Transaction:
                     rows[:, where[name]] = drawn.reshape(len(rows), -1)
                     return
             parents = compiled.set_parents.get(name, ()) if is_state else None
-            for parent in self.model.structure.parents(name) if parents is None else parents:
+            for parent in self.model.parents(name) if parents is None else parents:
                 compute(parent)
             for attempt, numbers in zip(attempts, rows, strict=True):
                 self._begin(replace(key, attempt=attempt), numbers)
