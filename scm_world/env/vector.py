@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -139,9 +139,6 @@ def keypoints(bodies: tuple[str, ...]) -> View:
 
 # --- vectors --------------------------------------------------------------------------------------
 
-Layouts = Mapping[str, Mapping[str, slice]]
-"""Where each variable stands, for every vector by its name."""
-
 STREAM = "observation"
 """The stream of the noise of the sensors; draws of ``sensor_noise`` itself have another one."""
 
@@ -180,7 +177,7 @@ class Vector:
 
     Attributes:
         names: The variables that have to be computed.
-        layouts: Where each part stands, under the name of the vector.
+        layout: Where each part stands.
         space: In which the observation lies.
     """
 
@@ -196,7 +193,7 @@ class Vector:
     ) -> None:
         self._world, self._keypoints = world, keypoints
         self._slices = _places(parts)
-        self.layouts: Layouts = {"observation": self._slices}
+        self.layout = self._slices
         where = declaration.mechanisms.where
         self.names = tuple(part.name for part in parts if part.name in where)
         self.names += () if keypoints is None else keypoints[0]
