@@ -619,11 +619,11 @@ def test_equations_without_a_name_are_given_on_reading(tmp_path: Path) -> None:
 
 
 def test_an_episode_of_equations_is_no_policy(tmp_path: Path) -> None:
-    """Its actions are not those of an environment."""
+    """Its actions are: an array is."""
     episode = equations().rollout("random", steps=2)
     saved = save_episode(SCM([RATE]).rollout(), tmp_path / "episode")
     for policy in (episode, saved):
-        with pytest.raises(UnknownOption, match="an episode of a world"):
+        with pytest.raises(UnknownOption, match="an array of actions"):
             as_player(policy)
 
 
