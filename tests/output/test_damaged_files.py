@@ -62,7 +62,7 @@ def _named_by(text: str, path: Path) -> Any:
 
 READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "policy": (".safetensors", as_player),
-    "network": (".onnx", as_player),
+    "network": (".safetensors", as_player),
     "archive": (".zip", load_sb2),
     "episode": (".npz", load_episode),
     "recording": (".parquet", Recording.load),
