@@ -24,7 +24,14 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph.acceptance import accepted, settable_causes
-from scm_world.graph.evaluate import AppliedIntervention, Evaluator, NoiseKey, earlier, source_of
+from scm_world.graph.evaluate import (
+    AppliedIntervention,
+    Evaluator,
+    NoiseKey,
+    earlier,
+    first_value,
+    source_of,
+)
 from scm_world.graph.structure import Edge, EdgeIndex, checked
 from scm_world.variables import (
     SOFT,
@@ -483,7 +490,7 @@ class SCM:
             if act is not None and not own and not isinstance(done, SOFT):
                 found = self._evaluator.evaluate(name, act, values, {}, key)
             elif name in self._temporal and isinstance(variable, Derived | Measured):
-                found = values.get(name, self._evaluator.first(name))
+                found = values.get(name, first_value(variable))
             else:
                 drawn = key if getattr(variable, "per", "step") == "episode" else None
                 found = self._evaluator.evaluate(name, act, values, {}, drawn)
