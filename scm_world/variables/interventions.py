@@ -128,7 +128,7 @@ class Mechanism(TimedIntervention):
         of: A bundle that the function returns as a whole; the variable gets its part of it.
 
     Example:
-        >>> tie = Mechanism(np.mean, ["floor_color"])
+        >>> tie = Mechanism(lambda color: color[..., 0], ["floor_color"])
         >>> tie.parents[0].name, tie.parents[0].lag
         ('floor_color', 0)
     """
