@@ -96,13 +96,6 @@ def flatten(
     return flat
 
 
-def _keeps_mechanism(act: AppliedIntervention, variable: Variable) -> bool:
-    """Return whether a variable follows its own function under an intervention."""
-    done = act.intervention
-    own = isinstance(done, Mechanism) and done.function is getattr(variable, "mechanism", None)
-    return own or isinstance(done, SOFT)
-
-
 class SCM:
     """A structural causal model over typed variables; ``scm_world.SCM`` can be asked, too.
 
@@ -419,7 +412,7 @@ class SCM:
     ) -> dict[str, Value]:
         """Compute every variable from the exogenous ones, shape ``(..., *shape)`` each.
 
-        Every value has the batch axes that lead in what is known, or in what the key draws.
+        Every value has the leading batch axes of the known values, or of the draws of the key.
 
         Args:
             known: Values of exogenous and measured variables and of actions; batch axes may lead.
@@ -491,7 +484,10 @@ class SCM:
             )
         for name in self._order if only is None else only:
             act, variable = self._acts.get(name), self._declared[name]
-            if act is not None and not _keeps_mechanism(act, variable):
+            done = None if act is None else act.intervention
+            mechanism = getattr(variable, "mechanism", None)
+            own = isinstance(done, Mechanism) and done.function is mechanism
+            if act is not None and not own and not isinstance(done, SOFT):
                 found = self._evaluator.evaluate(name, act, values, {}, key)
             elif name in self._temporal and isinstance(variable, Derived | Measured):
                 found = values.get(name, first_value(variable))

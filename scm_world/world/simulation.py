@@ -515,11 +515,7 @@ class Simulation:
     def _anew(
         self, request: Mapping[str, Any], base: StepBase
     ) -> tuple[dict[str, Any], dict[str, int]]:
-        """Give draws noise that no earlier draw of the variable had at this instant.
-
-        Returns:
-            The request, and how often each variable has been drawn then.
-        """
+        """Give draws noise that no earlier draw at this instant had; count the draws."""
         drawn, found = dict(base.drawn), dict(request)
         for name, act in request.items():
             if not (isinstance(act, Draw) and act.stream is None and act.of is None):
@@ -537,15 +533,13 @@ class Simulation:
         for name, act in request.items():
             if not isinstance(act, Mechanism) or name not in self.model:
                 continue
-            targets, parents = self.model.targets(name), [p.name for p in act.parents if not p.lag]
+            targets = self.model.targets(name)
+            parents = tuple(p.name for p in act.parents if not p.lag)
             known = len(parents) == len(act.parents) and all(p in self.model for p in parents)
             if not known or not self.compiled.actions.keys() >= {*targets}:
                 continue  # parents are refused with the reason
             try:
-                model, values = (
-                    self.model.with_interventions({name: act}),
-                    self.evaluate((*parents,)),
-                )
+                model, values = self.model.with_interventions({name: act}), self.evaluate(parents)
                 for target in targets:
                     value, declared = model.evaluate(target, values), model.declared(target)
                     if np.shape(value) != declared.shape:
