@@ -18,7 +18,7 @@ from scm_world.env.arguments import RESETS, reset_options, structure_after
 from scm_world.env.wrappers import unwrapped_env
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import NoiseKey, flatten
-from scm_world.queries.plans import Key, Plan, Schedule
+from scm_world.queries.plans import Key, Plan
 from scm_world.variables import Noise
 from scm_world.world.compiled_task import CompiledTask
 
@@ -41,7 +41,7 @@ class CurriculumRunner:
         self.memory = Memory() if memory is None else memory
         self._where = Noise(0), 0
         self._besides: frozenset[str] = frozenset()
-        self._schedule = Schedule()
+        self._acts = Plan()
         self._fired: dict[Key, int] = {}
         self._due: list[int] = []
         self._last = 0
@@ -71,7 +71,7 @@ class CurriculumRunner:
             acts = env.beginning({**first, **mine})
             compiled = structure_after(world.structures, acts, held, held.solve(), key) or compiled
         plan = self._plan(compiled)
-        self._schedule = Schedule([(0, plan)])
+        self._acts = plan
         options: dict[str, Any] = {"do": {**plan.at_start(), **mine}}
         space = self.curriculum.space
         return options if space is None else {**options, "space": space}
@@ -88,7 +88,7 @@ class CurriculumRunner:
         """
         steps = range(self._last + 1, step + 1) if step > self._last else (step,)
         self._fired = {key: at for key, at in self._fired.items() if at < step}
-        self._due = [at for at in steps if self._schedule.concerns(env.world, at, self._fired)]
+        self._due = [at for at in steps if self._acts.concerns(env.world, at, self._fired)]
         self._last = step
         return bool(self._due)
 
@@ -100,12 +100,12 @@ class CurriculumRunner:
         """
         world, acted = env.world, False
         for step in self._due:
-            due = self._schedule.due(world, step, self._fired)
+            due = self._acts.due(world, step, self._fired)
             if any(name in world.structures.head for name in due):  # names mean what there is then
                 now = world.row, world.noise_key(world.index)
                 found = structure_after(world.structures, due, world.graph, *now)
-                self._schedule = Schedule([(0, self._plan(found or world.compiled))])
-                due = self._schedule.due(world, step, self._fired)
+                self._acts = self._plan(found or world.compiled)
+                due = self._acts.due(world, step, self._fired)
             if due:
                 env.do(due, space=self.curriculum.space)
                 acted = True

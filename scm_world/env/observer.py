@@ -24,7 +24,7 @@ from scm_world.env.vector import (
 )
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.models.camera import Camera
-from scm_world.queries.rollouts import as_names
+from scm_world.queries.episodes import as_names
 from scm_world.tasks import Observed
 from scm_world.tasks.base import finite_numbers
 from scm_world.tasks.model import REWARD
