@@ -12,7 +12,7 @@ A curriculum is a sentence::
     env = CurriculumEnv(gymnasium.make("scm_world/Pushing-v0"), curriculum)
 """
 
-from scm_world.curricula.base import Do, Memory, Part, Situation
+from scm_world.curricula.base import Memory, Part, Progress, Situation
 from scm_world.curricula.combinations import (
     at_reset,
     at_step,
@@ -26,10 +26,6 @@ from scm_world.curricula.combinations import (
 )
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
 from scm_world.curricula.parts import (
-    Follow,
-    Interpolate,
-    NewGoal,
-    Resample,
     everything,
     follow,
     goals,
@@ -42,7 +38,7 @@ from scm_world.curricula.parts import (
 )
 from scm_world.curricula.published import ACTORS, published_actor
 from scm_world.curricula.vector import CurriculumVectorEnv, make_vec
-from scm_world.curricula.wrapper import CurriculumEnv, CurriculumRunner
+from scm_world.curricula.wrapper import CurriculumEnv
 from scm_world.variables import AB, A, B, Subset
 
 __all__ = [
@@ -52,15 +48,10 @@ __all__ = [
     "B",
     "Curriculum",
     "CurriculumEnv",
-    "CurriculumRunner",
     "CurriculumVectorEnv",
-    "Do",
-    "Follow",
-    "Interpolate",
     "Memory",
-    "NewGoal",
     "Part",
-    "Resample",
+    "Progress",
     "Situation",
     "Subset",
     "as_curriculum",

@@ -2,349 +2,244 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Literal, final
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import real_number
 from scm_world.curricula.base import (
+    Acts,
     AnyPart,
-    Memory,
+    Count,
+    Index,
     Part,
     Progress,
+    Rule,
     Situation,
-    as_part,
-    in_time,
-    over,
+    kind,
 )
 from scm_world.errors import UnknownOption
+from scm_world.graph import SCM
+from scm_world.queries.plans import targets
 from scm_world.variables import Time
 
 # --- when -----------------------------------------------------------------------------------------
 
-
-@final
-class Timed(Part):
-    """Act at certain times of every episode; what has a time of its own keeps it.
-
-    Attributes:
-        time: Of what has none.
-        part: What acts: a part, or an intervention.
-    """
-
-    kind: Literal["timed"] = "timed"
-    time: Time
-    part: AnyPart
-
-    def __init__(self, time: Any, part: Any, **fields: Any) -> None:
-        super().__init__(time=time, part=as_part(part), **fields)
-
-    def parts(self) -> tuple[Part, ...]:
-        """Return what acts."""
-        return (self.part,)
-
-    def acts(self, situation: Situation) -> Mapping[str, Any]:
-        """Return the interventions of the part, at its time."""
-        if situation.time is None and self.time == _RESET:
-            return self.part.plan(situation)
-        return self.part.plan(in_time(situation, self.time))
+RESET = Time(at=0)
 
 
-_RESET = Time(at=0)
+@kind("timed")
+def _timed(time: Time, part: AnyPart) -> Rule:
+    def acts(situation: Situation) -> Acts:
+        plan = part.plan(replace(situation, step=time.start or 0))
+        return {
+            name: tuple(act if act.time else act.model_copy(update={"time": time}) for act in acts)
+            for name, acts in plan.items()
+        }
+
+    return acts
 
 
-def at_reset(part: Any) -> Timed:
+def at_reset(part: Any) -> Part:
     """Act at the beginning of every episode; so does what has no time of its own.
 
     Example:
         >>> at_reset({"floor_friction": 0.4}).time
         Time(at=0)
     """
-    return Timed(_RESET, part)
+    return _timed(RESET, part)
 
 
-def at_step(step: int, part: Any) -> Timed:
-    """Act after so many control steps of every episode; 0 is the reset."""
-    return Timed(Time(at=step), part)
+def at_step(step: int, part: Any) -> Part:
+    """Act after a number of control steps of every episode; 0 is the reset."""
+    return _timed(Time(at=step), part)
 
 
-def every(steps: int, part: Any, *, first: int = 0) -> Timed:
+def every(steps: int, part: Any, *, first: int = 0) -> Part:
     """Act again and again within every episode.
 
     Args:
         steps: Control steps from one time to the next.
-        part: What acts: a part, or an intervention.
+        part: A part, or an intervention.
         first: The first control step at which it acts; 0 is the reset.
     """
-    return Timed(Time(every=steps, at=first), part)
+    return _timed(Time(every=steps, at=first), part)
 
 
-def when(event: Any, part: Any) -> Timed:
-    """Act at the first control step of every episode at which an event is there.
+def when(event: Any, part: Any) -> Part:
+    """Act at the first control step of every episode at which an event occurs.
 
     Args:
         event: ``Contact(first, second)`` or ``Reaches(name, above=…)``.
-        part: What acts: a part, or an intervention.
+        part: A part, or an intervention.
     """
-    return Timed(Time(when=event), part)
+    return _timed(Time(when=event), part)
 
 
-@final
-class During(Part):
-    """Act in some episodes only, which count from 0; ``during`` in a sentence.
+@kind("during")
+def _during(part: AnyPart, first: Index = 0, stop: Count | None = None, period: Count = 1) -> Rule:
+    if stop is not None and stop <= first:
+        raise UnknownOption("stop", stop, (f"any whole number from {first + 1} on",))
 
-    Its arguments are a range of episodes, whose step is the period, and what acts: a part, or an
-    intervention.
+    def acts(situation: Situation) -> Acts:
+        episode = situation.episode
+        is_within = first <= episode and (stop is None or episode < stop)
+        return part.plan(situation) if is_within and (episode - first) % period == 0 else {}
 
-    Attributes:
-        first: The first episode.
-        stop: The one after the last; None if there is no last one.
-        period: Episodes from one time to the next.
+    return acts
+
+
+def during(episodes: range, part: Any) -> Part:
+    """Act in some episodes only, which count from 0.
+
+    Args:
+        episodes: ``range(first, stop)`` or ``range(first, stop, period)``.
+        part: A part, or an intervention.
 
     Raises:
-        UnknownOption: It is no range of whole numbers that are not negative, or no part.
+        UnknownOption: It is not a range of whole numbers from 0 on, or an empty one.
 
     Example:
-        >>> During(range(10, 20, 5), {"floor_friction": 0.4}).period
+        >>> during(range(10, 20, 5), {"floor_friction": 0.4}).period
         5
     """
-
-    kind: Literal["during"] = "during"
-    part: AnyPart
-    first: int = 0
-    stop: int | None = None
-    period: int = 1
-
-    def __init__(self, episodes: Any = None, part: Any = None, **fields: Any) -> None:
-        if episodes is not None:
-            usable = isinstance(episodes, range) and episodes.step > 0 <= episodes.start
-            if not (usable and len(episodes)):
-                allowed = ("a range such as range(1_000, 5_000)", "range(first, stop, period)")
-                raise UnknownOption("episodes", episodes, allowed)
-            fields |= {"first": episodes.start, "stop": episodes.stop, "period": episodes.step}
-        fields["first"] = whole_number("first", fields.get("first", 0), least=0)
-        fields["period"] = whole_number("period", fields.get("period", 1), least=1)
-        if fields.get("stop") is not None:
-            fields["stop"] = whole_number("stop", fields["stop"], least=fields["first"] + 1)
-        super().__init__(part=as_part(part), **fields)
-
-    def parts(self) -> tuple[Part, ...]:
-        """Return what acts."""
-        return (self.part,)
-
-    def acts(self, situation: Situation) -> Mapping[str, Any]:
-        """Return the interventions of the part, in its episodes."""
-        return self.part.plan(situation) if self._includes(situation.episode) else {}
-
-    def _includes(self, episode: int) -> bool:
-        since = episode - self.first
-        ended = self.stop is not None and episode >= self.stop
-        return since >= 0 and not since % self.period and not ended
-
-    def live(self, memory: Memory, episode: int) -> Iterator[Part]:
-        """List it, and what acts in its episodes if this is one."""
-        yield self
-        if self._includes(episode):
-            yield from self.part.live(memory, episode)
+    usable = isinstance(episodes, range) and episodes.step > 0 <= episodes.start
+    if not (usable and len(episodes)):
+        allowed = ("a range such as range(1_000, 5_000)", "range(first, stop, period)")
+        raise UnknownOption("episodes", episodes, allowed)
+    return _during(part, episodes.start, episodes.stop, episodes.step)
 
 
 # --- which ----------------------------------------------------------------------------------------
 
 
-class _Several(Part):
-    """Something that is made of several parts, which are its arguments.
-
-    Attributes:
-        of: The parts.
-    """
-
-    of: tuple[AnyPart, ...]
-
-    def __init__(self, *parts: Any, **fields: Any) -> None:
-        made = tuple(as_part(part) for part in (*parts, *fields.pop("of", ())))
-        if not made:
-            kind = str(type(self).model_fields["kind"].default)
-            raise UnknownOption(kind, (), ("one part or more",))
-        super().__init__(of=made, **fields)
-
-    def parts(self) -> tuple[Part, ...]:
-        """List them."""
-        return self.of
-
-
-@final
-class Together(_Several):
-    """Do all together; of two on one quantity at one time the later one counts; ``together``.
+@kind("together")
+def together(*of: Part) -> Rule:
+    """Do several parts; of two on one quantity at one time the later one counts.
 
     Raises:
         UnknownOption: There is no part.
 
     Example:
-        >>> both = Together({"floor_friction": 0.4}, {"tool_block.mass": 0.03})
+        >>> both = together({"floor_friction": 0.4}, {"tool_block.mass": 0.03})
         >>> [list(part.request) for part in both.of]
         [['floor_friction'], ['tool_block.mass']]
     """
 
-    kind: Literal["together"] = "together"
+    def acts(situation: Situation) -> Acts:
+        found: Acts = {}
+        for part in of:
+            found = _over(situation.model, found, part.plan(situation))
+        return found
 
-    def __init__(self, *parts: Any, **fields: Any) -> None:
-        super().__init__(*parts, **fields)
-
-    def acts(self, situation: Situation) -> Mapping[str, Any]:
-        """Put them over one another."""
-        return over(situation.model, *(part.plan(situation) for part in self.of))
-
-
-class _Chosen(_Several):
-    """Several parts of which the episode and the progress of the learner choose one."""
-
-    def __init__(self, *parts: Any, **fields: Any) -> None:
-        super().__init__(*parts, **fields)
-
-    @abstractmethod
-    def chosen(self, memory: Memory, episode: int) -> Part:
-        """Return the part that acts in an episode."""
-
-    def acts(self, situation: Situation) -> Mapping[str, Any]:
-        """Return the interventions of that part."""
-        return self.chosen(situation.memory, situation.episode).plan(situation)
-
-    def live(self, memory: Memory, episode: int) -> Iterator[Part]:
-        """List it and that part."""
-        yield self
-        yield from self.chosen(memory, episode).live(memory, episode)
+    return acts
 
 
-@final
-class InTurn(_Chosen):
-    """Do one after another, and again from the first one; ``in_turn`` in a sentence.
+def _over(model: SCM, below: Acts, plan: Acts) -> Acts:
+    """Return interventions with a plan over them: at its times it alone sets its quantities."""
+    if not below:
+        return plan
+    mine: dict[Time, set[str]] = {}
+    for name, acts in plan.items():
+        for act in acts:
+            mine.setdefault(act.time or RESET, set()).update(targets(model, name))
+    found: dict[str, Any] = {}
+    for name, acts in below.items():
+        its = set(targets(model, name))
+        found[name] = tuple(act for act in acts if not its <= mine.get(act.time or RESET, set()))
+    found |= {name: (*found.get(name, ()), *acts) for name, acts in plan.items()}
+    return {name: acts for name, acts in found.items() if acts}
 
-    Attributes:
+
+@kind("in_turn")
+def in_turn(*of: Part, each: Count = 1) -> Rule:
+    """Do one part after another, and again from the first one.
+
+    Args:
+        of: Parts, or interventions.
         each: How many episodes each of them lasts.
 
     Raises:
-        UnknownOption: There is no part, or ``each`` is no positive whole number.
+        UnknownOption: There is no part, or ``each`` is not a positive whole number.
 
     Example:
-        >>> InTurn({"gravity": [0.0, 0.0, -9.8]}, {}, each=10).each
+        >>> in_turn({"gravity": [0.0, 0.0, -9.8]}, {}, each=10).each
         10
     """
-
-    kind: Literal["in_turn"] = "in_turn"
-    each: int = 1
-
-    def __init__(self, *parts: Any, each: Any = 1, **fields: Any) -> None:
-        super().__init__(*parts, each=whole_number("each", each, least=1), **fields)
-
-    def chosen(self, memory: Memory, episode: int) -> Part:
-        """Return the part whose turn it is."""
-        return self.of[episode // self.each % len(self.of)]
+    return lambda situation: of[situation.episode // each % len(of)].plan(situation)
 
 
-@final
-class Weighted(_Several):
-    """Do one that is drawn in each episode; ``weighted`` in a sentence.
+@kind("weighted")
+def _weighted(*of: Part, weights: tuple[float, ...]) -> Rule:
+    if len(weights) != len(of) or min(weights) <= 0.0:
+        raise UnknownOption("weights", weights, ("a positive number for each part",))
 
-    Its arguments are pairs of a weight and a part.
+    def acts(situation: Situation) -> Acts:
+        ends = np.cumsum(weights)
+        drawn = replace(situation, step=0).uniform(situation.key) * ends[-1]
+        place = int(np.searchsorted(ends, drawn, side="right"))
+        return of[min(place, len(of) - 1)].plan(situation)  # a product may round up
 
-    Attributes:
-        weights: Probabilities are in proportion to these.
+    return acts
+
+
+def weighted(*pairs: Any) -> Part:
+    """Do one of several parts, drawn in each episode.
+
+    Args:
+        pairs: A weight and a part each; probabilities are in proportion to the weights.
 
     Raises:
-        UnknownOption: There is no pair, or a weight is no positive number.
+        UnknownOption: There is no pair, or a weight is not a positive number.
 
     Example:
-        >>> Weighted((3.0, {"floor_friction": 0.4}), (1.0, {})).weights
+        >>> weighted((3.0, {"floor_friction": 0.4}), (1.0, {})).weights
         (3.0, 1.0)
     """
-
-    kind: Literal["weighted"] = "weighted"
-    weights: tuple[float, ...]
-
-    def __init__(self, *pairs: Any, **fields: Any) -> None:
-        for pair in pairs:
-            if not isinstance(pair, tuple | list) or len(pair) != 2:
-                raise UnknownOption("weighted", pair, ("pairs of a weight and a part",))
-        weights = (*(weight for weight, _ in pairs), *fields.pop("weights", ()))
-        for weight in weights:
-            is_number = isinstance(weight, int | float) and not isinstance(weight, bool)
-            if not is_number or not 0.0 < weight < float("inf"):
-                raise UnknownOption("weight", weight, ("any positive number",))
-        super().__init__(*(part for _, part in pairs), weights=tuple(map(float, weights)), **fields)
-
-    def acts(self, situation: Situation) -> Mapping[str, Any]:
-        """Return the interventions of the part that was drawn for the episode."""
-        ends = np.cumsum(self.weights)
-        drawn = in_time(situation, None).uniform(self.key) * ends[-1]
-        place = int(np.searchsorted(ends, drawn, side="right"))
-        return self.of[min(place, len(self.of) - 1)].plan(situation)  # a product may round up
+    for pair in pairs:
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise UnknownOption("weighted", pair, ("pairs of a weight and a part",))
+    weights = [real_number("weight", weight) for weight, _ in pairs]
+    return _weighted(*(part for _, part in pairs), weights=weights)
 
 
-@final
-class Stages(_Chosen):
-    """Do the first, and the next one once the learner succeeds; ``stages`` in a sentence.
+@kind("stages")
+def stages(*of: Part, up: float = 0.8, down: float | None = None, window: Count = 100) -> Rule:
+    """Do the first part, and the next one once the learner succeeds.
 
-    Attributes:
+    Args:
+        of: Parts, or interventions, from the first stage on.
         up: Share of successes from which the next stage begins, in (0, 1].
-        down: Share from which down the stage before comes back; never if None.
+        down: Share of successes down from which the stage before comes back; never if None.
         window: How many episodes of a stage count.
 
     Raises:
-        UnknownOption: There is no part, a share is none, or ``down`` is not below ``up``.
+        UnknownOption: There is no part, a share is out of range, or ``down`` is not below ``up``.
 
     Example:
-        >>> Stages({}, {"tool_block.mass": 0.08}, up=0.9, window=50).window
+        >>> stages({}, {"tool_block.mass": 0.08}, up=0.9, window=50).window
         50
     """
+    if not 0.0 < up <= 1.0:
+        raise UnknownOption("up", up, ("a share above 0 and up to 1",))
+    if down is not None and not 0.0 <= down < up:
+        raise UnknownOption("down", down, (f"a share from 0 up to less than {up:g}", "None"))
 
-    kind: Literal["stages"] = "stages"
-    up: float = 0.8
-    down: float | None = None
-    window: int = 100
+    def acts(situation: Situation) -> Acts:
+        situation.staged.add(situation.key)
+        level = situation.memory.stages.get(situation.key, Progress()).level
+        return of[level].plan(situation)
 
-    def __init__(
-        self, *parts: Any, up: Any = 0.8, down: Any = None, window: Any = 100, **fields: Any
-    ) -> None:
-        window = whole_number("window", window, least=1)
-        if not 0.0 < up <= 1.0:
-            raise UnknownOption("up", up, ("a share above 0 and up to 1",))
-        if down is not None and not 0.0 <= down < up:
-            raise UnknownOption("down", down, (f"a share from 0 up to less than {up:g}", "None"))
-        super().__init__(*parts, up=up, down=down, window=window, **fields)
-
-    def chosen(self, memory: Memory, episode: int) -> Part:
-        """Return the part of the present stage."""
-        return self.of[memory.stages.setdefault(self.key, Progress()).level]
-
-    def ended(self, memory: Memory, *, success: bool) -> None:
-        """Take an episode into account."""
-        kept = memory.stages.setdefault(self.key, Progress())
-        kept.recent.append(success)
-        while len(kept.recent) > self.window:
-            kept.recent.popleft()
-        if len(kept.recent) < self.window:
-            return
-        share = sum(kept.recent) / self.window
-        step = 1 if share >= self.up else -1 if self.down is not None and share <= self.down else 0
-        level = min(max(kept.level + step, 0), len(self.of) - 1)
-        if level != kept.level:
-            kept.level = level
-            kept.recent.clear()
+    return acts
 
 
-def count(parts: Iterable[Part], memory: Memory, *, success: bool) -> None:
-    """Take an episode into account, for all stages that acted in it.
-
-    Args:
-        parts: What could act.
-        memory: Of the curriculum.
-        success: Whether the task was solved at the end.
-    """
-    stages_by_key = {part.key: part for part in parts if isinstance(part, Stages)}
-    for part in stages_by_key.values():
-        part.ended(memory, success=success)
-
-
-during, together, in_turn, weighted, stages = During, Together, InTurn, Weighted, Stages
+def progressed(part: Any, before: Progress, *, success: bool) -> Progress:
+    """Return the progress in stages after one more episode."""
+    recent = (*before.recent, success)[-part.window :]
+    share, step = sum(recent) / part.window, 0
+    if len(recent) == part.window:
+        is_down = part.down is not None and share <= part.down
+        step = 1 if share >= part.up else -1 if is_down else 0
+    level = min(max(before.level + step, 0), len(part.of) - 1)
+    return Progress(level, recent if level == before.level else ())

@@ -7,22 +7,29 @@ Source:
 from __future__ import annotations
 
 from scm_world._arguments import one_of
-from scm_world.curricula.base import Do, Part
-from scm_world.curricula.parts import NewGoal, Resample
-from scm_world.errors import UnknownOption
+from scm_world.curricula.base import Part, as_part
+from scm_world.curricula.parts import goals, resample
 from scm_world.variables.kinds import SPACES, SpaceName
 
-ALL = ("@published",)
-ACTORS = (
-    "base_actor",
-    "goal_actor",
-    "joints_actor",
-    "physical_properties_actor",
-    "random_actor",
-    "rigid_pose_actor",
-    "visual_actor",
-)
-"""Their names in files of the predecessor."""
+PROPERTIES = {
+    "floor": "floor_friction",
+    "robot": "robot_finger_*.mass",
+    "stage": "stage_friction",
+    "tool": "tool_*.mass",
+}
+"""The variables of each group of physical properties."""
+POSITIONS, ORIENTATIONS = ("tool_*.cylindrical_position",), ("tool_*.euler_orientation",)
+DRAWN: dict[str, str | tuple[str, ...]] = {
+    "base_actor": (),
+    "goal_actor": (),
+    "joints_actor": "@joints",
+    "physical_properties_actor": (),
+    "random_actor": "@published",
+    "rigid_pose_actor": (),
+    "visual_actor": "*color",
+}
+"""What each actor draws, by its name in files of the predecessor; nothing where options decide."""
+ACTORS = tuple(DRAWN)
 
 
 def published_actor(
@@ -33,14 +40,14 @@ def published_actor(
     positions: bool = True,
     orientations: bool = True,
 ) -> Part:
-    """Give what an actor of the predecessor does.
+    """Return the part that does what an actor of the predecessor does.
 
     Args:
-        name: One of ``ACTORS``. ``random_actor`` draws everything, and leaves it to a coin
-            whether sizes or positions are drawn; ``joints_actor`` draws the joints from their
-            space (there from anywhere, so that most draws were refused).
+        name: One of ``ACTORS``. ``random_actor`` draws everything, and a coin decides whether
+            sizes or positions are drawn; ``joints_actor`` draws the joints from their space
+            (there from anywhere, so that most draws were refused).
         space: The active space; ``"A|B"`` is the default there.
-        group: Of the physical properties: ``"robot"``, ``"stage"``, ``"floor"`` or ``"tool"``.
+        group: The physical properties: ``"robot"``, ``"stage"``, ``"floor"`` or ``"tool"``.
         positions: Whether the pose actor draws positions.
         orientations: Whether it draws orientations.
 
@@ -51,32 +58,19 @@ def published_actor(
         >>> published_actor("visual_actor", space="A").what
         ('*color',)
     """
+    one_of("actor", name, ACTORS)
+    one_of("group", group, PROPERTIES)
     one_of("space", space, SPACES)
-    match name:
-        case "base_actor":
-            return Do({})
-        case "goal_actor":
-            return NewGoal(space=space)
-        case "joints_actor":
-            return Resample("@joints", space=space)
-        case "physical_properties_actor":
-            one_of("group", group, _PROPERTIES)
-            return Resample(_PROPERTIES[group], space=space)
-        case "random_actor":
-            return Resample(ALL, space=space, exclusive=True)
-        case "rigid_pose_actor":
-            chosen = (positions, orientations)
-            pairs = zip(chosen, ("cylindrical_position", "euler_orientation"), strict=True)
-            what = [f"tool_*.{one}" for wanted, one in pairs if wanted]
-            return Resample(what, space=space) if what else Do({})
-        case "visual_actor":
-            return Resample("*color", space=space)
-    raise UnknownOption("actor", name, ACTORS)
-
-
-_PROPERTIES = {
-    "floor": "floor_friction",
-    "robot": "robot_finger_*.mass",
-    "stage": "stage_friction",
-    "tool": "tool_*.mass",
-}
+    if name == "goal_actor":
+        return goals(space)
+    what = DRAWN[name]
+    if name == "physical_properties_actor":
+        what = PROPERTIES[group]
+    elif name == "rigid_pose_actor":
+        pairs = (
+            (positions, "tool_*.cylindrical_position"),
+            (orientations, "tool_*.euler_orientation"),
+        )
+        what = tuple(pattern for wanted, pattern in pairs if wanted)
+    exclusive = name == "random_actor"
+    return resample(what, space, exclusive=exclusive) if what else as_part({})

@@ -1,4 +1,4 @@
-"""A curriculum for many environments, which share its counts and its progress."""
+"""A curriculum for many environments, which share their progress."""
 
 from __future__ import annotations
 
@@ -10,19 +10,14 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import AutoresetMode, VectorWrapper
-from numpy.typing import NDArray
 
 from scm_world._arguments import whole_number
-from scm_world.curricula.base import Memory, state_read
-from scm_world.curricula.combinations import count
+from scm_world.curricula.base import Part, Progress, nested
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
-from scm_world.curricula.wrapper import CurriculumEnv, place
+from scm_world.curricula.wrapper import ADVICE, CurriculumEnv, State, read_state
 from scm_world.env import ScmWorldEnv
-from scm_world.env.arguments import RESETS, reset_options
-from scm_world.env.many import MASK, read_mask
-from scm_world.errors import UnknownOption
-
-SUCCESS = "is_success"
+from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.variables.spaces import Frozen
 
 
 def make_vec(
@@ -37,10 +32,10 @@ def make_vec(
 
     Args:
         env_id: Such as ``"scm_world/Pushing-v0"``.
-        num_envs: How many.
-        curriculum: What is done in each of them; see ``CurriculumEnv``.
+        num_envs: Number of environments.
+        curriculum: The curriculum of all of them; see ``CurriculumEnv``.
         autoreset_mode: When a member that is done is reset, as in Gymnasium.
-        options: Of the environments; ``threads`` and ``workers``, see ``vector_env``.
+        options: Options of the environments; ``threads`` and ``workers``, see ``vector_env``.
 
     Raises:
         UnknownOption: There is no such option, or the number is none.
@@ -68,20 +63,29 @@ def _member(curriculum: Curriculum, **options: Any) -> CurriculumEnv:
     return CurriculumEnv(ScmWorldEnv(**options), curriculum)
 
 
+class _States(Frozen):
+    """The states of all members; those under way have the stages of their beginning in others."""
+
+    members: tuple[State, ...]
+    stages: dict[str, Progress]
+
+
 @final
 class CurriculumVectorEnv(VectorWrapper):
-    """Counts the episodes of all environments as one series, and shares what they learn.
+    """Environments that each play a part of the episodes of a curriculum.
 
-    Episode numbers are handed out in the order in which episodes begin, within one step in the
-    order of the environments; so ``during(range(1_000), …)`` means a thousand episodes of
-    training, however many environments there are. A stage that is reached holds in each of them
-    from its next episode on. In the autoreset mode ``SAME_STEP`` an episode begins in the very
-    step that ends the last one, before that is known here: its number was handed out when that
-    one began, and its stage is the one of before.
+    Member i of n plays the episodes i, i + n, i + 2 n, …; so ``during(range(1_000), …)`` means a
+    thousand episodes of training, however many environments there are. They share their successes:
+    a stage that is reached holds in each of them from its next episode on. In the autoreset mode
+    ``SAME_STEP`` an episode begins in the very step that ends the last one; of the successes of
+    that step it knows only its own.
 
     Args:
         env: A vector environment whose members are each in a ``CurriculumEnv``.
-        curriculum: The same as theirs.
+        curriculum: The curriculum of each of them.
+
+    Attributes:
+        stages: Progress in each part with stages, by its key.
 
     Raises:
         UnknownOption: A member is in no ``CurriculumEnv``.
@@ -90,77 +94,81 @@ class CurriculumVectorEnv(VectorWrapper):
     def __init__(self, env: Any, curriculum: Any) -> None:
         super().__init__(env)
         self.curriculum = as_curriculum(curriculum)
-        self.memory = Memory()
+        self.stages: dict[str, Progress] = {}
+        self._is_staged = any(part.kind == "stages" for part in nested(self.curriculum, Part))
         self._members = env  # Gymnasium declares get_attr for its own kinds only
         try:
-            self._members.get_attr("turn")
+            self._members.get_attr("lane")
         except AttributeError:
             allowed = ("members in a CurriculumEnv; make_vec makes them",)
             raise UnknownOption("vector environment", type(env).__name__, allowed) from None
-        self._ahead = env.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP
-        self._again: list[int] = []
-        self._forget()
+        self._members.set_attr("lane", [(index, self.num_envs) for index in range(self.num_envs)])
 
-    def _forget(self) -> None:
-        """Know of no episode."""
-        self._present: list[int | None] = [None] * self.num_envs
-        self._waiting: list[int | None] = [None] * self.num_envs
-        self._stepped = np.zeros(self.num_envs, bool)
-        self._success = np.zeros(self.num_envs, bool)
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in all of them, or in those of ``options["reset_mask"]``."""
+        found = self.env.reset(seed=seed, options=options)
+        self._share()
+        return found
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Advance all of them one control step."""
+        found = self.env.step(actions)
+        if np.logical_or(found[2], found[3]).any():
+            self._share()
+        return found
+
+    def _share(self) -> None:
+        """Count the episodes that ended, in the order of the members, for all of them."""
+        if not self._is_staged:
+            return
+        for ended in self._members.get_attr("ended"):
+            for staged, success in ended:
+                self.stages = self.curriculum.counted(self.stages, staged, success=success)
+        self._members.set_attr("stages", [self.stages] * self.num_envs)
 
     def state(self) -> dict[str, Any]:
         """Return the state of the curriculum, as plain data.
 
         Episodes that are not over begin again.
         """
-        numbers = (*self._present, *self._waiting, *self._again)
-        again = sorted({number for number in numbers if number is not None})
-        places = [None if where is None else [*where] for where in self._members.get_attr("where")]
-        return {**self.memory.as_dict(), "again": again, "noises": places}
+        return self._written("saved")
+
+    def _written(self, what: str) -> dict[str, Any]:
+        members = self._members.get_attr(what)
+        return _States(members=members, stages=self.stages).model_dump(mode="json")
 
     def resume(self, state: dict[str, Any]) -> None:
-        """Continue where ``state`` was taken, with the next reset of all members.
+        """Continue from a state, with the next reset of all members.
 
         Args:
-            state: What ``state`` gave, of as many environments.
+            state: The answer of ``state``, of as many environments.
 
         Raises:
             UnreadableFile: It is something else.
         """
-        memory = Memory.from_dict(state)
-        with state_read("state()"):
-            again = [whole_number("episode", number, least=0) for number in state["again"]]
-            places = [place(noise) for noise in state["noises"]]
-            if len(places) != self.num_envs:
-                raise ValueError(f"{len(places)} environments, and here are {self.num_envs}")
-        self._members.set_attr("where", places)
-        self.memory, self._again = memory, again
-        self._forget()
+        read = read_state(_States, state)
+        if len(read.members) != self.num_envs:
+            said = f"it has {len(read.members)} environments, and here are {self.num_envs}"
+            raise UnreadableFile("the state of a curriculum", said, ADVICE)
+        self._members.set_attr("saved", [one.model_dump() for one in read.members])
+        self.stages = read.stages
 
     def running(self) -> dict[str, Any]:
-        """Give what decides how the episodes that are under way began, as plain data.
+        """Return how the episodes that are under way began, as plain data.
 
         With the actions since then, ``rerun`` takes all members to where they are.
         """
-        memories, turns = self._members.get_attr("memory"), self._members.get_attr("turn")
-        saved = [None if turn is None else [turn[0], turn[1].as_dict()] for turn in turns]
-        return {
-            **self.state(),
-            "present": [*self._present],
-            "waiting": [*self._waiting],
-            "left": [*self._again],
-            "memories": [memory.as_dict() for memory in memories],
-            "turns": saved,
-            "stepped": self._stepped.tolist(),
-            "success": self._success.tolist(),
-        }
+        return self._written("begun")
 
     def rerun(self, running: Mapping[str, Any], actions: Any, lengths: Any) -> Any:
-        """Play episodes again up to where they were, bit for bit.
+        """Run episodes again up to where they were, bit for bit.
 
         Args:
-            running: What ``running`` gave, of as many environments.
-            actions: Of each control step since their resets, shape (steps, n, n_actions).
+            running: The answer of ``running``, of as many environments.
+            actions: The actions of each control step since their resets, shape
+                (steps, n, n_actions).
             lengths: How many of them each member took, shape (n,).
 
         Returns:
@@ -169,86 +177,10 @@ class CurriculumVectorEnv(VectorWrapper):
         Raises:
             UnreadableFile: ``running`` is something else.
         """
-        with state_read("running()"):
-            memories = [Memory.from_dict(memory) for memory in running["memories"]]
-            turns = [t and (int(t[0]), Memory.from_dict(t[1])) for t in running["turns"]]
-            left = [int(number) for number in running["left"]]
-            kept = {name: running[name] for name in ("present", "waiting", "stepped", "success")}
-            if any(len(one) != self.num_envs for one in (memories, turns, *kept.values())):
-                raise ValueError(f"another number of environments than {self.num_envs}")
-        self.resume({name: running[name] for name in ("episode", "stages", "again", "noises")})
-        self._members.set_attr("turn", [(memory.episode, memory) for memory in memories])
+        self.resume(dict(running))
         self.env.reset()
         given = np.asarray(actions, dtype=np.float64)
         for index, length in enumerate(lengths):
             self._members.call_in([index], "rerun", given[:length, index])
-        self._members.set_attr("turn", turns)
-        self._present, self._waiting, self._again = kept["present"], kept["waiting"], left
-        self._stepped = np.array(kept["stepped"], bool)
-        self._success = np.array(kept["success"], bool)
+        self._share()
         return self._members.present()[0]
-
-    def reset(
-        self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode in all of them, or in those of ``options["reset_mask"]``."""
-        begun = read_mask(reset_options(options, (*RESETS, MASK)).get(MASK), self.num_envs)
-        for index in np.flatnonzero(begun):
-            self._ended(index, counts=bool(self._stepped[index]))
-        self._hand_out(begun)
-        found = self.env.reset(seed=seed, options=options)
-        self._begin(begun)
-        return found
-
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Advance all of them one control step."""
-        waited = np.array([number is not None for number in self._waiting])
-        observations, rewards, terminated, truncated, info = self.env.step(actions)
-        ended = np.logical_or(terminated, truncated)
-        if not self._ahead and waited.any():
-            self._begin(waited)
-        self._stepped |= self._ahead | ~waited
-        present = info.get(SUCCESS, False)
-        final = info["final_info"].get(SUCCESS, False) if "final_info" in info else present
-        self._success = np.where(ended, final, present).astype(bool)
-        if ended.any():
-            levels = self._levels()
-            for index in np.flatnonzero(ended):
-                self._ended(index)
-            if self._ahead:
-                self._begin(ended)
-                if levels != self._levels():
-                    self._hand_out(np.ones(self.num_envs, bool))
-            else:
-                self._hand_out(ended)
-        return observations, rewards, terminated, truncated, info
-
-    def _levels(self) -> dict[str, int]:
-        return {key: kept.level for key, kept in self.memory.stages.items()}
-
-    def _ended(self, index: Any, *, counts: bool = True) -> None:
-        """Take into account how the present episode of a member ended."""
-        number, self._present[index] = self._present[index], None
-        if number is not None and counts:
-            live = self.curriculum.part.live(self.memory, number)
-            count(live, self.memory, success=bool(self._success[index]))
-
-    def _begin(self, which: NDArray[np.bool_]) -> None:
-        """Note which members have begun their next episode."""
-        for index in np.flatnonzero(which):
-            self._present[index], self._waiting[index] = self._waiting[index], None
-            self._stepped[index] = self._success[index] = False
-        if self._ahead:
-            self._hand_out(which)
-
-    def _hand_out(self, which: NDArray[np.bool_]) -> None:
-        """Tell some members the number of their next episode, and the stages."""
-        turns: list[Any] = [None] * self.num_envs
-        for index in np.flatnonzero(which):
-            number = self._waiting[index]
-            if number is None:
-                number = self._again.pop(0) if self._again else self.memory.episode
-                self.memory.episode += number == self.memory.episode
-            self._waiting[index] = number
-            turns[index] = (number, Memory.from_dict(self.memory.as_dict()))
-        self._members.set_attr("turn", turns)

@@ -4,141 +4,123 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, final
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar, final
 
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
+from pydantic import NonNegativeInt
 
 from scm_world._arguments import whole_number
-from scm_world.curricula.base import Memory, Situation, state_read
-from scm_world.curricula.combinations import count
+from scm_world.curricula.base import Memory, Progress, Situation
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
-from scm_world.env import ScmWorldEnv
 from scm_world.env.arguments import RESETS, reset_options, structure_after
+from scm_world.env.copies import EnvSnapshot
 from scm_world.env.wrappers import unwrapped_env
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.graph import NoiseKey, flatten
 from scm_world.queries.plans import Key, Plan, Schedule
 from scm_world.variables import Noise
+from scm_world.variables.spaces import Frozen
 from scm_world.world.compiled_task import CompiledTask
 
 
 @final
-class CurriculumRunner:
-    """A curriculum at work.
-
-    Args:
-        curriculum: What is done.
-        memory: The state to continue from; the beginning if None.
+class State(Memory):
+    """The state of a curriculum in an environment.
 
     Attributes:
-        curriculum: What is done.
-        memory: The state of the curriculum.
+        noise: Seed and episode, within the noise, of the next or unfinished episode; None before
+            the first reset.
     """
 
-    def __init__(self, curriculum: Any, memory: Memory | None = None) -> None:
-        self.curriculum: Curriculum = as_curriculum(curriculum)
-        self.memory = Memory() if memory is None else memory
-        self._where = Noise(0), 0
-        self._besides: frozenset[str] = frozenset()
-        self._schedule = Schedule()
-        self._fired: dict[Key, int] = {}
-        self._due: list[int] = []
-        self._last = 0
+    noise: tuple[NonNegativeInt, NonNegativeInt] | None
 
-    def begin(
-        self, env: ScmWorldEnv, seed: int, number: int, do: Mapping[str, Any] | None = None
-    ) -> dict[str, Any]:
-        """Plan an episode, and return the options of its reset.
 
-        Args:
-            env: Before the reset.
-            seed: Of the noise.
-            number: Of the episode within the noise.
-            do: What the caller does at the reset: the curriculum leaves these variables alone, in
-                any coordinates.
+ADVICE = "give what state() returned, of as many environments"
+Read = TypeVar("Read", bound=Frozen)
 
-        Raises:
-            InterventionError: The curriculum names something that does not exist.
-        """
-        mine, world = flatten(do or {}), env.world
-        self._where, self._besides = (Noise(seed), number), frozenset(mine)
-        self._fired, self._due, self._last = {}, [], 0
-        compiled = world.structures.natural(None)
-        if len(world.structures.head):
-            key, held = NoiseKey(self._where[0], number, origin=0), world.structures.head
-            first = self._plan(compiled, frozenset(held)).at_start()
-            acts = env.beginning({**first, **mine})
-            compiled = structure_after(world.structures, acts, held, held.solve(), key) or compiled
-        plan = self._plan(compiled)
-        self._schedule = Schedule([(0, plan)])
-        options: dict[str, Any] = {"do": {**plan.at_start(), **mine}}
-        space = self.curriculum.space
-        return options if space is None else {**options, "space": space}
 
-    def _plan(self, compiled: CompiledTask, first: frozenset[str] | None = None) -> Plan:
-        memory, (noise, number) = self.memory, self._where
-        situation = Situation(memory.episode, memory, compiled, noise, number, first=first)
-        return self.curriculum.plan(situation, self._besides)
+def read_state(kind: type[Read], data: Any) -> Read:
+    """Return the state that was written as plain data.
 
-    def stepped(self, env: ScmWorldEnv, step: int) -> bool:
-        """Note that so many control steps are over; tell whether anything may be due now.
+    Raises:
+        UnreadableFile: It is something else.
+    """
+    build: Any = kind
+    try:
+        found: Read = build(**data)
+    except (TypeError, ValueError) as error:
+        said = "; ".join(getattr(error, "problems", (str(error),)))
+        raise UnreadableFile("the state of a curriculum", said, ADVICE) from None
+    return found
 
-        Where several control steps have passed, what was due in between is due now.
-        """
-        steps = range(self._last + 1, step + 1) if step > self._last else (step,)
-        self._fired = {key: at for key, at in self._fired.items() if at < step}
-        self._due = [at for at in steps if self._schedule.concerns(env.world, at, self._fired)]
-        self._last = step
-        return bool(self._due)
 
-    def act(self, env: ScmWorldEnv) -> bool:
-        """Do what is due; tell whether that was anything.
+@dataclass
+class _Now:
+    """The present episode of a curriculum, or the next one where it is not running.
 
-        Raises:
-            InterventionError: It was refused; nothing has changed.
-        """
-        world, acted = env.world, False
-        for step in self._due:
-            due = self._schedule.due(world, step, self._fired)
-            if any(name in world.structures.head for name in due):  # names mean what there is then
-                now = world.current()[0], world.noise_key(world.index)
-                found = structure_after(world.structures, due, world.graph, *now)
-                self._schedule = Schedule([(0, self._plan(found or world.compiled))])
-                due = self._schedule.due(world, step, self._fired)
-            if due:
-                env.do(due, space=self.curriculum.space)
-                acted = True
-        return acted
+    Attributes:
+        number: Number of the episode within the curriculum.
+        stages: Progress in each part with stages, by its key.
+        place: Seed and episode of the noise of the next episode, if these were set.
+        running: Whether the episode is under way.
+        stepped: Whether it has taken a step.
+        success: Whether the task was solved at its last step.
+        memory: The memory at its beginning.
+        noise: Its noise, and its number within that.
+        besides: The variables that the curriculum leaves alone.
+        staged: The keys of the parts with stages that act in it.
+        schedule: The plan of the episode.
+        fired: When events of the plan occurred.
+        due: The control steps for which something may be due now.
+        last: The last control step that was looked at.
+        ended: Of the episodes that a vector environment has not counted yet: the parts with
+            stages, and the success.
+    """
 
-    def ended(self, *, success: bool) -> None:
-        """Take an episode into account that has ended, and count it."""
-        parts = self.curriculum.part.live(self.memory, self.memory.episode)
-        count(parts, self.memory, success=success)
-        self.memory.episode += 1
+    number: int = 0
+    stages: dict[str, Progress] = field(default_factory=dict)
+    place: tuple[int, int] | None = None
+    running: bool = False
+    stepped: bool = False
+    success: bool = False
+    memory: Memory | None = None
+    noise: tuple[Noise, int] = (Noise(0), 0)
+    besides: frozenset[str] = frozenset()
+    staged: set[str] = field(default_factory=set)
+    schedule: Schedule = field(default_factory=Schedule)
+    fired: dict[Key, int] = field(default_factory=dict)
+    due: tuple[int, ...] = ()
+    last: int = 0
+    ended: tuple[tuple[tuple[str, ...], bool], ...] = ()
+
+    def copy(self) -> _Now:
+        """Return a copy that later steps do not change."""
+        return replace(self, staged=set(self.staged), fired=dict(self.fired))
 
 
 @final
 class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Intervenes on an environment, at its resets and within its episodes.
 
-    What the caller of ``reset`` asks for in ``options["do"]`` counts more than the curriculum; both
-    are one intervention. All draws come from noises of their own, so that another part of a
-    curriculum changes none of them. Observation and info are those after the interventions; an
-    intervention gives no reward, and the terms of the reward are those of the step. A reset that is
-    refused is no episode: the next one has its number.
+    ``options["do"]`` of ``reset`` counts more than the curriculum; both are one intervention. All
+    draws have noise streams of their own, so that another part of a curriculum changes none of
+    them. Observation and info are those after the interventions; an intervention gives no reward,
+    and the terms of the reward are those of the step. A reset that is refused is no episode: the
+    next one has its number.
 
     Args:
-        env: Of this package, in any wrappers that do not change what ``do`` means. Of those that
-            change observations, an ``ObservationWrapper`` may be inside; one that remembers
-            earlier observations belongs around this one.
+        env: An environment of this package, in any wrappers that do not change the meaning of
+            ``do``. Of those that change observations, an ``ObservationWrapper`` may be inside; one
+            that remembers earlier observations belongs around this one.
         curriculum: A ``Curriculum``, a part of one, plain data, or an intervention.
 
     Raises:
         UnknownOption: It is no environment of this package, or no curriculum; or a wrapper inside
             would not know of interventions.
         InterventionError: The curriculum names something that does not exist. Where bodies come
-            and go, that is said at a reset.
+            and go, a reset raises it.
 
     Example:
         >>> from scm_world.curricula import goals
@@ -150,16 +132,14 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], curriculum: Any) -> None:
-        made = as_curriculum(curriculum)
-        RecordConstructorArgs.__init__(self, curriculum=_plain(made))
+        self.curriculum: Curriculum = as_curriculum(curriculum)
+        RecordConstructorArgs.__init__(self, curriculum=_plain(self.curriculum))
         super().__init__(env)
         self._inner = unwrapped_env(env, "CurriculumEnv")
         _refuse_forgetful(self._layers())
-        made.check(self._inner.world)
-        self._turn = CurriculumRunner(made)
-        self._begun = self._running = self._stepped = self._success = False
-        self._next: tuple[int, Memory] | None = None
-        self._place: tuple[int, int] | None = None
+        self.curriculum.check(self._inner.world)
+        self._now = _Now()
+        self._lane: tuple[int, int] | None = None
 
     def _layers(self) -> Iterator[gymnasium.Wrapper[Any, Any, Any, Any]]:
         """List the wrappers inside of this one, from the outermost on."""
@@ -168,85 +148,118 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             yield env
             env = env.env
 
-    @property
-    def curriculum(self) -> Curriculum:
-        """What is done."""
-        return self._turn.curriculum
+    # --- the state between episodes ---------------------------------------------------------------
 
     @property
     def memory(self) -> Memory:
-        """How many episodes there were, and how far the learner has come."""
-        return self._turn.memory
-
-    @property
-    def where(self) -> tuple[int, int] | None:
-        """Seed and episode, within the noise, of the next episode; of the present one in mid-way.
-
-        None before the first reset.
-        """
-        world = self._inner.world
-        if self._place is not None or not self._begun:
-            return self._place
-        return world.noise.seed, world.episode + (not self._running)
-
-    @where.setter
-    def where(self, where: tuple[int, int] | None) -> None:
-        self._place, self._running = where, False
+        """The number of the present or next episode, and how far the learner has come."""
+        return Memory(episode=self._now.number, stages=self._now.stages)
 
     def state(self) -> dict[str, Any]:
         """Return the state of the curriculum, as plain data.
 
         An episode that is not over begins again.
         """
-        return {**self.memory.as_dict(), "noise": None if self.where is None else [*self.where]}
+        now, world, place = self._now, self._inner.world, self._now.place
+        if place is None and now.memory is not None:
+            place = world.noise.seed, world.episode + (not now.running)
+        found = State(episode=now.number, stages=now.stages, noise=place)
+        return found.model_dump(mode="json")
 
     def resume(self, state: dict[str, Any]) -> None:
-        """Continue where ``state`` was taken, with the next reset, in any process.
+        """Continue from a state, with the next reset, in any process.
 
-        A seed, or an episode, that the reset is given counts more than that of the state.
+        A seed, or an episode, of the reset counts more than that of the state.
 
         Args:
-            state: What ``state`` gave.
+            state: The answer of ``state``.
 
         Raises:
             UnreadableFile: It is something else.
         """
-        memory = Memory.from_dict(state)
-        with state_read("state()"):
-            where = place(state["noise"])
-        self._turn.memory, self.where = memory, where
+        read = read_state(State, state)
+        self._now = replace(
+            self._now, number=read.episode, stages=read.stages, place=read.noise, running=False
+        )
+
+    saved = property(state, resume, doc="The state, for vector environments: they set attributes.")
 
     @property
-    def turn(self) -> tuple[int, Memory] | None:
-        """The number of the next episode, and the memory then, if a vector environment set them."""
-        return self._next
+    def begun(self) -> dict[str, Any]:
+        """The state from which the present episode began, as plain data."""
+        memory = self._now.memory or self.memory
+        return {**self.state(), "stages": memory.model_dump(mode="json")["stages"]}
 
-    @turn.setter
-    def turn(self, turn: tuple[int, Memory] | None) -> None:
-        self._next = turn or self._next
+    @property
+    def stages(self) -> dict[str, Progress]:
+        """Progress in each part with stages, by its key."""
+        return self._now.stages
+
+    @stages.setter
+    def stages(self, stages: dict[str, Progress]) -> None:
+        self._now.stages, self._now.ended = stages, ()
+
+    @property
+    def ended(self) -> tuple[tuple[tuple[str, ...], bool], ...]:
+        """Of episodes since ``stages`` was set: the keys of the parts with stages, the success."""
+        return self._now.ended
+
+    @property
+    def lane(self) -> tuple[int, int] | None:
+        """Index among the members of a vector environment, and their number.
+
+        Member i of n plays the episodes i, i + n, i + 2 n, …
+        """
+        return self._lane
+
+    @lane.setter
+    def lane(self, lane: tuple[int, int]) -> None:
+        self._lane, self._now.number = lane, lane[0]
+
+    def snapshot(self) -> EnvSnapshot:
+        """Save all that decides the future of the episode, the plan included.
+
+        Raises:
+            NotReset: There is no episode yet.
+        """
+        found: EnvSnapshot = self.env.get_wrapper_attr("snapshot")()
+        return replace(found, memory=(self._now.copy(), found.memory))
+
+    def restore(self, snapshot: EnvSnapshot) -> None:
+        """Go back to a snapshot, bit for bit.
+
+        Raises:
+            SnapshotMismatch: It is none, or one of another task or backend.
+        """
+        memory = getattr(snapshot, "memory", None)
+        if memory is None:
+            self.env.get_wrapper_attr("restore")(snapshot)
+        else:
+            self.env.get_wrapper_attr("restore")(replace(snapshot, memory=memory[1]))
+            self._now = memory[0].copy()
+
+    # --- episodes ---------------------------------------------------------------------------------
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode, with what is due.
+        """Begin an episode.
 
         Args:
-            seed: Of the noise.
-            options: As without this wrapper; what ``"do"`` sets, the curriculum leaves alone for
-                the whole episode, and ``"episode"`` is the number of the episode for it, too.
+            seed: Seed of the noise.
+            options: As without this wrapper. The curriculum leaves the variables of ``"do"`` alone
+                for the whole episode; ``"episode"`` is the number of the episode for it, too.
 
         Raises:
             InterventionError: An intervention was refused.
         """
         given = reset_options(options, RESETS)
         self._close()
-        if self._next is not None:
-            self._turn.memory = Memory(self._next[0], self._next[1].stages)
-        elif given.get("episode") is not None:
-            self.memory.episode = whole_number("episode", given["episode"], least=0)
-        world, number = self._inner.world, 0
-        if seed is None and self._place is not None:
-            seed, number = self._place
+        now, world, number = self._now, self._inner.world, 0
+        if given.get("episode") is not None:
+            now.number = whole_number("episode", given["episode"], least=0)
+        if seed is None and now.place is not None:
+            seed, number = now.place
             given = {"episode": number, **given}
         elif seed is None and world.has_begun:
             number = world.episode + 1
@@ -255,19 +268,47 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         noise = world.noise.seed if seed is None else whole_number("seed", seed, least=0)
         if given.get("episode") is not None:
             number = given["episode"]
-        mine = self._turn.begin(self._inner, noise, number, given.get("do"))
+        mine = self._begin(noise, number, flatten(given.get("do") or {}))
         found = self.env.reset(seed=seed, options={**given, **mine})
-        self._next = self._place = None
-        self._begun = self._running = True
+        now.place, now.running = None, True
         return found
 
+    def _begin(self, seed: int, number: int, mine: Mapping[str, Any]) -> dict[str, Any]:
+        """Plan an episode, and return the options of its reset."""
+        now, env, world = self._now, self._inner, self._inner.world
+        now.memory, now.noise, now.besides = self.memory, (Noise(seed), number), frozenset(mine)
+        now.staged, now.fired, now.due, now.last = set(), {}, (), 0
+        compiled = world.structures.natural(None)
+        if len(world.structures.head):
+            key, held = NoiseKey(now.noise[0], number, origin=0), world.structures.head
+            first = self._plan(compiled, frozenset(held)).at_start()
+            acts = env.beginning({**first, **mine})
+            compiled = structure_after(world.structures, acts, held, held.solve(), key) or compiled
+        plan = self._plan(compiled)
+        now.schedule = Schedule([(0, plan)])
+        options: dict[str, Any] = {"do": {**plan.at_start(), **mine}}
+        space = self.curriculum.space
+        return options if space is None else {**options, "space": space}
+
+    def _plan(self, compiled: CompiledTask, first: frozenset[str] | None = None) -> Plan:
+        now = self._now
+        memory = now.memory or self.memory
+        situation = Situation(memory, compiled, *now.noise, first=first, staged=now.staged)
+        return self.curriculum.plan(situation, now.besides)
+
     def _close(self) -> None:
-        """Count the episode that ends."""
-        if self._running and self._stepped:
-            self._turn.ended(success=self._success)
-        elif self._running:
-            self.memory.episode += 1
-        self._running = self._stepped = self._success = False
+        """Count the episode that ends; stages count it if it took a step."""
+        now = self._now
+        if not now.running:
+            return
+        now.running = False
+        if now.stepped and now.staged:
+            now.stages = self.curriculum.counted(now.stages, now.staged, success=now.success)
+            if self._lane is not None:
+                now.ended = (*now.ended, (tuple(now.staged), now.success))
+        now.stepped = now.success = False
+        index, several = self._lane or (0, 1)
+        now.number += 1 + (index - now.number - 1) % several
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance one control step, then do what is due.
@@ -292,31 +333,44 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             self.step(action)
 
     def stepped(self, step: int, *, over: bool, success: bool) -> bool:
-        """Note a control step; tell whether the curriculum may act after it."""
-        self._stepped, self._success = True, success
+        """Note a control step; return whether the curriculum may act after it.
+
+        Where several control steps have passed, what was due in between is due now.
+        """
+        now = self._now
+        now.stepped, now.success = True, success
         if over:
             self._close()
-        return not over and self._turn.stepped(self._inner, step)
+            return False
+        steps = range(now.last + 1, step + 1) if step > now.last else (step,)
+        now.fired = {key: at for key, at in now.fired.items() if at < step}
+        world = self._inner.world
+        now.due = tuple(at for at in steps if now.schedule.concerns(world, at, now.fired))
+        now.last = step
+        return bool(now.due)
 
     def act(self) -> bool:
-        """Do what is due; tell whether that was anything."""
-        return self._turn.act(self._inner)
+        """Do what is due; return whether that was anything.
 
-
-def place(given: Any) -> tuple[int, int] | None:
-    """Read a seed and an episode.
-
-    Raises:
-        ValueError: It is something else.
-    """
-    if given is None:
-        return None
-    seed, episode = given
-    return whole_number("seed", seed, least=0), whole_number("episode", episode, least=0)
+        Raises:
+            InterventionError: It was refused; nothing has changed.
+        """
+        now, env, world, acted = self._now, self._inner, self._inner.world, False
+        for step in now.due:
+            due = now.schedule.due(world, step, now.fired)
+            if any(name in world.structures.head for name in due):  # names mean what comes
+                where = world.current()[0], world.noise_key(world.index)
+                found = structure_after(world.structures, due, world.graph, *where)
+                now.schedule = Schedule([(0, self._plan(found or world.compiled))])
+                due = now.schedule.due(world, step, now.fired)
+            if due:
+                env.do(due, space=self.curriculum.space)
+                acted = True
+        return acted
 
 
 def _plain(curriculum: Curriculum) -> Any:
-    """Return plain data from which it can be made, so that a specification can be written down."""
+    """Return plain data from which it can be made, so that a specification can be written."""
     try:
         data = curriculum.as_dict()
         Curriculum.from_dict(data)

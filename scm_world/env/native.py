@@ -102,12 +102,12 @@ class NativeVectorEnv(ScmWorldVectorEnv):
             for index, arguments in given.items():
                 env = self._bring(index)
                 if self._inner[index].world.has_begun:  # else there is nothing to lose
-                    before[index] = self._inner[index].snapshot()
+                    before[index] = env.get_wrapper_attr("snapshot")()
                 answers[index], shown = self._alike[index].act(env, method, arguments)
                 self._write(index, *shown)
         except BaseException as error:
             for row, snapshot in before.items():
-                self._inner[row].restore(snapshot)
+                self.envs[row].get_wrapper_attr("restore")(snapshot)
                 self._write(row, *self._inner[row].present())
             if isinstance(error, ScmWorldError):
                 located(error, index)

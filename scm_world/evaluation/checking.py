@@ -12,7 +12,6 @@ import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._fingerprint import differing, fingerprint
-from scm_world.curricula import Do
 from scm_world.errors import (
     DAMAGED,
     ModelError,
@@ -31,10 +30,10 @@ from scm_world.evaluation.results import KEYS, Evaluation
 from scm_world.evaluation.setups import EvaluationPlace, Setup
 from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.plans import FORMAT, Plan
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task, tasks
 from scm_world.tasks.factories import is_model, refuse_untrusted
-from scm_world.variables.mechanisms import check_trusted
 
 
 @final
@@ -190,9 +189,8 @@ def _acts(options: Any, trusted: Sequence[str]) -> Any:
     if not isinstance(options, Mapping):
         return options
     if isinstance(options.get("kind"), str):
-        part = Do({"option": options})
-        check_trusted(part.functions(), trusted)
-        return part.request["option"]
+        data = {"format": FORMAT, "do": {"option": [options]}}
+        return Plan.from_dict(data, trusted=trusted)["option"][0]
     return {name: _acts(value, trusted) for name, value in options.items()}
 
 

@@ -108,7 +108,8 @@ def test_actors_act_on_every_task(name: str, id_: str) -> None:
 def test_d26_the_pose_actor_takes_no_size_for_a_block() -> None:
     """On the general task the size of the blocks begins like a block, and is left alone."""
     env = under(published_actor("rigid_pose_actor", space="A"), "scm_world/General-v0")
-    targets = env.curriculum.part.targets(env.unwrapped.world.compiled)
+    env.reset(seed=0)
+    ((_, targets),) = env.unwrapped.interventions
     assert "tool_block_size" in env.unwrapped.world.model
     assert len(targets) == 2 * len(env.unwrapped.world.composition.blocks)
     assert {name.partition(".")[2] for name in targets} == {
