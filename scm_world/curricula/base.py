@@ -24,7 +24,7 @@ from pydantic import (
 
 from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats
-from scm_world.errors import UnknownOption
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.plans import Plan
 from scm_world.variables import Noise
@@ -214,7 +214,10 @@ def as_part(given: Any) -> Part:
     if not isinstance(given.get("kind"), str):
         fields = {"kind": "do", "request": given}
     one_of("part of a curriculum", fields["kind"], Part.KINDS)
-    return Part.KINDS[fields["kind"]](**fields)
+    try:
+        return Part.KINDS[fields["kind"]](**fields)
+    except TypeError as error:  # of an intervention in a file that lacks its value
+        raise ModelError([f"{fields['kind']}: {error}"]) from None
 
 
 # --- types of fields ------------------------------------------------------------------------------

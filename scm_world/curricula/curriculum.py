@@ -79,9 +79,12 @@ class Curriculum(Frozen):
         """Write it as plain data.
 
         Raises:
-            ModelError: It calls a function that cannot be found again under its name.
+            ModelError: It calls a function that cannot be found again under its name, or has a
+                number that is not finite.
         """
         check_portable(nested(self, Function))
+        for part in nested(self, Part):
+            Plan(getattr(part, "request", None)).as_dict()
         return {"format": FORMAT, **self.model_dump(mode="json")}
 
     def to_json(self, *, indent: int | None = None) -> str:

@@ -16,7 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scm_world import Draw, Scale, Shift
+from scm_world import Draw, Hard, Scale, Shift, do
 from scm_world.curricula import (
     A,
     B,
@@ -46,6 +46,7 @@ LEAVES: list[Any] = [
     {},
     {"floor_friction": 0.4},
     {"block": {"size": [0.05, 0.06, 0.07]}, "tool_block.mass": Draw("B"), "gravity": Scale(0.5)},
+    do({"floor_friction": (0.3, Hard(0.2, at=1)), "tool_block": {"mass": Draw("A", every=4)}}),
     {"floor_friction": Mechanism(Function("numpy:mean"), ["floor_color"]), "x": Natural()},
     resample(["*.mass", "@looks"], "A|B", besides="robot_*"),
     resample("tool_block.mass", Normal(0.03, 0.001)),
@@ -164,6 +165,12 @@ def test_what_is_no_curriculum_is_refused(text: str, says: str, tmp_path: Path) 
         Curriculum.load(file)
     assert "pydantic" not in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_what_is_not_finite_has_no_file() -> None:
+    """It is refused as in a plan."""
+    with pytest.raises(ModelError, match="not finite"):
+        Curriculum(together({}, {"floor_friction": float("nan")})).to_json()
 
 
 def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:

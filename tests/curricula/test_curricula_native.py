@@ -174,10 +174,14 @@ def test_what_is_refused_happens_in_none_of_them() -> None:
     part = together(interpolate({FRICTION: 1.0}, start={FRICTION: 0.0}, episodes=100), inside)
     envs = made("native", part, AutoresetMode.DISABLED)
     envs.reset(seed=0)
-    before = envs.env.present()
+    before, state = envs.env.present(), envs.state()
     with pytest.raises(InterventionError, match="environment 1"):
         envs.reset()
     same(envs.env.present(), before)
+    assert envs.state() == state
+    with pytest.raises(InterventionError, match="environment 1"):
+        envs.reset()
+    assert envs.state() == state
     with pytest.raises(InterventionError, match=r"nowhere"):
         made("native", {"nowhere": 1.0}, AutoresetMode.DISABLED)
 

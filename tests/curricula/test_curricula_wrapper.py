@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import gymnasium
@@ -26,6 +27,7 @@ from scm_world.curricula import (
     everything,
     follow,
     goals,
+    in_turn,
     interpolate,
     looks,
     make_vec,
@@ -45,6 +47,7 @@ from scm_world.errors import (
     UnreadableFile,
 )
 from scm_world.models.scene import TOLERANCE
+from scm_world.queries.plans import do
 from scm_world.tasks.trifinger.entities.block_world import overlaps
 from scm_world.variables import Hard, Reaches
 
@@ -387,3 +390,43 @@ def test_an_event_within_the_episode_is_a_predicate_of_the_plan() -> None:
     for _ in range(2):
         env.reset()
         assert along(env, MASS, 4) == [0.02, 0.05, 0.05, 0.05]
+
+
+def test_a_plan_is_a_part() -> None:
+    """Its times are those of every episode, and together with others it counts as any part."""
+    plan = do({MASS: (0.03, Hard(0.05, at=2)), "floor_friction": Hard(0.2, at=1)})
+    for curriculum in (plan, Curriculum(plan), together({"floor_friction": 0.5}, plan)):
+        env = under(curriculum)
+        for _ in range(2):
+            env.reset()
+            assert [value(env, MASS), *along(env, MASS, 3)] == [0.03, 0.03, 0.05, 0.05]
+            assert value(env, "floor_friction") == 0.2
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_snapshot_has_the_plan_and_the_stages(inside: bool) -> None:
+    """Also of an episode before the present one, and of two curricula around one another."""
+    part = together(
+        interpolate({MASS: 0.1}, start={MASS: 0.02}, episodes=8),
+        at_step(2, resample("floor_friction")),
+        when(Reaches("control_index", above=2.5), {"gravity": [0.0, 0.0, -5.0]}),
+        stages({}, {"restitution": 0.3}, up=0.01, window=2),
+    )
+    env = under(part, max_episode_length=4)
+    env = CurriculumEnv(env, in_turn({}, {"stage_friction": 0.3})) if inside else env
+    env.reset(seed=4)
+    env.step(STILL)
+    saved, state = env.snapshot(), env.state()
+
+    def rest() -> list[Any]:
+        seen = [env.step(STILL)[0] for _ in range(3)]
+        for _ in range(2):
+            seen += [env.reset()[0], *(env.step(STILL)[0] for _ in range(4))]
+        return [*seen, env.state(), env.unwrapped.world.values()]
+
+    first = rest()
+    env.restore(saved)
+    assert env.state() == state
+    np.testing.assert_equal(rest(), first)
+    env.restore(pickle.loads(pickle.dumps(saved)))  # noqa: S301 # our own
+    np.testing.assert_equal(rest(), first)
