@@ -16,6 +16,7 @@ from scm_world._arguments import one_of, real_numbers
 from scm_world._types import Floats, Values
 from scm_world.errors import ActionError, Infeasible, InterventionError, UnknownOption
 from scm_world.graph import SCM, NoiseKey, flatten
+from scm_world.queries.plans import Plan
 from scm_world.tasks import Task, make_task
 from scm_world.variables import Draw, Null
 from scm_world.variables.kinds import SPACES, SpaceName
@@ -118,7 +119,8 @@ def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
     """
     flat = flatten(given or {})
     for name, value in flat.items():
-        if isinstance(value, Null):
+        several = value if isinstance(value, list | tuple) else ()
+        if isinstance(value, Null) or any(isinstance(act, Null) for act in several):
             raise InterventionError(
                 f"do({name}): an environment observes all that its task has; take something away "
                 "in a World instead",
@@ -179,11 +181,11 @@ def structure_after(
 ) -> CompiledTask | None:
     """Return the structure after an intervention; None where it decides nothing of that."""
     mine: dict[str, Any] = {}
-    for name, value in acts.items():
-        if name in structures.head:
-            try:
-                mine[name] = structures.head.accept(name, value)
-            except InterventionError:  # the intervention will be refused
-                continue
+    deciding = Plan({name: acts[name] for name in acts if name in structures.head})
+    for name, value in deciding.at_start().items():
+        try:
+            mine[name] = structures.head.accept(name, value)
+        except InterventionError:  # the intervention will be refused
+            continue
     found = structures.after(mine, held, static, key)
     return None if found is None else structures.compiled(found)

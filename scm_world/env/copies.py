@@ -8,7 +8,8 @@ from typing import Any, final
 from gymnasium.utils import EzPickle
 
 from scm_world.errors import NotReset, SnapshotMismatch
-from scm_world.world import Simulation, WorldSnapshot
+from scm_world.queries.world import World
+from scm_world.world import WorldSnapshot
 
 
 @final
@@ -36,7 +37,7 @@ class Copied(EzPickle):
         world: That is simulated.
     """
 
-    world: Simulation
+    world: World
     _done: list[tuple[int, dict[str, Any]]]
 
     @property

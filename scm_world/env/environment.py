@@ -45,11 +45,13 @@ from scm_world.errors import ActionError, ModelError, UnknownOption
 from scm_world.geometry.numbers import scaled_clip_kernel
 from scm_world.graph import flatten
 from scm_world.models.camera import Camera
+from scm_world.queries.plans import Plan
+from scm_world.queries.world import World
 from scm_world.tasks import Task
 from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.subsets import AnyRegion, as_region
-from scm_world.world import Audit, Simulation
+from scm_world.world import Audit
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.interventions import merged
 
@@ -127,6 +129,9 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         render_size: Height and width of what ``render`` gives, or both in one [pixels]; if None
             480 and 640, or those of a camera that is given.
 
+    Attributes:
+        world: Its ``World``, which can be asked; what is asked leaves the environment as it is.
+
     Raises:
         UnknownOption: An option does not exist, or does not go with the others.
         ModelError: The task has no reward.
@@ -196,7 +201,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         )
         made = made_task(task, task_options)
         mode = checked_mode(action_mode, made)
-        self.world = Simulation(
+        self.world = World(
             made,
             backend=backend,
             preset=preset,
@@ -348,7 +353,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
 
         Args:
             seed: Of the noise.
-            options: ``{"do": {…}}``: an intervention that holds for the whole episode. Where it
+            options: ``{"do": {…}}``: an intervention that holds for the whole episode, or a plan
+                whose times lie within it. Where it
                 sets what ``start`` or a random goal sets too, it counts. ``{"episode": n}``: the
                 number of the episode within the noise; the next one if not given, 0 with a seed.
                 ``{"space": …}``: the space in which every target must lie.
@@ -363,6 +369,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         request = self.beginning(asked_for.get("do"))
         number, space = asked_for.get("episode"), asked_for.get("space")
         begin(self.world, seed, request, self._attempts, number, space)
+        if self.world.is_planned:
+            request = Plan(request).at_start()
         self._done = [(0, request)] if request else []
         now = self._look()
         for name in self._terms:
@@ -385,19 +393,40 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Advance one control step.
+        """Advance one control step, and do what the plan of the reset contains for where it leads.
+
+        Observation and info are those after it; it earns nothing.
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
+            InterventionError: The plan was refused there; the step is taken.
         """
         self.world.advance(self.command(action))
         now = self._look()
         reward = self._scale * one_number(now, REWARD, self._terms)
         terminated = TERMINATED in self._counted and bool(now[TERMINATED])
         truncated = self.world.index >= self.limit
+        info = self._info(now)
+        if self.world.is_planned and not (terminated or truncated) and self.act():
+            now = self._look()
+            info = {**self._info(now), "reward_terms": info["reward_terms"]}  # of the step
         if self._window is not None:
             self._window.show(self.world.scene())
-        return self._observer.observe(now), reward, terminated, truncated, self._info(now)
+        return self._observer.observe(now), reward, terminated, truncated, info
+
+    def act(self) -> bool:
+        """Do what the plan of the reset contains for this instant; return whether it was anything.
+
+        Steps do so by themselves.
+
+        Raises:
+            InterventionError: It was refused.
+        """
+        audit = self.world.act()
+        if audit is not None:
+            did = {name: entry.requested for name, entry in audit.targets.items()}
+            self._done.append((self.world.index, did))
+        return audit is not None
 
     def command(self, action: ArrayLike) -> Floats:
         """Give what the world takes for an action of this environment, shape (n,) [SI units].

@@ -85,6 +85,7 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         # Where joints were put since the last command: relative actions are relative to them.
         self._are_set = np.zeros(count, dtype=np.bool_)
         self._sensed: set[int] = set()
+        self._planned: set[int] = set()  # with a plan that acts within the episode
         self._alone: set[int] = set()  # they were used by themselves since they were stepped
         self._acting: Any = self.envs if hasattr(first, "stepped") else ()
 
@@ -178,8 +179,9 @@ class NativeVectorEnv(ScmWorldVectorEnv):
                 if which[row]:
                     self._bring(row)
                     self._write(row, *self._inner[row].present())
-            for row in members.tolist() if self._acting else ():
-                self._intervene(row, int(numbers[row, reader.clock]))
+        for row in rows.tolist() if self._acting or self._planned else ():
+            if self._acting or row in self._planned:
+                self._intervene(row, self._batch.table(row).clock(row))
 
     def _look(self) -> None:
         """Note what was changed in environments that were used by themselves."""
@@ -189,10 +191,14 @@ class NativeVectorEnv(ScmWorldVectorEnv):
                 continue
             if env._delta is not None and env.world.action_mode == JOINTS:
                 self._are_set[index] = env._delta.is_set()
-            if env.world.current()[0].get(SENSOR_NOISE):
-                self._sensed.add(index)
-            else:
-                self._sensed.discard(index)
+            for which, belongs in (
+                (self._sensed, env.world.current()[0].get(SENSOR_NOISE)),
+                (self._planned, env.world.is_planned),
+            ):
+                if belongs:
+                    which.add(index)
+                else:
+                    which.discard(index)
         self._alone.clear()
 
     def _commanded(self, rows: Integers, actions: Floats) -> Floats:
@@ -218,12 +224,14 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         return self._commands
 
     def _intervene(self, row: int, step: int) -> None:
-        """Do what the curriculum of one environment asks for after a control step."""
+        """Do what a plan or the curriculum of one environment contains after a control step."""
         over = bool(self._terminations[row] or self._truncations[row])
-        success: Any = self._known.get("is_success")
-        if not self._acting[row].stepped(
-            step, over=over, success=success is not None and bool(success[row])
-        ):
+        acts = not over and self._inner[row].world.may_act(step)
+        if self._acting:
+            success: Any = self._known.get("is_success")
+            succeeded = success is not None and bool(success[row])
+            acts |= self._acting[row].stepped(step, over=over, success=succeeded)
+        if not acts:
             return
         terms = self._known["reward_terms"]
         earned = {name: column[row] for name, column in terms.items()}

@@ -14,7 +14,7 @@ from scm_world.env.observer import Observer
 from scm_world.errors import EngineError
 from scm_world.models import Scene
 from scm_world.models.camera import Camera
-from scm_world.world import Simulation
+from scm_world.queries.world import World
 
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.viewer import Viewer
@@ -61,7 +61,7 @@ class Looks:
         world: That is observed.
     """
 
-    world: Simulation
+    world: World
     _observer: Observer
     _modes: tuple[str, str]
     _automatic: Camera | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import pickle
 from pathlib import Path
@@ -24,7 +25,7 @@ from scm_world.errors import (
 )
 from scm_world.evaluation.players import as_player, in_world, player_from
 from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, networks, save_policy
-from scm_world.policies.cards import KEY, OPTIONS, USUAL
+from scm_world.policies.cards import KEY, OPTIONS, USUAL, plain
 from scm_world.queries import World
 
 SEEN = np.random.default_rng(1).uniform(-1, 1, (5, 4, 56)).astype(np.float32)
@@ -320,7 +321,8 @@ def test_files_are_written_whole_or_not_at_all(
 
 def test_options_of_the_environment_exist() -> None:
     """The format knows the options of the environment by their names, and what is usual."""
-    assert set(OPTIONS) == USUAL.keys()
+    of_env = inspect.signature(ScmWorldEnv).parameters
+    assert {name: plain(of_env[name].default) for name in OPTIONS} == USUAL
     about = PolicyAbout(task="pushing", env={"include": ("joint_torques",), "frame_skip": 10})
     assert about.option("include") == ["joint_torques"]
     assert about.option("context") == "none"
