@@ -130,13 +130,13 @@ def together(*of: Part) -> Rule:
     def acts(situation: Situation) -> Acts:
         found: Acts = {}
         for part in of:
-            found = _over(situation.model, found, part.plan(situation))
+            found = over(situation.model, found, part.plan(situation))
         return found
 
     return acts
 
 
-def _over(model: SCM, below: Acts, plan: Acts) -> Acts:
+def over(model: SCM, below: Acts, plan: Acts) -> Acts:
     """Return interventions with a plan over them: at its times it alone sets its quantities."""
     if not below:
         return plan

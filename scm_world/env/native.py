@@ -38,7 +38,7 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         copy: Likewise.
         threads: Of the backend; as many as there are cores if None. Results do not depend on it.
         member: Makes one of them from the options: a ``ScmWorldEnv``, or one in a
-            ``CurriculumEnv``, whose ``stepped`` and ``act`` are used after each control step.
+            ``CurriculumEnv``, whose ``over`` is called at the end of an episode.
         options: Of ``ScmWorldEnv``.
 
     Raises:
@@ -87,7 +87,7 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         self._sensed: set[int] = set()
         self._planned: set[int] = set()  # with a plan that acts within the episode
         self._alone: set[int] = set()  # they were used by themselves since they were stepped
-        self._acting: Any = self.envs if hasattr(first, "stepped") else ()
+        self._counting = hasattr(first, "over")
 
     # --- one of them by itself --------------------------------------------------------------------
 
@@ -179,9 +179,13 @@ class NativeVectorEnv(ScmWorldVectorEnv):
                 if which[row]:
                     self._bring(row)
                     self._write(row, *self._inner[row].present())
-        for row in rows.tolist() if self._acting or self._planned else ():
-            if self._acting or row in self._planned:
-                self._intervene(row, self._batch.table(row).clock(row))
+        ended = self._terminations | self._truncations
+        for row in [row for row in self._planned if which[row] and not ended[row]]:
+            self._intervene(row, self._batch.table(row).clock(row))
+        if self._counting:
+            success = self._known.get("is_success", np.zeros(self.num_envs, bool))
+            for row in np.flatnonzero(which & ended).tolist():
+                self.envs[row].get_wrapper_attr("over")(success=bool(success[row]))
 
     def _look(self) -> None:
         """Note what was changed in environments that were used by themselves."""
@@ -224,14 +228,8 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         return self._commands
 
     def _intervene(self, row: int, step: int) -> None:
-        """Do what a plan or the curriculum of one environment contains after a control step."""
-        over = bool(self._terminations[row] or self._truncations[row])
-        acts = not over and self._inner[row].world.may_act(step)
-        if self._acting:
-            success: Any = self._known.get("is_success")
-            succeeded = success is not None and bool(success[row])
-            acts |= self._acting[row].stepped(step, over=over, success=succeeded)
-        if not acts:
+        """Do what the plan of one environment contains after a control step."""
+        if not self._inner[row].world.may_act(step):
             return
         terms = self._known["reward_terms"]
         earned = {name: column[row] for name, column in terms.items()}
