@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
+from itertools import chain
 from typing import Any, final
 
 import gymnasium
@@ -14,10 +15,9 @@ from gymnasium.vector import AutoresetMode, VectorWrapper
 from scm_world._arguments import whole_number
 from scm_world.curricula.base import Part, Progress, nested
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
-from scm_world.curricula.wrapper import ADVICE, CurriculumEnv, State, read_state
+from scm_world.curricula.wrapper import ADVICE, CurriculumEnv, State
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import UnknownOption, UnreadableFile
-from scm_world.variables.spaces import Frozen
 
 
 def make_vec(
@@ -63,13 +63,6 @@ def _member(curriculum: Curriculum, **options: Any) -> CurriculumEnv:
     return CurriculumEnv(ScmWorldEnv(**options), curriculum)
 
 
-class _States(Frozen):
-    """The states of all members; those under way have the stages of their beginning in others."""
-
-    members: tuple[State, ...]
-    stages: dict[str, Progress]
-
-
 @final
 class CurriculumVectorEnv(VectorWrapper):
     """Environments that each play a part of the episodes of a curriculum.
@@ -77,15 +70,12 @@ class CurriculumVectorEnv(VectorWrapper):
     Member i of n plays the episodes i, i + n, i + 2 n, …; so ``during(range(1_000), …)`` means a
     thousand episodes of training, however many environments there are. They share their successes:
     a stage that is reached holds in each of them from its next episode on. In the autoreset mode
-    ``SAME_STEP`` an episode begins in the very step that ends the last one; of the successes of
-    that step it knows only its own.
+    ``SAME_STEP`` an episode begins in the very step that ends the last one, before its success is
+    known to the others: its stage is the one of before.
 
     Args:
         env: A vector environment whose members are each in a ``CurriculumEnv``.
         curriculum: The curriculum of each of them.
-
-    Attributes:
-        stages: Progress in each part with stages, by its key.
 
     Raises:
         UnknownOption: A member is in no ``CurriculumEnv``.
@@ -94,15 +84,22 @@ class CurriculumVectorEnv(VectorWrapper):
     def __init__(self, env: Any, curriculum: Any) -> None:
         super().__init__(env)
         self.curriculum = as_curriculum(curriculum)
-        self.stages: dict[str, Progress] = {}
         self._is_staged = any(part.kind == "stages" for part in nested(self.curriculum, Part))
         self._members = env  # Gymnasium declares get_attr for its own kinds only
         try:
-            self._members.get_attr("lane")
+            self._members.get_attr("saved")
         except AttributeError:
             allowed = ("members in a CurriculumEnv; make_vec makes them",)
             raise UnknownOption("vector environment", type(env).__name__, allowed) from None
-        self._members.set_attr("lane", [(index, self.num_envs) for index in range(self.num_envs)])
+        first = {"stages": {}, "noise": None, "every": self.num_envs}
+        states = [{"episode": index, **first} for index in range(self.num_envs)]
+        self._members.set_attr("saved", states)
+
+    @property
+    def stages(self) -> dict[str, Progress]:
+        """Progress in each part with stages, by its key."""
+        found: dict[str, Progress] = self._members.get_attr("memory")[0].stages
+        return found
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -121,23 +118,19 @@ class CurriculumVectorEnv(VectorWrapper):
 
     def _share(self) -> None:
         """Count the episodes that ended, in the order of the members, for all of them."""
-        if not self._is_staged:
-            return
-        for ended in self._members.get_attr("ended"):
-            for staged, success in ended:
-                self.stages = self.curriculum.counted(self.stages, staged, success=success)
-        self._members.set_attr("stages", [self.stages] * self.num_envs)
+        shared = self._members.get_attr("shared") if self._is_staged else ()
+        if any(shared):
+            stages = self.stages
+            for staged, success in chain(*shared):
+                stages = self.curriculum.counted(stages, staged, success=success)
+            self._members.set_attr("shared", [stages] * self.num_envs)
 
     def state(self) -> dict[str, Any]:
         """Return the state of the curriculum, as plain data.
 
         Episodes that are not over begin again.
         """
-        return self._written("saved")
-
-    def _written(self, what: str) -> dict[str, Any]:
-        members = self._members.get_attr(what)
-        return _States(members=members, stages=self.stages).model_dump(mode="json")
+        return {"members": [*self._members.get_attr("saved")]}
 
     def resume(self, state: dict[str, Any]) -> None:
         """Continue from a state, with the next reset of all members.
@@ -148,25 +141,19 @@ class CurriculumVectorEnv(VectorWrapper):
         Raises:
             UnreadableFile: It is something else.
         """
-        read = read_state(_States, state)
-        if len(read.members) != self.num_envs:
-            said = f"it has {len(read.members)} environments, and here are {self.num_envs}"
+        members = state.get("members") if isinstance(state, Mapping) else None
+        if not isinstance(members, list | tuple) or len(members) != self.num_envs:
+            said = f"it is not of {self.num_envs} environments"
             raise UnreadableFile("the state of a curriculum", said, ADVICE)
-        self._members.set_attr("saved", [one.model_dump() for one in read.members])
-        self.stages = read.stages
+        for one in members:
+            State.read(one)
+        self._members.set_attr("saved", [*members])
 
-    def running(self) -> dict[str, Any]:
-        """Return how the episodes that are under way began, as plain data.
-
-        With the actions since then, ``rerun`` takes all members to where they are.
-        """
-        return self._written("begun")
-
-    def rerun(self, running: Mapping[str, Any], actions: Any, lengths: Any) -> Any:
-        """Run episodes again up to where they were, bit for bit.
+    def rerun(self, state: dict[str, Any], actions: Any, lengths: Any) -> Any:
+        """Run unfinished episodes again up to where they were, bit for bit.
 
         Args:
-            running: The answer of ``running``, of as many environments.
+            state: The answer of ``state``, of as many environments.
             actions: The actions of each control step since their resets, shape
                 (steps, n, n_actions).
             lengths: How many of them each member took, shape (n,).
@@ -175,12 +162,11 @@ class CurriculumVectorEnv(VectorWrapper):
             The observations.
 
         Raises:
-            UnreadableFile: ``running`` is something else.
+            UnreadableFile: ``state`` is something else.
         """
-        self.resume(dict(running))
+        self.resume(state)
         self.env.reset()
         given = np.asarray(actions, dtype=np.float64)
         for index, length in enumerate(lengths):
             self._members.call_in([index], "rerun", given[:length, index])
-        self._share()
         return self._members.present()[0]

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import secrets
-from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar, final
+from dataclasses import replace
+from typing import Any, final
 
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
-from pydantic import NonNegativeInt
+from pydantic import Field, NonNegativeInt, PositiveInt
 
 from scm_world._arguments import whole_number
 from scm_world.curricula.base import Memory, Progress, Situation
@@ -21,7 +21,10 @@ from scm_world.errors import ModelError, UnreadableFile
 from scm_world.graph import NoiseKey
 from scm_world.queries.plans import Plan
 from scm_world.variables import Noise
-from scm_world.variables.spaces import Frozen
+
+Outcome = tuple[tuple[str, ...], bool]
+"""The keys of the parts with stages that acted in an episode, and its success."""
+ADVICE = "give what state() returned, of as many environments"
 
 
 @final
@@ -29,54 +32,38 @@ class State(Memory):
     """The state of a curriculum in an environment.
 
     Attributes:
-        noise: Seed and episode, within the noise, of the next or unfinished episode; None before
+        noise: Seed and episode, within the noise, of the unfinished or next episode; None before
             the first reset.
+        begun: The stages at the beginning of the unfinished episode; None if there is none.
+        every: Difference of the numbers of consecutive episodes: n where n environments share them.
+        running: Whether the unfinished episode is under way.
+        staged: The keys of the parts with stages that act in it.
+        outcomes: Of the episodes that are not counted yet, where environments share the stages.
     """
 
     noise: tuple[NonNegativeInt, NonNegativeInt] | None
+    begun: dict[str, Progress] | None = None
+    every: PositiveInt = 1
+    running: bool = Field(False, exclude=True)
+    staged: tuple[str, ...] = Field((), exclude=True)
+    outcomes: tuple[Outcome, ...] = Field((), exclude=True)
 
+    @classmethod
+    def read(cls, data: Any) -> State:
+        """Return the state that was written as plain data.
 
-ADVICE = "give what state() returned, of as many environments"
-Read = TypeVar("Read", bound=Frozen)
+        Raises:
+            UnreadableFile: It is something else.
+        """
+        try:
+            return cls(**data)
+        except (TypeError, ValueError) as error:
+            said = "; ".join(getattr(error, "problems", (str(error),)))
+            raise UnreadableFile("the state of a curriculum", said, ADVICE) from None
 
-
-def read_state(kind: type[Read], data: Any) -> Read:
-    """Return the state that was written as plain data.
-
-    Raises:
-        UnreadableFile: It is something else.
-    """
-    build: Any = kind
-    try:
-        found: Read = build(**data)
-    except (TypeError, ValueError) as error:
-        said = "; ".join(getattr(error, "problems", (str(error),)))
-        raise UnreadableFile("the state of a curriculum", said, ADVICE) from None
-    return found
-
-
-@dataclass
-class _Now:
-    """The present episode of a curriculum, or the next one where it is not running.
-
-    Attributes:
-        number: Number of the episode within the curriculum.
-        stages: Progress in each part with stages, by its key.
-        place: Seed and episode of the noise of the next episode, if these were set.
-        begun: The memory at the beginning of the last episode that began.
-        staged: The keys of the parts with stages that act in it.
-        running: Whether it is under way.
-        ended: Of the episodes that a vector environment has not counted yet: the parts with
-            stages, and the success.
-    """
-
-    number: int = 0
-    stages: dict[str, Progress] = field(default_factory=dict)
-    place: tuple[int, int] | None = None
-    begun: Memory | None = None
-    staged: tuple[str, ...] = ()
-    running: bool = False
-    ended: tuple[tuple[tuple[str, ...], bool], ...] = ()
+    def but(self, **fields: Any) -> State:
+        """Return a state with other fields."""
+        return self.model_copy(update=fields)
 
 
 @final
@@ -113,26 +100,21 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         super().__init__(env)
         self._inner = unwrapped_env(env, "CurriculumEnv")
         self.curriculum.check(self._inner.world)
-        self._now = _Now()
-        self._lane: tuple[int, int] | None = None
+        self._state = State(episode=0, stages={}, noise=None)
 
     # --- the state between episodes ---------------------------------------------------------------
 
     @property
     def memory(self) -> Memory:
-        """The number of the present or next episode, and how far the learner has come."""
-        return Memory(episode=self._now.number, stages=self._now.stages)
+        """The number of the unfinished or next episode, and how far the learner has come."""
+        return Memory(episode=self._state.episode, stages=self._state.stages)
 
     def state(self) -> dict[str, Any]:
         """Return the state of the curriculum, as plain data.
 
         An episode that is not over begins again.
         """
-        now, world, place = self._now, self._inner.world, self._now.place
-        if place is None and now.begun is not None:
-            place = world.noise.seed, world.episode + (not now.running)
-        found = State(episode=now.number, stages=now.stages, noise=place)
-        return found.model_dump(mode="json")
+        return self._state.model_dump(mode="json")
 
     def resume(self, state: dict[str, Any]) -> None:
         """Continue from a state, with the next reset, in any process.
@@ -145,42 +127,18 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         Raises:
             UnreadableFile: It is something else.
         """
-        read = read_state(State, state)
-        self._now = _Now(read.episode, read.stages, read.noise, self._now.begun)
+        self._state = State.read(state)
 
     saved = property(state, resume, doc="The state, for vector environments: they set attributes.")
 
     @property
-    def begun(self) -> dict[str, Any]:
-        """The state from which the present episode began, as plain data."""
-        memory = self._now.begun or self.memory
-        return {**self.state(), "stages": memory.model_dump(mode="json")["stages"]}
+    def shared(self) -> tuple[Outcome, ...]:
+        """The outcomes of the episodes since the stages of all environments were set here."""
+        return self._state.outcomes
 
-    @property
-    def stages(self) -> dict[str, Progress]:
-        """Progress in each part with stages, by its key."""
-        return self._now.stages
-
-    @stages.setter
-    def stages(self, stages: dict[str, Progress]) -> None:
-        self._now.stages, self._now.ended = stages, ()
-
-    @property
-    def ended(self) -> tuple[tuple[tuple[str, ...], bool], ...]:
-        """Of episodes since ``stages`` was set: the keys of the parts with stages, the success."""
-        return self._now.ended
-
-    @property
-    def lane(self) -> tuple[int, int] | None:
-        """Index among the members of a vector environment, and their number.
-
-        Member i of n plays the episodes i, i + n, i + 2 n, …
-        """
-        return self._lane
-
-    @lane.setter
-    def lane(self, lane: tuple[int, int]) -> None:
-        self._lane, self._now.number = lane, lane[0]
+    @shared.setter
+    def shared(self, stages: dict[str, Progress]) -> None:
+        self._state = self._state.but(stages=stages, outcomes=())
 
     def snapshot(self) -> EnvSnapshot:
         """Save all that decides the future of the episode, the plan included.
@@ -189,7 +147,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             NotReset: There is no episode yet.
         """
         found: EnvSnapshot = self.env.get_wrapper_attr("snapshot")()
-        return replace(found, memory=(replace(self._now), found.memory))
+        return replace(found, memory=(self._state, found.memory))
 
     def restore(self, snapshot: EnvSnapshot) -> None:
         """Go back to a snapshot, bit for bit.
@@ -198,11 +156,10 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             SnapshotMismatch: It is none, or one of another task or backend.
         """
         memory = getattr(snapshot, "memory", None)
-        if memory is None:
-            self.env.get_wrapper_attr("restore")(snapshot)
-        else:
-            self.env.get_wrapper_attr("restore")(replace(snapshot, memory=memory[1]))
-            self._now = replace(memory[0])
+        if memory is not None:
+            snapshot = replace(snapshot, memory=memory[1])
+        self.env.get_wrapper_attr("restore")(snapshot)
+        self._state = self._state if memory is None else memory[0]
 
     # --- episodes ---------------------------------------------------------------------------------
 
@@ -220,38 +177,42 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             InterventionError: An intervention was refused.
         """
         given = reset_options(options, RESETS)
-        now, world, number = self._now, self._inner.world, 0
-        if now.running:
-            self.over(success=world.index > 0 and self._inner.present()[1].get("is_success"))
+        world = self._inner.world
+        if self._state.running:
+            stepped = world.index > 0 and bool(self._state.staged)
+            self.over(success=stepped and bool(self._inner.present()[1]["is_success"]))
+        found = self._state
+        place = found.noise or (secrets.randbits(63), 0)
+        if seed is not None:
+            place = whole_number("seed", seed, least=0), 0
+        elif found.noise is None and world.has_begun:
+            place = world.noise.seed, world.episode + 1
         if given.get("episode") is not None:
-            now.number = whole_number("episode", given["episode"], least=0)
-        if seed is None and now.place is not None:
-            seed, number = now.place
-            given = {"episode": number, **given}
-        elif seed is None and world.has_begun:
-            number = world.episode + 1
-        elif seed is None:
-            seed = secrets.randbits(63)
-        noise = world.noise.seed if seed is None else whole_number("seed", seed, least=0)
-        if given.get("episode") is not None:
-            number = given["episode"]
-        given["do"], staged = self._plan(Noise(noise), number, Plan(given.get("do")))
+            number = whole_number("episode", given["episode"], least=0)
+            place, found = (place[0], number), found.but(episode=number)
+        goes_on = world.has_begun and place == (world.noise.seed, world.episode + 1)
+        if seed is not None or not goes_on:
+            seed, given["episode"] = place
+        begun = found.stages if found.begun is None else found.begun
+        memory = Memory(episode=found.episode, stages=begun)
+        given["do"], staged = self._plan(memory, *place, Plan(given.get("do")))
         if self.curriculum.space is not None:
             given["space"] = self.curriculum.space
-        found = self.env.reset(seed=seed, options=given)
-        now.place, now.begun, now.staged, now.running = None, self.memory, staged, True
-        return found
+        shown = self.env.reset(seed=seed, options=given)
+        self._state = found.but(noise=place, begun=begun, staged=staged, running=True)
+        return shown
 
-    def _plan(self, noise: Noise, number: int, mine: Plan) -> tuple[Plan, tuple[str, ...]]:
-        """Return the plan of an episode, and the parts with stages that act in it."""
+    def _plan(
+        self, memory: Memory, seed: int, number: int, mine: Plan
+    ) -> tuple[Plan, tuple[str, ...]]:
+        """Return the plan of an episode, and the keys of the parts with stages that act in it."""
         structures, besides = self._inner.world.structures, mine.at_start()
-        situation = Situation(self.memory, structures.natural(None), noise, number)
+        situation = Situation(memory, structures.natural(None), Noise(seed), number)
         if len(structures.head):
-            held, key = structures.head, NoiseKey(noise, number, origin=0)
+            held, key = structures.head, NoiseKey(situation.noise, number, origin=0)
             first = replace(situation, first=frozenset(held))
-            acts = self._inner.beginning(
-                over(first.model, self.curriculum.plan(first, besides), mine)
-            )
+            plan = over(first.model, self.curriculum.plan(first, besides), mine)
+            acts = self._inner.beginning(plan)
             found = structure_after(structures, acts, held, held.solve(), key)
             situation = replace(situation, compiled=found or situation.compiled)
         plan = over(situation.model, self.curriculum.plan(situation, besides), mine)
@@ -270,16 +231,17 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
     def over(self, *, success: bool) -> None:
         """Count the episode that is over; stages count it if it took a step."""
-        now = self._now
-        if not now.running:
+        now = self._state
+        if now.noise is None or not now.running:
             return
-        now.running = False
+        next_ = {"episode": now.episode + now.every, "noise": (now.noise[0], now.noise[1] + 1)}
+        self._state = now.but(begun=None, staged=(), running=False, **next_)
         if now.staged and self._inner.world.index > 0:
-            now.stages = self.curriculum.counted(now.stages, now.staged, success=success)
-            if self._lane is not None:
-                now.ended = (*now.ended, (now.staged, success))
-        index, several = self._lane or (0, 1)
-        now.number += 1 + (index - now.number - 1) % several
+            if now.every > 1:
+                self._state = self._state.but(outcomes=(*now.outcomes, (now.staged, success)))
+            else:
+                stages = self.curriculum.counted(now.stages, now.staged, success=success)
+                self._state = self._state.but(stages=stages)
 
     def rerun(self, actions: Any) -> None:
         """Take the steps of an episode again, from its reset on."""
