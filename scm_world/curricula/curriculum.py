@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar, final
 
 from scm_world.curricula.base import AnyPart, Memory, Part, Progress, Situation, nested
-from scm_world.curricula.combinations import progressed
+from scm_world.curricula.parts import progressed
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.output.reading import read_text
 from scm_world.queries.plans import Plan, targets
@@ -53,6 +53,8 @@ def read_from(kind: type[Made], data: Any, *, form: str, trusted: Sequence[str])
 class Curriculum(Frozen):
     """An intervention curriculum: immutable and JSON-serialisable.
 
+    It is made of a part, an intervention, a plan, plain data, or another curriculum.
+
     Attributes:
         part: The rule that returns the interventions of an episode.
         space: The part of the parameter space in which every intervention has to lie, if any.
@@ -73,6 +75,10 @@ class Curriculum(Frozen):
     space: Subset | None = None
 
     def __init__(self, part: Any = None, **fields: Any) -> None:
+        if isinstance(part, Mapping) and part.get("format") == FORMAT:
+            part = Curriculum.from_dict(part)
+        if isinstance(part, Curriculum):
+            part, fields = part.part, {"space": part.space, **fields}
         super().__init__(part={} if part is None else part, **fields)
 
     def as_dict(self) -> dict[str, Any]:
@@ -200,21 +206,3 @@ def _check(part: Part, world: Simulation) -> None:
             for name, act in plan.acts():
                 if name not in world.compiled.entity_names:
                     world.model.accept(name, act)
-
-
-def as_curriculum(given: Any) -> Curriculum:
-    """Return a curriculum: itself, or one of a part, of plain data, or of an intervention.
-
-    Raises:
-        UnknownOption: It is none of these.
-        ModelError: The plain data is not that of a curriculum.
-
-    Example:
-        >>> as_curriculum({"floor_friction": 0.4}).part.kind
-        'do'
-    """
-    if isinstance(given, Curriculum):
-        return given
-    if isinstance(given, Mapping) and given.get("format") == FORMAT:
-        return Curriculum.from_dict(given)
-    return Curriculum(given)

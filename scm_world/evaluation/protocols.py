@@ -17,7 +17,7 @@ from fnmatch import fnmatchcase
 from typing import Any, final
 
 from scm_world._arguments import whole_number
-from scm_world.curricula import Curriculum, as_curriculum, at_step, goals, resample, together
+from scm_world.curricula import Curriculum, at_step, goals, resample, together
 from scm_world.curricula.base import AnyPart, Part, as_part, words
 from scm_world.curricula.curriculum import read_from
 from scm_world.curricula.targets import regions
@@ -89,7 +89,7 @@ class Protocol(Frozen):
 
     def curriculum(self) -> Curriculum:
         """Give it as a curriculum, for an environment."""
-        return as_curriculum(self.part)
+        return Curriculum(self.part)
 
     def at(self, step: int) -> Protocol:
         """Give the protocol that does the same within the episodes, after so many steps."""

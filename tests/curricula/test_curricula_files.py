@@ -21,7 +21,6 @@ from scm_world.curricula import (
     A,
     B,
     Curriculum,
-    as_curriculum,
     at_reset,
     at_step,
     during,
@@ -111,7 +110,7 @@ def test_a_file_makes_the_same_episodes(tmp_path: Path) -> None:
     again = Curriculum.load(file)
     mass = "tool_block.mass"
     assert series(under(one), mass, 4) == series(under(again), mass, 4)
-    assert as_curriculum(json.loads(one.to_json())) == one
+    assert Curriculum(json.loads(one.to_json())) == one
 
 
 def test_functions_of_others_are_called_only_if_trusted() -> None:
@@ -181,7 +180,7 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     with pytest.raises(UnreadableFile, match="binary"):
         Curriculum.load(tmp_path / "binary")
     with pytest.raises(UnknownOption, match="part of a curriculum"):
-        as_curriculum(5)
+        Curriculum(5)
 
 
 def test_wrapped_environments_can_be_written_down() -> None:

@@ -13,7 +13,7 @@ from scm_world import Draw, Shift
 from scm_world.curricula import (
     A,
     B,
-    as_curriculum,
+    Curriculum,
     at_reset,
     at_step,
     during,
@@ -108,8 +108,8 @@ def test_groups_fit_every_task(task: str) -> None:
     assert not found["looks"] & found["physics"]
     assert not (found["looks"] | found["poses"]) - found["everything"]
     for group in found:
-        as_curriculum(resample(f"@{group}")).check(world)
-    as_curriculum(goals("A|B")).check(world)
+        Curriculum(resample(f"@{group}")).check(world)
+    Curriculum(goals("A|B")).check(world)
 
 
 def test_goal_draws_what_the_task_draws() -> None:
@@ -370,7 +370,7 @@ def test_whole_numbers_are_drawn_from_whole_numbers() -> None:
         (lambda: resample([]), "what cannot be"),
         (lambda: during(range(5, 5), goals()), "episodes cannot be"),
         (
-            lambda: as_curriculum({"kind": "during", "first": 5, "stop": 5, "part": {}}),
+            lambda: Curriculum({"kind": "during", "first": 5, "stop": 5, "part": {}}),
             "stop cannot",
         ),
     ],

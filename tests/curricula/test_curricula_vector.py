@@ -13,9 +13,9 @@ from curriculum_envs import PUSHING
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from scm_world.curricula import (
+    Curriculum,
     CurriculumEnv,
     CurriculumVectorEnv,
-    as_curriculum,
     at_step,
     during,
     goals,
@@ -188,7 +188,7 @@ def test_wrong_vectors_are_refused() -> None:
 
 def test_members_may_be_wrapped_further() -> None:
     """Wrappers around the members change no number."""
-    part = as_curriculum(COUNTER)
+    part = Curriculum(COUNTER)
 
     def one() -> Any:
         options = {"backend": "fake", "max_episode_length": 2, "observation_mode": "custom"}
