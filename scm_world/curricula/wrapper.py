@@ -198,8 +198,9 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             number = whole_number("episode", given["episode"], least=0)
             place, found = (place[0], number), found.but(episode=number)
         goes_on = world.has_begun and place == (world.noise.seed, world.episode + 1)
-        if seed is not None or not goes_on:
-            seed, given["episode"] = place
+        if seed is None and not goes_on:
+            seed = place[0]
+            given |= {"episode": place[1]} if place[1] else {}
         begun = found.stages if found.begun is None else found.begun
         memory = Memory(episode=found.episode, stages=begun)
         given["do"], staged = self._plan(memory, *place, Plan(given.get("do")))
