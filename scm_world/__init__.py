@@ -133,8 +133,9 @@ for _task in (
 if "scm_world/Model-v0" not in gymnasium.registry:
     gymnasium.register(
         id="scm_world/Model-v0",
-        entry_point="scm_world.env:model_env",
-        vector_entry_point="scm_world.env:model_vector_env",
+        entry_point="scm_world.env:make_env",
+        vector_entry_point="scm_world.env:vector_env",
+        kwargs={"task": None},  # a model takes its place
         order_enforce=False,
         disable_env_checker=True,
     )

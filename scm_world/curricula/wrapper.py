@@ -22,7 +22,7 @@ from scm_world.curricula.curriculum import Curriculum
 from scm_world.curricula.parts import over
 from scm_world.env import ScmWorldEnv
 from scm_world.env.arguments import RESETS, reset_options, structure_after
-from scm_world.env.copies import EnvSnapshot
+from scm_world.env.environment import EnvSnapshot
 from scm_world.env.wrappers import unwrapped_env
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.graph import NoiseKey

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.env.arguments import RESETS, doubles, finite, limited, reset_options
-from scm_world.env.copies import EnvSnapshot
+from scm_world.env.environment import EnvSnapshot
 from scm_world.errors import (
     ActionError,
     InterventionError,

@@ -203,8 +203,8 @@ def test_pictures_are_observed_and_drawn() -> None:
     env.unwrapped.do({ANGLE: 1.5})
     assert (env.unwrapped.observe() != first).any(axis=(1, 2, 3)).all()
     assert env.render().shape == (480, 640, 3)
-    assert env.unwrapped.segmentation("side")[1] == ("world", "cart", "pole")
-    assert env.unwrapped.depth().shape == (480, 640)
+    assert env.unwrapped.image("side").names == ("world", "cart", "pole")
+    assert env.unwrapped.image().depth.shape == (480, 640)
     with pytest.raises(UnknownOption, match="side"):
         make(observation_mode="pixel", cameras=["front"])
     empty = make(Decay(), backend="step", render_mode="rgb_array")

@@ -389,37 +389,6 @@ def test_other_tasks_are_refused_by_what_they_show() -> None:
         first_action(as_player(policy(env=RELATIVE)), make("Stacking2"))
 
 
-def test_an_onnx_network_may_say_what_it_was_trained_for(tmp_path: Path) -> None:
-    """It is in its metadata, and checked like that of a policy file."""
-    onnx: Any = pytest.importorskip("onnx")
-    pytest.importorskip("onnxruntime")
-    helper, numbers = onnx.helper, onnx.TensorProto.FLOAT
-    weight = np.ascontiguousarray(FULL["layers.0.weight"].T[:, :9])
-    graph = helper.make_graph(
-        [helper.make_node("MatMul", ["x", "w"], ["y"])],
-        "policy",
-        [helper.make_tensor_value_info("x", numbers, [1, 56])],
-        [helper.make_tensor_value_info("y", numbers, [1, 9])],
-        [onnx.numpy_helper.from_array(weight, "w")],
-    )
-    opset = [helper.make_opsetid("", 13)]
-    model = helper.make_model(graph, opset_imports=opset, ir_version=8)
-    about = PolicyAbout(task="pushing", env=RELATIVE)
-    helper.set_model_props(model, {KEY: about.text()})
-    onnx.save(model, tmp_path / "a.onnx")
-    player: Any = as_player(tmp_path / "a.onnx")
-    assert player.made_for == about
-    assert first_action(player, make()).shape == (9,)
-    with pytest.raises(UnknownOption, match=r"action_mode for 'a\.onnx'"):
-        first_action(
-            player, make(action_mode="delta_end_effector_positions", delta_origin="command")
-        )
-    helper.set_model_props(model, {KEY: "{}"})
-    onnx.save(model, tmp_path / "b.onnx")
-    with pytest.raises(UnreadableFile, match="task: Field required"):
-        as_player(tmp_path / "b.onnx")
-
-
 def test_the_names_are_public() -> None:
     """What users write and read files with is where its documentation says."""
     assert scm_world.policies.load_policy is load_policy
