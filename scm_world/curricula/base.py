@@ -200,7 +200,7 @@ def nested(value: Any, kind: type[Kind]) -> Iterator[Kind]:
 
 
 def as_part(given: Any) -> Part:
-    """Return a part: itself, from plain data, or of an intervention that is always done.
+    """Return a part: itself, from plain data, of a function, or of a fixed intervention.
 
     Raises:
         UnknownOption: It is none of these.
@@ -208,10 +208,12 @@ def as_part(given: Any) -> Part:
     """
     if isinstance(given, Part):
         return given
-    if not isinstance(given, Mapping):
+    fields: Any = given
+    if callable(given):
+        fields = {"kind": "follow", "function": given}
+    elif not isinstance(given, Mapping):
         raise UnknownOption("part of a curriculum", given, ("a part, such as resample('*.mass')",))
-    fields: Mapping[str, Any] = given
-    if not isinstance(given.get("kind"), str):
+    elif not isinstance(given.get("kind"), str):
         fields = {"kind": "do", "request": given}
     one_of("part of a curriculum", fields["kind"], Part.KINDS)
     try:

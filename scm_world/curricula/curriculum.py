@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, final
+from typing import Annotated, Any, TypeVar, final
+
+from pydantic import BeforeValidator
 
 from scm_world.curricula.base import AnyPart, Memory, Part, Progress, Situation, nested
 from scm_world.curricula.parts import progressed
@@ -17,6 +19,7 @@ from scm_world.variables import Function, Noise, Subset
 from scm_world.variables.checks import check_subset
 from scm_world.variables.mechanisms import check_portable, check_trusted
 from scm_world.variables.spaces import Frozen
+from scm_world.variables.subsets import as_region
 from scm_world.world import Simulation
 
 FORMAT = "scm_world/curriculum/1"
@@ -49,11 +52,17 @@ def read_from(kind: type[Made], data: Any, *, form: str, trusted: Sequence[str])
     return made
 
 
+def _subset(space: Any) -> Subset | None:
+    found = as_region("space", space)
+    return Subset(found) if isinstance(found, str) else found
+
+
 @final
 class Curriculum(Frozen):
     """An intervention curriculum: immutable and JSON-serialisable.
 
-    It is made of a part, an intervention, a plan, plain data, or another curriculum.
+    It is made of a part, an intervention, a plan, a function of the ``Situation``, plain data, or
+    another curriculum.
 
     Attributes:
         part: The rule that returns the interventions of an episode.
@@ -72,7 +81,7 @@ class Curriculum(Frozen):
     """
 
     part: AnyPart
-    space: Subset | None = None
+    space: Annotated[Subset | None, BeforeValidator(_subset)] = None
 
     def __init__(self, part: Any = None, **fields: Any) -> None:
         if isinstance(part, Mapping) and part.get("format") == FORMAT:

@@ -85,7 +85,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     Args:
         env: An environment of this package, in any wrappers that do not change the meaning of
             ``do``.
-        curriculum: A ``Curriculum``, a part of one, plain data, or an intervention.
+        curriculum: A ``Curriculum``, or what it is made of.
 
     Raises:
         UnknownOption: It is no environment of this package, or no curriculum.
@@ -344,6 +344,12 @@ class CurriculumVectorEnv(VectorWrapper):
         first = {"stages": {}, "noise": None, "every": self.num_envs}
         states = [{"episode": index, **first} for index in range(self.num_envs)]
         self._members.set_attr("saved", states)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the environments inside, such as ``do`` or ``get_attr``."""
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self.env, name)
 
     @property
     def stages(self) -> dict[str, Progress]:
