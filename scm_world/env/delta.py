@@ -63,12 +63,11 @@ class Delta:
         reach = (self._high - self._low) / 2.0
         self._gain, self._reach = (scale, reach) if normalized else (1.0, scale * reach)
         self.space = box(-self._reach, self._reach)
-        mode = world.action_mode
+        mode = world.options.action_mode
         self.reads = TIPS if mode == TIPS else None if origin == COMMAND else mode
         if self.reads not in (None, TIPS, JOINTS):
             allowed = f"{COMMAND!r}, or action_mode={PREFIX + JOINTS!r}"
             raise UnknownOption(f"delta_origin of {PREFIX}{mode}", origin, (allowed,))
-        self._version = self._fresh = -1
 
     def moved(self, action: Floats, offset: Floats) -> Floats:
         """Add what actions are relative to, shape (..., n) [SI units]; clip to the range."""
@@ -89,19 +88,14 @@ class Delta:
         if self.reads is not None:
             measured: Floats = world.evaluate((self.reads,))[self.reads]
             return measured
-        now, state = world.current()
-        if world.action_mode == JOINTS and self.is_set():
-            found: Floats = world.compiled.view("joint_positions", state)
-            return found
-        return np.concatenate([np.ravel(now[name]) for name in world.compiled.actions])
+        if world.options.action_mode == JOINTS and self.is_set():
+            return world.row[JOINTS]
+        return world.row.actions
 
     def is_set(self) -> bool:
         """Return whether nothing was commanded since the joints were put where they are."""
-        world = self._world
-        if world.version != self._version:
-            self._version = world.version
-            base = world.snapshot().base
-            joints = world.model.targets("joint_positions")
-            set_now = base and (base.at_start or any(j in base.pending for j in joints))
-            self._fresh = world.index if set_now else -1
-        return self._fresh == world.index
+        base = self._world.base
+        if base is None:  # a step was taken since
+            return False
+        joints = self._world.model.targets("joint_positions")
+        return base.at_start or any(joint in base.pending for joint in joints)

@@ -15,7 +15,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of, whole_number
-from scm_world._types import Floats, Values
+from scm_world._types import Floats, Value, Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
 from scm_world.env.arguments import (
     RESETS,
@@ -51,6 +51,7 @@ from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, WorldSnapshot
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.interventions import merged
+from scm_world.world.mechanisms import Rows
 from scm_world.world.structures import StructureCache, as_task
 
 if TYPE_CHECKING:
@@ -217,7 +218,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             conventions=conventions,
             variables_space=as_region("variables_space", variables_space),
         )
-        used = {"preset": self.world.options.preset, "frame_skip": self.world.frame_skip}
+        used = {"preset": self.world.options.preset, "frame_skip": self.world.options.frame_skip}
         used |= {"backend": self.world.backend.name, "action_mode": mode}
         super().__init__(**options | used)
         if REWARD not in self.world.model:
@@ -231,7 +232,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             )
         one_of("random_goal", random_goal, (None, *SPACES))
         self._start, self._random_goal = asked(start), random_goal
-        self.limit = self.world.max_episode_length + int(self.world.conventions.published)
+        self.limit = self.world.max_episode_length + int(self.world.options.conventions.published)
         if max_episode_steps not in (None, -1):
             steps = whole_number("max_episode_steps", max_episode_steps, least=1)
             self.limit = min(self.limit, steps)
@@ -250,7 +251,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         if self._view is not None:  # refuses one that there is not
             scene_camera(self.world.structure.default_scene(), self._view)
         modes = [one for one in RENDER_MODES if one != "human" or has_screen()]
-        fps = round(1 / self.world.control_period)
+        fps = round(1 / self.world.options.control_period)
         self.metadata = {**type(self).metadata, "render_modes": modes, "render_fps": fps}
 
         # What an action means: middle + half * action [SI units].
@@ -272,7 +273,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._given = np.empty(low.size)
         self._range = (self._middle, self._half, low, high)
 
-        self._scale = self.world.control_period if self.world.conventions.published else 1.0
+        self._scale = (
+            self.world.options.control_period if self.world.options.conventions.published else 1.0
+        )
         self._terms = tuple(self.world.task.weights)
         self._version = -1
         self._done: list[tuple[int, dict[str, Any]]] = []
@@ -364,13 +367,26 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         goals = self._goals.names if self._how.goal_env and self._goals is not None else ()
         return (*self._observer.names, *goals)
 
-    def _look(self) -> Values:
+    def _look(self) -> Rows:
         """Compute what is needed of the present."""
+        self._follow()
+        return self.world.evaluate(self._needed)
+
+    def _follow(self) -> None:
+        """Observe the structure that there is, if it has changed."""
         if self._version != self.world.version:
             self._version = self.world.version
             if self.world.compiled is not self._declaration:
                 self._arrange(self.world.compiled)
-        return self.world.evaluate(self._needed)
+
+    def read(self, now: Rows) -> tuple[Any, dict[str, Any]]:
+        """Return observation and info of the values of its world, or of several like it.
+
+        Those of several have a leading axis; ``None`` where they cannot be read in one call.
+        """
+        self._follow()
+        together = now.numbers.ndim == 1 or self._observer.together
+        return self._observer.observe(now) if together else None, self._info(now)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -508,20 +524,19 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def present(self) -> tuple[Observation, dict[str, Any]]:
         """Give the observation and the info of the present, as after an intervention."""
-        now = self._look()
-        return self._observer.observe(now), self._info(now)
+        return self.read(self._look())
 
-    def _info(self, now: Values) -> dict[str, Any]:
+    def _info(self, now: Rows) -> dict[str, Any]:
+        """Return the info of one world, or of several as columns."""
+        truth, number = (bool, float) if now.numbers.ndim == 1 else (_truths, np.asarray)
         info: dict[str, Any] = {}
         if SUCCESS in self._counted:
-            info["is_success"] = info["success"] = bool(now[SUCCESS])
+            info["is_success"] = info["success"] = truth(now[SUCCESS])
         if FRACTION in self._counted:
-            info["fractional_success"] = float(now[FRACTION])
+            info["fractional_success"] = number(now[FRACTION])
         if self._goals is not None:
-            info["achieved_goal"], info["desired_goal"] = self._goals.read(self.world)
-        info["reward_terms"] = terms = {}
-        for name in self._terms:
-            terms[name] = float(now[name])
+            info["achieved_goal"], info["desired_goal"] = self._goals.read(now)
+        info["reward_terms"] = {name: number(now[name]) for name in self._terms}
         return info
 
     @property
@@ -638,6 +653,11 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         if self._viewer is not None:
             self._viewer.close()
         self.world.close()
+
+
+def _truths(values: Value) -> NDArray[np.bool_]:
+    found: NDArray[np.bool_] = values != 0
+    return found
 
 
 ENV_OPTIONS = tuple(inspect.signature(ScmWorldEnv).parameters)[:-1]

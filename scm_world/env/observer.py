@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of
-from scm_world._types import Floats, Values
+from scm_world._types import Floats
 from scm_world.env.pictures import Pixels
 from scm_world.env.vector import (
     KEYPOINTS,
@@ -31,7 +31,7 @@ from scm_world.tasks.base import finite_numbers
 from scm_world.variables import Linear
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
-from scm_world.world.mechanisms import places
+from scm_world.world.mechanisms import Rows, places
 
 BOUND = 10.0
 """Goals that saturate are positions [m], sizes [m] and unit quaternions; beyond they saturate."""
@@ -66,14 +66,14 @@ class Goals:
         self._weights = getattr(reward.mechanism, "weights", ())
         self._measures, self._has_warned = goal.measures, False
 
-    def read(self, world: Simulation) -> tuple[Floats, Floats]:
-        """Return what is achieved and what is desired."""
-        row, (achieved, desired) = world.numbers[0], self._sides
-        return row.take(achieved), row.take(desired)
+    def read(self, now: Rows) -> tuple[Floats, Floats]:
+        """Return what is achieved and what is desired, of one world or of several."""
+        achieved, desired = self._sides
+        return now.numbers.take(achieved, axis=-1), now.numbers.take(desired, axis=-1)
 
-    def observe(self, world: Simulation) -> dict[str, Floats]:
+    def observe(self, now: Rows) -> dict[str, Floats]:
         """Return both vectors, by name."""
-        pair = zip(self.spaces, self.read(world), strict=True)
+        pair = zip(self.spaces, self.read(now), strict=True)
         return {name: np.clip(goal, -self.bound, self.bound) for name, goal in pair}
 
     def reward(self, achieved: ArrayLike, desired: ArrayLike) -> Any:
@@ -152,10 +152,9 @@ class Observing:
 class DictObserver:
     """Several observations in a dictionary, with the goals if they are observed too."""
 
-    def __init__(
-        self, world: Simulation, parts: dict[str, Vector | Pixels], goals: Goals | None
-    ) -> None:
-        self._world, self._parts, self._goals = world, parts, goals
+    def __init__(self, parts: dict[str, Vector | Pixels], goals: Goals | None) -> None:
+        self._parts, self._goals = parts, goals
+        self.together = all(part.together for part in parts.values())
         self.names = tuple(name for part in parts.values() for name in part.names)
         self.layouts: Layouts = {
             name: layout for name, part in parts.items() for layout in part.layouts.values()
@@ -165,10 +164,10 @@ class DictObserver:
             spaces | (goals.spaces if goals else {})
         )
 
-    def observe(self, now: Values) -> dict[str, NDArray[Any]]:
+    def observe(self, now: Rows) -> dict[str, NDArray[Any]]:
         """Return all of them."""
         found = {name: part.observe(now) for name, part in self._parts.items()}
-        return found if self._goals is None else found | self._goals.observe(self._world)
+        return found if self._goals is None else found | self._goals.observe(now)
 
 
 Observer = Vector | Pixels | DictObserver
@@ -210,7 +209,7 @@ def observer(
         )
     if len(parts) == 1 and not how.goal_env:
         return main
-    return DictObserver(world, parts, goals if how.goal_env else None)
+    return DictObserver(parts, goals if how.goal_env else None)
 
 
 def _check_goals(declaration: CompiledTask, goals: Goals | None) -> None:
@@ -235,8 +234,8 @@ def _context(declaration: CompiledTask) -> list[str]:
 
 def published(world: Simulation, declaration: CompiledTask) -> dict[str, Observed]:
     """Return the parts of the structured observation, by variable."""
-    length = world.max_episode_length * world.control_period
-    end = length if world.given_length is None else float(world.given_length)
+    length = world.max_episode_length * world.options.control_period
+    end = length if world.options.given_length is None else float(world.options.given_length)
     return {
         part.variable: replace(part, published=part.published or (0.0, end))
         for part in declaration.task.observation.rows
@@ -299,7 +298,7 @@ def _parts(
         low, high = bounds(declaration.model, name)
         observed, shape = known.get(name), declaration.model.declared(name).shape
         saturates = name not in soft or (observed is not None and observed.low is not None)
-        if observed is not None and world.conventions.published:
+        if observed is not None and world.options.conventions.published:
             low, high = (spread(side, shape) for side in observed.published or ())
         elif observed is not None and observed.low is not None:
             low, high = spread(observed.low, shape), spread(observed.high, shape)

@@ -111,16 +111,18 @@ class Pixels:
     Attributes:
         names: The variables that have to be computed: none.
         layouts: Where variables stand in vectors: there are none.
+        together: Whether several worlds can be observed in one call.
         space: uint8, shape (n, 3, h, w), with goals (2 n, 3, h, w); under the predecessor's
             conventions (2 n, h, w, 3).
     """
 
     names: tuple[str, ...] = ()
+    together = False
 
     def __init__(
         self, world: Simulation, cameras: Sequence[str | Camera] | None, size: Size | None
     ) -> None:
-        views, self._published = views_of(world.structure), world.conventions.published
+        views, self._published = views_of(world.structure), world.options.conventions.published
         self._world, self._cameras = world, Cameras(world)
         self._size = height_and_width("image_size", size) or (Camera.height, Camera.width)
         own = () if views is None else views.cameras
@@ -146,7 +148,7 @@ class Pixels:
 
     def observe(self, now: Values) -> NDArray[np.uint8]:
         """Draw; pictures of the goals are kept until someone intervenes."""
-        scene = self._world.describe(*self._world.current())  # drawn immediately: no copies
+        scene = self._world.compiled.scene(self._world.row)  # drawn immediately: no copies
         published, n = self._published, len(self._given)
         pictures: NDArray[np.uint8] = np.empty(self._shape, dtype=np.uint8)
         if self._version != self._world.version or not self._shows_goals:

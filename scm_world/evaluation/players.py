@@ -391,10 +391,10 @@ def in_world(policy: Any, world: Simulation) -> Policy:
         world.structures.task,
         backend=world.backend.name,
         preset=world.options.preset,
-        resolution=world.resolution,
-        frame_skip=world.frame_skip,
-        max_episode_length=world.given_length,
-        conventions=world.conventions.name,
+        resolution=world.options.resolution,
+        frame_skip=world.options.frame_skip,
+        max_episode_length=world.options.given_length,
+        conventions=world.options.conventions.name,
         **options,
     )
     remembers = player.made_for is not None and player.made_for.memory > 0

@@ -265,7 +265,7 @@ def _differences(env: ScmWorldEnv, episode: Recorded) -> Iterator[str]:
                     env.do(plan.at_start())
             except InterventionError as error:
                 yield f"control step {step}: an intervention is refused ({error})"
-        if _digest(env.world.current()[1].vector) != episode.states[step]:
+        if _digest(env.world.vector) != episode.states[step]:
             yield f"control step {step}: the true state"
         now, then = parts(env.observe()), parts(episode.observations[step])
         for name in sorted({*now, *then}):
@@ -425,7 +425,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         else:
             copied = np.array(observation)
         episode.observations.append(copied)
-        episode.states.append(world.current()[1].vector.copy())
+        episode.states.append(world.vector.copy())
         episode.interventions = self._inner.interventions
 
     def _update(self, episode: _Episode) -> None:

@@ -22,7 +22,7 @@ from scm_world.queries.questions import Questions
 from scm_world.queries.twins import AnyTwins, twins_of
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion
-from scm_world.world import Audit, Simulation, WorldSnapshot
+from scm_world.world import Audit, Batch, Simulation, WorldSnapshot
 from scm_world.world.interventions import merged
 
 
@@ -42,7 +42,26 @@ class World(Simulation, Questions):
         0.05
         >>> episode.counterfactual({}) == episode
         True
+
+    With ``num_worlds=n`` it makes n worlds in one ``scm_world.world.Batch``, which are stepped
+    together, and read as arrays with a leading axis:
+
+        >>> worlds = World("pushing", backend="fake", num_worlds=3)
+        >>> _ = worlds.reset(seed=0, do={"tool_block.mass": [0.02, 0.05, 0.08]})
+        >>> worlds.step(worlds["joint_positions"])
+        >>> worlds["tool_block.mass"], worlds["tool_block.cartesian_position"].shape
+        (array([0.02, 0.05, 0.08]), (3, 3))
+        >>> worlds.world(1).effect("reward", do={"floor_friction": 0.9}, n=2, steps=3).n
+        2
+        >>> worlds.close()
     """
+
+    def __new__(cls, *args: Any, num_worlds: int | None = None, **options: Any) -> Self:
+        """Make one world, or several."""
+        if num_worlds is None:
+            return super().__new__(cls)
+        batch: Any = Batch.of(cls, num_worlds, *args, **options)
+        return batch  # type: ignore[no-any-return] # types of Python know no such case
 
     @classmethod
     def from_mjcf(

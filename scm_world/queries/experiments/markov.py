@@ -69,7 +69,7 @@ class Markov:
         self._targets = tuple(
             name
             for name in settable(model)
-            if not deciding or deciding.isdisjoint({name, *world.static_order((name,))})
+            if not deciding or deciding.isdisjoint({name, *world.compiled.static_order((name,))})
         )
         self._geometry = {
             v.name for v in model.variables if v.unit in GEOMETRY or isinstance(v.bounds, Rotations)
@@ -185,7 +185,7 @@ class Markov:
         """Take a control step with other values of what is no parent; compare the children."""
         request = {**context, **changed}
         action = self._set(request)
-        now = self._world.current()[0]
+        now = self._world.row
         moved = {n: base[0][n] for n in parents if n not in self._actions}
         moved = {n: value for n, value in moved.items() if gap(now[n], value) > 0.0}
         if moved:  # follows from what was changed
@@ -195,7 +195,7 @@ class Markov:
             return {}
         self._world.step(action)
         self.effects.rollouts += 1
-        now = self._world.current()[0]
+        now = self._world.row
         found = {(name, 1): gap(now[name], base[1][name]) for name in children}
         found = {key: size for key, size in found.items() if size > self._least}
         if not found:
@@ -255,7 +255,7 @@ class Markov:
                 mechanisms[name, lag] = found[name]
             if lag == 0:
                 world.step(action)
-        now = world.current()[0]
+        now = world.row
         world.do({name: value for name, value in back.items() if gap(now[name], value) > 0.0})
         values = [world.values()]
         for action in actions:

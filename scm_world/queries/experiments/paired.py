@@ -112,7 +112,7 @@ class Paired:
     def _is_worn(self, effects: Effects) -> bool:
         """Note the parameters that the backend has changed by itself; no state comes back then."""
         world: Any = self._world
-        now, names = world.current()[0], {k: n for n, k in world.compiled.parameter_keys.items()}
+        now, names = world.row, {k: n for n, k in world.compiled.parameter_keys.items()}
         for key, value in world.backend.parameters(names).items():
             effects.see_unstable(names[key], gap(value, now[names[key]]))
         return bool(effects.unstable)
@@ -290,7 +290,7 @@ class Paired:
         world: Any = self._world
         world.restore(self._probe.snapshot)
         world.do(request)
-        now = world.current()[0]
+        now = world.row
         return [
             name
             for name in self.targets
@@ -300,7 +300,7 @@ class Paired:
     def _alike(self, name: str) -> bool:
         """Check whether a variable is there in the present structure, and has the same shape."""
         world: Any = self._world
-        now = world.current()[0]
+        now = world.row
         return name in now and np.shape(now[name]) == np.shape(self._first[name])
 
     def _see_later(
@@ -310,7 +310,7 @@ class Paired:
         world: Any = self._world
         world.step(action)
         effects.rollouts += 1
-        now = world.current()[0]
+        now = world.row
         for name in filter(self._alike, self.states):
             effects.see((cause, name, 1), gap(now[name], self._later[name]), setting)
 

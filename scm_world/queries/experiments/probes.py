@@ -180,7 +180,7 @@ def _made(world: Simulation, scenario: Scenario, rng: ProbeGenerator) -> Probe:
     if scenario.fresh:
         snapshot = replace(snapshot, base=None)
     world.step(action)
-    if not np.isfinite(world.current()[1].vector).all():
+    if not np.isfinite(world.vector).all():
         raise EngineFailure("the state is lost", world.backend.name)
     return Probe(scenario.name, snapshot, action)
 
@@ -295,7 +295,7 @@ def set_others(world: Simulation, rng: ProbeGenerator) -> None:
         (v.name, _jittered(v, world, rng))
         for v in world.model.variables
         if isinstance(v, Exogenous) and v.settable and v.dtype == "real"
-        if not deciding or deciding.isdisjoint(world.static_order((v.name,)))
+        if not deciding or deciding.isdisjoint(world.compiled.static_order((v.name,)))
     )
     request = {name: value for name, value in drawn if value is not None}
     while request:
@@ -316,7 +316,7 @@ def _jittered(variable: Exogenous, world: Simulation, rng: ProbeGenerator) -> Va
     """Give another value of a parameter, or None where it keeps the one that it has."""
     if rng.random(f"{variable.name}|other or not", 1)[0] >= SHARE:
         return None
-    now = world.current()[0]
+    now = world.row
     return drawn(variable, world[variable.name], now, rng, "other", JITTER)
 
 
