@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, final
 
@@ -28,16 +28,10 @@ Made = TypeVar("Made", bound=Frozen)
 
 
 def read_from(kind: type[Made], data: Any, *, form: str, trusted: Sequence[str]) -> Made:
-    """Read a value that was written as plain data.
-
-    Args:
-        kind: Class of the value.
-        data: Plain data.
-        form: Its ``"format"``.
-        trusted: Packages other than this one whose functions may be called.
+    """Read a value of a class that was written as plain data, with its ``"format"``.
 
     Raises:
-        ModelError: It is something else, or it calls a function outside of those packages.
+        ModelError: It is something else, or it calls a function outside of the trusted packages.
     """
     what = kind.__name__.lower()
     if not isinstance(data, Mapping) or data.get("format") != form:
@@ -187,23 +181,15 @@ class Curriculum(Frozen):
         )
 
     def counted(
-        self, stages: Mapping[str, Progress], staged: Iterable[str], *, success: bool
+        self, stages: Mapping[str, Progress], staged: Collection[str], *, success: bool
     ) -> dict[str, Progress]:
-        """Return the progress after an episode.
-
-        Args:
-            stages: The progress before.
-            staged: The keys of the parts with stages that acted.
-            success: Whether the task was solved at the end.
-        """
-        parts = {part.key: part for part in nested(self.part, Part) if part.kind == "stages"}
-        return {
-            **stages,
-            **{
-                key: progressed(parts[key], stages.get(key, Progress()), success=success)
-                for key in staged
-            },
-        }
+        """Return the progress after an episode in which the parts of some keys acted."""
+        found = dict(stages)
+        for part in nested(self.part, Part):
+            if part.key in staged:
+                before = stages.get(part.key, Progress())
+                found[part.key] = progressed(part, before, success=success)
+        return found
 
 
 def _check(part: Part, world: Simulation) -> None:

@@ -66,19 +66,11 @@ def regions(
     besides: Iterable[str] = (),
     among: Collection[str] | None = None,
 ) -> dict[str, SpaceName | Distribution]:
-    """Return the variables that are drawn, each with its region.
+    """Return the variables that ``resample`` draws, each with its region; see ``matching``.
 
     A variable that a pattern fits has to have the region; a group leaves out those without.
 
-    Args:
-        compiled: The structure.
-        what: Names, patterns or groups.
-        space: A space, a distribution, or a ``Subset``.
-        besides: Names, patterns or groups of the variables that keep their values.
-        among: As in ``matching``.
-
     Raises:
-        UnknownVariable: A pattern fits nothing.
         InterventionError: A variable does not have the space, or the region is impossible.
     """
     left_out = set(matching(compiled, besides, among))

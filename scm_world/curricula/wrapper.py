@@ -68,10 +68,6 @@ class State(Memory):
             said = "; ".join(getattr(error, "problems", (str(error),)))
             raise UnreadableFile("the state of a curriculum", said, ADVICE) from None
 
-    def but(self, **fields: Any) -> State:
-        """Return a state with other fields."""
-        return self.model_copy(update=fields)
-
 
 @final
 class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -145,7 +141,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
     @shared.setter
     def shared(self, stages: dict[str, Progress]) -> None:
-        self._state = self._state.but(stages=stages, outcomes=())
+        self._state = self._state.model_copy(update={"stages": stages, "outcomes": ()})
 
     def snapshot(self) -> EnvSnapshot:
         """Save all that decides the future of the episode, the plan included.
@@ -196,7 +192,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             place = world.noise.seed, world.episode + 1
         if given.get("episode") is not None:
             number = whole_number("episode", given["episode"], least=0)
-            place, found = (place[0], number), found.but(episode=number)
+            place, found = (place[0], number), found.model_copy(update={"episode": number})
         goes_on = world.has_begun and place == (world.noise.seed, world.episode + 1)
         if seed is None and not goes_on:
             seed = place[0]
@@ -207,7 +203,8 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         if self.curriculum.space is not None:
             given["space"] = self.curriculum.space
         shown = self.env.reset(seed=seed, options=given)
-        self._state = found.but(noise=place, begun=begun, staged=staged, running=True)
+        now = {"noise": place, "begun": begun, "staged": staged, "running": True}
+        self._state = found.model_copy(update=now)
         return shown
 
     def _plan(
@@ -242,14 +239,15 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         now = self._state
         if now.noise is None or not now.running:
             return
-        next_ = {"episode": now.episode + now.every, "noise": (now.noise[0], now.noise[1] + 1)}
-        self._state = now.but(begun=None, staged=(), running=False, **next_)
+        seed, number = now.noise
+        then: dict[str, Any] = {"episode": now.episode + now.every, "noise": (seed, number + 1)}
+        then |= {"begun": None, "staged": (), "running": False}
         if now.staged and self._inner.world.index > 0:
             if now.every > 1:
-                self._state = self._state.but(outcomes=(*now.outcomes, (now.staged, success)))
+                then["outcomes"] = (*now.outcomes, (now.staged, success))
             else:
-                stages = self.curriculum.counted(now.stages, now.staged, success=success)
-                self._state = self._state.but(stages=stages)
+                then["stages"] = self.curriculum.counted(now.stages, now.staged, success=success)
+        self._state = now.model_copy(update=then)
 
     def rerun(self, actions: Any) -> None:
         """Take the steps of an episode again, from its reset on."""
@@ -321,7 +319,7 @@ class CurriculumVectorEnv(VectorWrapper):
     thousand episodes of training, however many environments there are. They share their successes:
     a stage that is reached holds in each of them from its next episode on. In the autoreset mode
     ``SAME_STEP`` an episode begins in the very step that ends the last one, before its success is
-    known to the others: its stage is the one of before.
+    counted: its stage is the one of before.
 
     Args:
         env: A vector environment whose members are each in a ``CurriculumEnv``.
@@ -341,8 +339,10 @@ class CurriculumVectorEnv(VectorWrapper):
         except AttributeError:
             allowed = ("members in a CurriculumEnv; make_vec makes them",)
             raise UnknownOption("vector environment", type(env).__name__, allowed) from None
-        first = {"stages": {}, "noise": None, "every": self.num_envs}
-        states = [{"episode": index, **first} for index in range(self.num_envs)]
+        states = [
+            State(episode=index, stages={}, noise=None, every=self.num_envs).model_dump()
+            for index in range(self.num_envs)
+        ]
         self._members.set_attr("saved", states)
 
     def __getattr__(self, name: str) -> Any:
@@ -389,14 +389,7 @@ class CurriculumVectorEnv(VectorWrapper):
         return {"members": [*self._members.get_attr("saved")]}
 
     def resume(self, state: dict[str, Any]) -> None:
-        """Continue from a state, with the next reset of all members.
-
-        Args:
-            state: The answer of ``state``, of as many environments.
-
-        Raises:
-            UnreadableFile: It is something else.
-        """
+        """Continue from a state, of as many environments; see ``CurriculumEnv.resume``."""
         members = state.get("members") if isinstance(state, Mapping) else None
         if not isinstance(members, list | tuple) or len(members) != self.num_envs:
             said = f"it is not of {self.num_envs} environments"
@@ -416,9 +409,6 @@ class CurriculumVectorEnv(VectorWrapper):
 
         Returns:
             The observations.
-
-        Raises:
-            UnreadableFile: ``state`` is something else.
         """
         self.resume(state)
         self.env.reset()

@@ -196,18 +196,3 @@ def test_a_snapshot_goes_back_to_what_is_due() -> None:
     first = [envs.step(action) for _ in range(2)]
     envs.env.restore(snapshot)
     same([envs.step(action) for _ in range(2)], first)
-
-
-def test_members_that_are_left_alone_are_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where nothing is due within an episode, only resets ask an environment by itself."""
-    envs = made("native", goals("A"), AutoresetMode.NEXT_STEP)
-    many: Any = envs.env
-    envs.reset(seed=0)
-    asked: list[int] = []
-    bring = many._bring
-    monkeypatch.setattr(many, "_bring", lambda row: asked.append(row) or bring(row))
-    for _ in range(4):
-        envs.step(np.zeros((3, 9), np.float32))
-    assert asked == []
-    envs.step(np.zeros((3, 9), np.float32))
-    assert asked == [0, 1, 2]
