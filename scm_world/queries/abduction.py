@@ -24,7 +24,13 @@ import numpy as np
 from scm_world._arguments import real_number, whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world._types import Integers as Numbers
-from scm_world.errors import ImpossibleObservation, InterventionError, ModelError, UnknownOption
+from scm_world.errors import (
+    ImpossibleObservation,
+    InterventionError,
+    ModelError,
+    UnknownOption,
+    blamed,
+)
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier, first_value
 from scm_world.queries.equations import Layout
@@ -320,7 +326,8 @@ class _Abduction:
             except ModelError:
                 if source.parents():
                     raise
-                log = np.zeros(self._size)
+                inside = getattr(source, "contains", lambda _: True)
+                log = np.array([0.0 if inside(each) else -np.inf for each in value])
             # without causes the density is the same for all draws
             return Found(value, log if source.parents() else np.where(np.isfinite(log), 0.0, log))
         parents: list[Value] = []
@@ -334,11 +341,13 @@ class _Abduction:
             function: Any, parents: list[Value], noise: Values, shape: tuple[int, ...]
         ) -> Value:
             def called(key: NoiseKey, parents: Mapping[Any, Value], noise: Values) -> Value:
-                try:
-                    with np.errstate(all="ignore"):
-                        return np.asarray(function(*parents.values(), **noise), dtype=float)
-                except (ArithmeticError, ValueError):  # not defined there, as the logarithm of 0
-                    return np.full(shape if key.count is None else (key.count, *shape), np.nan)
+                whole = shape if key.count is None else (key.count, *shape)
+                with blamed(f"a function of {name!r}"), np.errstate(all="ignore"):
+                    try:
+                        found = np.asarray(function(*parents.values(), **noise), dtype=float)
+                    except (ArithmeticError, ValueError):  # not defined, as the logarithm of 0
+                        found = np.array(np.nan)
+                    return np.broadcast_to(found, whole)
 
             return self._each(called, step, {}, dict(enumerate(parents)), noise)
 
