@@ -171,7 +171,7 @@ def _load_changed(episode: Episode, **changes: Any) -> None:
 
 def _read_episode(reference: str) -> None:
     episode = World("reaching", backend="fake").rollout("random", seed=0, steps=1)
-    _load_changed(episode, layers=[[0, _plan(reference)]])
+    _load_changed(episode, plan=_plan(reference))
 
 
 def _read_episode_of_equations(reference: str) -> None:

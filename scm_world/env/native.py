@@ -13,9 +13,10 @@ from gymnasium.vector import AutoresetMode
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.env.delta import JOINTS
-from scm_world.env.environment import REWARD, ScmWorldEnv
+from scm_world.env.environment import ScmWorldEnv
 from scm_world.env.many import ScmWorldVectorEnv, act, member_shapes
 from scm_world.errors import EngineFailure, FunctionFailure, ScmWorldError
+from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import TERMINATED, one_number
 from scm_world.variables.reserved import CONTROL_INDEX, SENSOR_NOISE
 from scm_world.world.batch import Batch, Mask, located
@@ -74,7 +75,7 @@ class NativeVectorEnv(ScmWorldVectorEnv):
             inner._ezpickle_kwargs = lead._ezpickle_kwargs
         self._delta = lead._delta
         self._reads = None if self._delta is None else self._delta.reads
-        names = (*lead._needed, *(() if self._reads is None else (self._reads,)))
+        names = (*lead._observer.needed, *(() if self._reads is None else (self._reads,)))
         worlds = [inner.world for inner in self._inner]
         self._batch = Batch(worlds, threads=threads, names=names)
         self._commands = np.empty((count, self._action_size))
@@ -152,13 +153,7 @@ class NativeVectorEnv(ScmWorldVectorEnv):
             self.envs[row].get_wrapper_attr("over")(success=bool(success[row]))
 
     def _take(self, lead: ScmWorldEnv, now: Rows, rows: Integers) -> None:
-        """Write what a step led to in environments of one structure.
-
-        Args:
-            lead: One of them.
-            now: Their values.
-            rows: Which ones they are, shape (m,).
-        """
+        """Write what a step led to in environments of one structure; ``lead`` is one of them."""
         rewards = lead._scale * now[REWARD]
         for row in rows[~np.isfinite(rewards)].tolist():
             self._explain(row)

@@ -33,7 +33,7 @@ from scm_world.errors import (
 )
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier, first_value
-from scm_world.queries.equations import Layout
+from scm_world.queries.equations import CompiledModel
 from scm_world.queries.inversion import Found, density_of, noise_given, noise_shape, proposed
 from scm_world.queries.observations import Observations, observations, per
 from scm_world.queries.plans import Plan, at_once, numbered
@@ -214,7 +214,7 @@ class _Abduction:
         self.model, self._tolerance = model, tolerance
         own = np.random.SeedSequence((whole_number("seed", seed, least=0), 1))  # not that of data
         self._noise = Noise(int(own.generate_state(1)[0]))
-        self._together = Layout(model).is_vectorised
+        self._together = CompiledModel(model).is_vectorised
         self._seen, self._rows, self._size = seen, seen.rows, seen.rows * self.n
         if self._size * seen.steps > MOST:
             said = f"{seen.rows} units of {seen.steps} instants with {self.n} draws are too many"

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from scm_world.errors import InterventionError, ModelError, UnknownOption
+from scm_world.errors import InterventionError, ModelError, ScmWorldError, UnknownOption
 from scm_world.queries import SCM, Plan, World, do
 from scm_world.variables import (
     Box,
@@ -79,7 +79,7 @@ def test_later_wins_and_nothing_changes() -> None:
 )
 def test_what_is_no_plan_is_refused(make) -> None:  # type: ignore[no-untyped-def] # a table
     """At once, with what it can be."""
-    with pytest.raises(UnknownOption, match="can be"):
+    with pytest.raises(ScmWorldError, match="can be"):
         make()
 
 

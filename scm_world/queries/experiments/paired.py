@@ -23,7 +23,7 @@ from scm_world.errors import EngineFailure, InterventionError, SnapshotMismatch
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier
 from scm_world.policies.planning import action_range
-from scm_world.queries.equations import Layout
+from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.experiments.effects import RESOLUTION, EdgeKey, Effects, ProbeSetting, gap
 from scm_world.queries.experiments.probes import Probe, ProbeGenerator, drawn, touching_pairs
 from scm_world.variables import Action, Exogenous, Measured, Noise, Rotations
@@ -77,7 +77,8 @@ class Paired:
         self.targets = tuple(model)
         self.exact = False
         if self._world is None:
-            self._idle = Layout(model).idle()
+            compiled = CompiledModel(model)
+            self._idle = compiled.split(Equations(compiled).idle())
         else:
             self.states = engine_decided(model)
             self.targets = settable(model)
