@@ -74,11 +74,13 @@ class EnvSnapshot:
         world: Of its world.
         interventions: What was done so far.
         ended: Whether the episode is over and the next one begins with the next step of a batch.
+        memory: The state of a curriculum around it.
     """
 
     world: WorldSnapshot
     interventions: tuple[tuple[int, dict[str, Any]], ...]
     ended: bool = False
+    memory: Any = None
 
 
 class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):

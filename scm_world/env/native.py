@@ -36,7 +36,7 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         copy: Likewise.
         threads: Of the backend; as many as there are cores if None. Results do not depend on it.
         member: Makes one of them from the options: a ``ScmWorldEnv``, or one in a
-            ``CurriculumEnv``, whose ``stepped`` and ``act`` are used after each control step.
+            ``CurriculumEnv``, whose ``over`` is called where an episode ends.
         options: Of ``ScmWorldEnv``.
 
     Raises:
@@ -79,7 +79,7 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         worlds = [inner.world for inner in self._inner]
         self._batch = Batch(worlds, threads=threads, names=names)
         self._commands = np.empty((count, self._action_size))
-        self._acting: Any = self.envs if hasattr(first, "stepped") else ()
+        self._counting = hasattr(first, "over")
 
     # --- one of them by itself --------------------------------------------------------------------
 
@@ -88,12 +88,12 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         try:
             for index, arguments in given.items():
                 if self._inner[index].world.has_begun:  # else there is nothing to lose
-                    before[index] = self._inner[index].snapshot()
+                    before[index] = self.envs[index].get_wrapper_attr("snapshot")()
                 answers[index], shown = act(self.envs[index], self._shapes, method, arguments)
                 self._write(index, *shown)
         except BaseException as error:
             for row, snapshot in before.items():
-                self._inner[row].restore(snapshot)
+                self.envs[row].get_wrapper_attr("restore")(snapshot)
                 self._write(row, *self._inner[row].present())
             if isinstance(error, ScmWorldError):
                 located(error, index, "environment")
@@ -144,9 +144,13 @@ class NativeVectorEnv(ScmWorldVectorEnv):
             whole = len(members) == self.num_envs
             now = table if whole else Rows(table.mechanisms, table.numbers[members])
             self._take(self._inner[int(members[0])], now, members)
-        for row in rows.tolist():
-            if self._acting or self._inner[row].world.is_planned:
+        ended = self._terminations | self._truncations
+        for row in rows[~ended[rows]].tolist():
+            if self._inner[row].world.is_planned:
                 self._intervene(row)
+        success = self._known.get("is_success", np.zeros(self.num_envs, bool))
+        for row in rows[ended[rows]].tolist() if self._counting else ():
+            self.envs[row].get_wrapper_attr("over")(success=bool(success[row]))
 
     def _take(self, lead: ScmWorldEnv, now: Rows, rows: Integers) -> None:
         """Write what a step led to in environments of one structure; ``lead`` is one of them."""
@@ -186,15 +190,8 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         return self._commands
 
     def _intervene(self, row: int) -> None:
-        """Do what a plan or the curriculum of one environment contains after a control step."""
-        step = self._inner[row].world.index
-        over = bool(self._terminations[row] or self._truncations[row])
-        acts = not over and self._inner[row].world.may_act(step)
-        if self._acting:
-            success: Any = self._known.get("is_success")
-            succeeded = success is not None and bool(success[row])
-            acts |= self._acting[row].stepped(step, over=over, success=succeeded)
-        if not acts:
+        """Do what the plan of one environment contains after a control step."""
+        if not self._inner[row].world.may_act(self._inner[row].world.index):
             return
         terms = self._known["reward_terms"]
         earned = {name: column[row] for name, column in terms.items()}

@@ -74,7 +74,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             (``at=``, ``during=``, ``every=``, ``when=``); a tuple or list where there are several.
 
     Raises:
-        UnknownOption: Something is no intervention.
+        UnknownOption: Something is no intervention, or a name is not text.
 
     Example:
         >>> plan = Plan({"tool_block": {"mass": 0.05}, "floor_friction": Hard(0.2, at=10)})
@@ -93,6 +93,10 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             self._parts: dict[str, tuple[Any, ...]] = request._parts
         else:
             flat = flatten({} if request is None else request)
+            for name in flat:
+                if not isinstance(name, str):
+                    allowed = ("text, such as 'tool_block.mass'",)
+                    raise UnknownOption("name of a variable", name, allowed)
             self._parts = {name: _several(value) for name, value in flat.items()}
 
     @classmethod
@@ -256,9 +260,14 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         """Write the plan as plain data.
 
         Raises:
-            ModelError: It has a function that cannot be found again under its name.
+            ModelError: It has a function that cannot be found again under its name, or a number
+                that is not finite.
         """
         check_portable(self._functions())
+        infinite = [(name, act) for name, act in self.acts() if not _is_finite(act)]
+        if infinite:
+            said = "has a number that is not finite, which JSON does not have"
+            raise ModelError([f"do({name}): {act!r} {said}" for name, act in infinite])
         return {"format": FORMAT, "do": _PARTS.dump_python(self._parts, mode="json")}
 
     def to_json(self) -> str:
@@ -318,10 +327,13 @@ def _short(act: Any) -> str:
 
 
 def _several(value: Any) -> tuple[Any, ...]:
-    is_list = isinstance(value, list | tuple) and len(value) > 0
-    if is_list and all(isinstance(act, ACTS) for act in value):
-        return tuple(value)
+    if isinstance(value, list | tuple) and any(isinstance(act, ACTS) for act in value):
+        return tuple(map(as_act, value))
     return (as_act(value),)
+
+
+def _is_finite(act: Any) -> bool:
+    return bool(np.isfinite(getattr(act, "value", getattr(act, "by", 0.0))).all())
 
 
 def has_times(request: Any) -> bool:
