@@ -851,6 +851,7 @@ class Simulation:
                 self.backend.restore(engine)
                 self._adopt(present.compiled, present.model, present.row, moved=False)
                 self._values.matrix[0] = present.row.numbers
+                self._values.be_at(self._index)
         except (SnapshotMismatch, EngineFailure):
             raise
         except Exception as error:
