@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, final
 
@@ -16,8 +16,8 @@ from scm_world.graph import SCM
 from scm_world.output.durable import made, removed, write_durably, write_whole
 from scm_world.output.reading import read_text
 from scm_world.output.remote import Location, located
-from scm_world.queries.experiments.effects import EdgeKey, Effects, series
-from scm_world.queries.experiments.paired import REMEMBERED, Paired
+from scm_world.queries.experiments.effects import EdgeKey, Effects
+from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
@@ -203,23 +203,20 @@ def _discovered(
     if path is not None and isinstance(system, Simulation):
         saved = Checkpoint(path, _terms(system, seed))
         first = min(saved.read(effects), probes)
-    states = probe_states(system, probes, seed, first=max(0, first - REMEMBERED))
-
-    def experiments() -> Iterator[Effects]:
-        for number, probe in enumerate(states, max(0, first - REMEMBERED)):
-            if number < first:  # what it lends to later ones is not in the file
-                paired.look(number, probe)
-            else:
-                yield paired.run(number, probe)
-
-    def finished(done: int) -> bool:
-        if found is not None:
-            found(effects.edges(declared))
-        if saved is not None:
-            saved.write(effects, done)
-        return False
-
-    done, _ = series(experiments(), effects, probes, finished, progress, done=first)
+    done = first
+    try:
+        for probe in probe_states(system, probes, seed, first=first):
+            effects.add(paired.run(done, probe))
+            done += 1
+            if found is not None:
+                found(effects.edges(declared))
+            if saved is not None:
+                saved.write(effects, done)
+            if progress is not None:
+                progress(done, probes)
+    except KeyboardInterrupt:
+        if not done:
+            raise
     if saved is not None and done == probes:
         saved.end()
     edges = effects.edges(declared)

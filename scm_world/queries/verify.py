@@ -4,27 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 from scm_world._arguments import whole_number
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM, Edge
-from scm_world.queries.experiments.effects import EdgeKey, Effects, series
+from scm_world.queries.experiments.effects import EdgeKey, Effects, ProbeSetting
 from scm_world.queries.experiments.markov import Markov
 from scm_world.queries.experiments.paired import Paired
-from scm_world.queries.experiments.probes import Probe
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
-from scm_world.queries.verification import (
-    Fired,
-    Undeclared,
-    Unseen,
-    Verification,
-    by_provenance,
-    named,
-)
+from scm_world.queries.verification import EdgeReport, Verification, by_provenance
 from scm_world.tasks import Task
 from scm_world.world import Simulation
 
@@ -112,59 +104,53 @@ def _verified(
     progress: Progress | None,
     found: Callable[[set[EdgeKey]], object] | None,
 ) -> Verification:
-    started = time.perf_counter()
-    world = system if isinstance(system, Simulation) else None
-    model: SCM = system if isinstance(system, SCM) else system.model
+    started, paired = time.perf_counter(), Paired(system, seed)
+    model, world = paired.model, system if isinstance(system, Simulation) else None
+    markov = None if world is None else Markov(paired)
     generated = world is not None and world.task.generated_graph
-    declared = tuple(edge.key for edge in model.edges)
+    declared = {edge.key for edge in model.edges}
     missing, after = set(declared), dict[EdgeKey, int]()
-    effects = Effects(exact=generated)
-    paired, markov = Paired(system, seed), None if world is None else Markov(world, seed)
-
-    def experiments(states: Iterator[Probe], first: int, *, held: bool) -> Iterator[Effects]:
-        for number, probe in enumerate(states, first):
-            one = paired.run(number, probe, missing)
-            if held and markov is not None and not one.unstable:
-                markov.run(number, probe, one)
-            yield one
-
-    def is_enough(done: int) -> bool:
-        now = effects.edges(declared)
-        if found is not None:
-            found(now)
-        after.update(dict.fromkeys(missing & now, done))
-        missing.difference_update(now)
-        return not missing or (generated and done - max(after.values(), default=0) >= QUIET)
-
-    states = probe_states(system, probes, seed)
-    searched, interrupted = series(
-        experiments(states, 0, held=False), effects, probes, is_enough, progress, further=held_out
-    )
-    done = searched
-    if not interrupted:
-        states = probe_states(system, held_out, seed + OTHER, scenarios=False)
-        done, interrupted = series(
-            experiments(states, searched, held=True),
-            effects,
-            searched + held_out,
-            lambda done: is_enough(done) and False,
-            progress,
-            done=searched,
-        )
+    effects, done, searched, interrupted = Effects(exact=generated), 0, 0, False
+    search = probe_states(system, probes, seed)
+    others = probe_states(system, held_out, seed + OTHER, scenarios=False)
+    try:
+        for held, states in ((False, search), (True, others)):
+            for probe in states:
+                one = paired.run(done, probe, missing)
+                if held and markov is not None and not one.unstable:
+                    markov.run(one)
+                effects.add(one)
+                done, searched = done + 1, searched + (not held)
+                now = effects.edges(declared)
+                after.update(dict.fromkeys(missing & now, done))
+                missing -= now
+                quiet = generated and done - max(after.values(), default=0) >= QUIET
+                last = not held and (quiet or not missing)
+                if found is not None:
+                    found(now)
+                if progress is not None:
+                    progress(done, held_out + (searched if held or last else probes))
+                if last:
+                    break
+    except KeyboardInterrupt:
+        if not done:
+            raise
+        interrupted = True
     observed = effects.edges(declared)
     wrong = dict(effects.violations)
-    for key in observed.difference(declared):
+    for key in observed - declared:
         wrong.setdefault(key, (effects.largest[key], effects.settings[key]))
-    undeclared = tuple(
-        Undeclared(
-            **named(key),
-            size=size,
-            probe=setting.probe,
-            kind=setting.kind,
-            change=() if setting.change is None else tuple(setting.change.tolist()),
-        )
-        for key, (size, setting) in sorted(wrong.items())
-    )
+    edges = list[EdgeReport]()
+    for edge in sorted(model.edges, key=lambda edge: edge.key):
+        key, size = edge.key, effects.largest.get(edge.key, 0.0)
+        told: dict[str, Any] = {"status": "unseen", "states": effects.changed[edge.cause]}
+        if key in observed:
+            told |= {"status": "fired", "after": after[key]}
+        else:
+            told["reason"] = _reason(world, edge, effects, observed)
+        edges.append(_reported(key, size, effects.settings.get(key), **told))
+    for key, (size, setting) in sorted(wrong.items()):
+        edges.append(_reported(key, size, setting, status="undeclared"))
     return Verification(
         task=world.task.name if world else "model",
         backend=world.backend.name if world else "equations",
@@ -178,23 +164,17 @@ def _verified(
         rollouts=effects.rollouts,
         provenance=by_provenance(model, declared, observed, wrong),
         unstable=effects.unstable,
-        fired=tuple(
-            Fired(**named(key), after=after[key], largest=effects.largest[key])
-            for key in sorted(observed.intersection(declared))
-        ),
-        unseen=tuple(
-            Unseen(
-                **named(edge.key),
-                states=effects.changed[edge.cause],
-                reason=_reason(world, edge, effects, observed),
-            )
-            for edge in sorted(model.edges, key=lambda edge: edge.key)
-            if edge.key not in observed
-        ),
-        undeclared=undeclared,
+        edges=tuple(edges),
         seconds=time.perf_counter() - started,
         versions=versions(world.engine if world else ""),
     )
+
+
+def _reported(key: EdgeKey, size: float, setting: ProbeSetting | None, **more: Any) -> EdgeReport:
+    if setting is not None:
+        more |= setting._asdict() | {"change": setting.change.tolist()}
+    cause, effect, lag = key
+    return EdgeReport(cause=cause, effect=effect, lag=lag, size=size, **more)
 
 
 def _reason(world: Simulation | None, edge: Edge, effects: Effects, observed: set[EdgeKey]) -> str:
