@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from itertools import accumulate
+from types import MappingProxyType
 from typing import Any, Literal, Self, final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from scm_world.errors import UnreadableFile
-from scm_world.graph import SCM
-from scm_world.queries.experiments.effects import EdgeKey
+from scm_world.graph import SCM, Edge
+from scm_world.queries.experiments.effects import EdgeKey, Effects, ProbeSetting
+from scm_world.queries.experiments.versions import versions
 from scm_world.variables import Measured
+from scm_world.world import Simulation
 
 SHOWN = 10  # edges that are written out in a table
 NAMED = 3  # variables that are named in a headline
@@ -104,50 +108,39 @@ class EdgeReport(BaseModel):
         return f"{arrow(self.key)}: {self.reason or seen}"
 
 
-@final
-class Verification(Report):
-    """The result of comparing a declared graph with the physics.
+class GraphReport(Report):
+    """The result of experiments with a declared graph.
 
     Attributes:
-        format: Of the file.
         task: Name of the task.
         arguments: What the task was made with, each as ``name=value``, where that is known.
         backend: Its name.
         preset: Its numerical settings.
         seed: Of the experiments.
-        generated: Whether the graph follows from structure: then physics may have nothing to show
-            of an edge (the mass of what falls freely moves nothing).
         probes: Probe states that were used.
-        held_out: Further ones, of another seed and without the task's scenarios, in which effects
-            without an edge were looked for.
+        planned: How many there may have been.
+        rollouts: Control steps simulated in an experiment of their own.
+        edges: Declared edges, and effects without one.
         provenance: How many declared edges were seen, how many there are, and how many effects
             without an edge were seen, by what decides the effect: ``"engine"``, ``"readout"``
             (computed from states) or ``"definition"``.
         unstable: By how much a variable differed though nothing had been changed: in a second run,
             or evaluated a second time.
-        planned: How many probe states there may have been, without those.
-        interrupted: Whether it was stopped (Ctrl-C) before it was through.
-        rollouts: Control steps simulated in an experiment of their own.
-        edges: Declared edges, and effects without one.
         seconds: Wall time.
         versions: Of everything that decides the result.
     """
 
-    format: Literal["scm_world/verification/4"] = "scm_world/verification/4"
     task: str
     arguments: tuple[str, ...] = ()
     backend: str
     preset: str
     seed: int
-    generated: bool = False
     probes: int
-    held_out: int = 0
-    provenance: dict[str, tuple[int, int, int]] = {}
-    unstable: dict[str, float] = {}
     planned: int
-    interrupted: bool
     rollouts: int
     edges: tuple[EdgeReport, ...]
+    provenance: dict[str, tuple[int, int, int]] = {}
+    unstable: dict[str, float] = {}
     seconds: float
     versions: dict[str, str]
 
@@ -167,24 +160,62 @@ class Verification(Report):
         return tuple(edge for edge in self.edges if edge.status == "undeclared")
 
     @property
-    def never_fired(self) -> tuple[EdgeKey, ...]:
-        """The declared edges that were not seen, as keys."""
-        return tuple(edge.key for edge in self.unseen)
-
-    @property
     def declared(self) -> tuple[EdgeKey, ...]:
         """The declared edges, as keys."""
-        return tuple(edge.key for edge in (*self.fired, *self.unseen))
+        return tuple(edge.key for edge in self.edges if edge.status != "undeclared")
 
     @property
     def found(self) -> tuple[EdgeKey, ...]:
         """The edges that were observed, declared or not, as keys."""
-        return tuple(edge.key for edge in (*self.fired, *self.undeclared))
+        return tuple(edge.key for edge in self.edges if edge.status != "unseen")
 
     @property
     def floor(self) -> float:
         """The largest difference between two runs without a change."""
         return max(self.unstable.values(), default=0.0)
+
+    @classmethod
+    def of(
+        cls, system: Simulation | SCM, effects: Effects, edges: Iterable[EdgeReport], **more: Any
+    ) -> Self:
+        """Make the report of a system."""
+        world = None if isinstance(system, SCM) else system
+        model = system if isinstance(system, SCM) else system.model
+        return cls(
+            task=world.task.name if world else "model",
+            backend=world.backend.name if world else "equations",
+            preset=world.options.preset if world else "none",
+            versions=versions(world.engine if world else ""),
+            rollouts=effects.rollouts,
+            unstable=effects.unstable,
+            edges=tuple(edges),
+            provenance=by_provenance(model, edges),
+            **more,
+        )
+
+
+@final
+class Verification(GraphReport):
+    """The result of comparing a declared graph with the physics.
+
+    Attributes:
+        format: Of the file.
+        generated: Whether the graph follows from structure: then physics may have nothing to show
+            of an edge (the mass of what falls freely moves nothing).
+        held_out: Further probe states, of another seed and without the task's scenarios, in which
+            effects without an edge were looked for.
+        interrupted: Whether it was stopped (Ctrl-C) before it was through.
+    """
+
+    format: Literal["scm_world/verification/4"] = "scm_world/verification/4"
+    generated: bool = False
+    held_out: int = 0
+    interrupted: bool
+
+    @property
+    def never_fired(self) -> tuple[EdgeKey, ...]:
+        """The declared edges that were not seen, as keys."""
+        return tuple(edge.key for edge in self.unseen)
 
     @property
     def share(self) -> float:
@@ -283,29 +314,60 @@ def failed(outcomes: Iterable[Outcome], *, strict: bool) -> bool:
     return not {*outcomes} <= ({"confirmed"} if strict else {"confirmed", "not refuted"})
 
 
-def by_provenance(
-    model: SCM, declared: Iterable[EdgeKey], found: set[EdgeKey], undeclared: Iterable[EdgeKey]
-) -> dict[str, tuple[int, int, int]]:
+def by_provenance(model: SCM, edges: Iterable[EdgeReport]) -> dict[str, tuple[int, int, int]]:
     """Count declared edges that were seen, all of them, and undeclared ones, by what decides.
 
     The engine decides states and what it reports. What is computed from them is a readout, and
     everything else follows by definition: its edges hold because the mechanism is what it is.
     """
-    counts = {"engine": [0, 0, 0], "readout": [0, 0, 0], "definition": [0, 0, 0]}
-    declared = set(declared)
-    for column, keys in enumerate((declared & found, declared, undeclared)):
-        for _, name, _ in keys:
-            effect: Any = model.declared(name)
-            measured = isinstance(effect, Measured)
-            by = (
-                "definition"
-                if not measured
-                else "engine"
-                if effect.mechanism is None
-                else "readout"
-            )
-            counts[by][column] += 1
-    return {by: (seen, all_, others) for by, (seen, all_, others) in counts.items()}
+    counts = {by: Counter[str]() for by in ("engine", "readout", "definition")}
+    for edge in edges:
+        effect: Any = model.declared(edge.effect)
+        measured = isinstance(effect, Measured)
+        by = "definition" if not measured else "engine" if effect.mechanism is None else "readout"
+        counts[by][edge.status] += 1
+    return {
+        by: (found["fired"], found["fired"] + found["unseen"], found["undeclared"])
+        for by, found in counts.items()
+    }
+
+
+def edge_reports(
+    model: SCM,
+    effects: Effects,
+    after: Mapping[EdgeKey, int] = MappingProxyType({}),
+    reason: Callable[[Edge], str] = lambda edge: "not seen",
+) -> list[EdgeReport]:
+    """List declared edges, seen or not, and effects without an edge.
+
+    Args:
+        model: Declares the edges.
+        effects: What was seen.
+        after: How many probe states it took until an edge was seen, where that is known.
+        reason: Returns why a declared edge was not seen.
+    """
+    edges, reports = sorted(model.edges, key=lambda edge: edge.key), list[EdgeReport]()
+    declared = {edge.key for edge in edges}
+    observed = effects.edges(declared)
+
+    def add(key: EdgeKey, size: float, setting: ProbeSetting | None, **more: Any) -> None:
+        if setting is not None:
+            more |= setting._asdict() | {"change": setting.change.tolist()}
+        cause, effect, lag = key
+        reports.append(EdgeReport(cause=cause, effect=effect, lag=lag, size=size, **more))
+
+    for edge in edges:
+        more: dict[str, Any] = {"states": effects.changed[edge.cause], "status": "fired"}
+        if edge.key in observed:
+            more["after"] = after.get(edge.key, 0)
+        else:
+            more |= {"status": "unseen", "reason": reason(edge)}
+        where = effects.settings.get(edge.key)
+        add(edge.key, effects.largest.get(edge.key, 0.0), where, **more)
+    for key in sorted(observed - declared | effects.violations.keys()):
+        seen = effects.largest.get(key, 0.0), effects.settings.get(key)
+        add(key, *effects.violations.get(key, seen), status="undeclared")
+    return reports
 
 
 def counted(provenance: Mapping[str, tuple[int, int, int]]) -> list[Row]:

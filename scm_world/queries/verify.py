@@ -5,18 +5,18 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from scm_world._arguments import whole_number
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM, Edge
-from scm_world.queries.experiments.effects import EdgeKey, Effects, ProbeSetting
+from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.markov import Markov
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
-from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
-from scm_world.queries.verification import EdgeReport, Verification, by_provenance
+from scm_world.queries.verification import Verification, edge_reports
 from scm_world.tasks import Task
 from scm_world.world import Simulation
 
@@ -136,48 +136,22 @@ def _verified(
         if not done:
             raise
         interrupted = True
-    observed = effects.edges(declared)
-    wrong = dict(effects.violations)
-    for key in observed - declared:
-        wrong.setdefault(key, (effects.largest[key], effects.settings[key]))
-    edges = list[EdgeReport]()
-    for edge in sorted(model.edges, key=lambda edge: edge.key):
-        key, size = edge.key, effects.largest.get(edge.key, 0.0)
-        told: dict[str, Any] = {"status": "unseen", "states": effects.changed[edge.cause]}
-        if key in observed:
-            told |= {"status": "fired", "after": after[key]}
-        else:
-            told["reason"] = _reason(world, edge, effects, observed)
-        edges.append(_reported(key, size, effects.settings.get(key), **told))
-    for key, (size, setting) in sorted(wrong.items()):
-        edges.append(_reported(key, size, setting, status="undeclared"))
-    return Verification(
-        task=world.task.name if world else "model",
-        backend=world.backend.name if world else "equations",
-        preset=world.options.preset if world else "none",
+    reason = partial(_reason, world, effects, effects.edges(declared))
+    return Verification.of(
+        system,
+        effects,
+        edge_reports(model, effects, after, reason),
         seed=seed,
         generated=generated,
         probes=searched,
         held_out=done - searched,
         planned=probes,
         interrupted=interrupted,
-        rollouts=effects.rollouts,
-        provenance=by_provenance(model, declared, observed, wrong),
-        unstable=effects.unstable,
-        edges=tuple(edges),
         seconds=time.perf_counter() - started,
-        versions=versions(world.engine if world else ""),
     )
 
 
-def _reported(key: EdgeKey, size: float, setting: ProbeSetting | None, **more: Any) -> EdgeReport:
-    if setting is not None:
-        more |= setting._asdict() | {"change": setting.change.tolist()}
-    cause, effect, lag = key
-    return EdgeReport(cause=cause, effect=effect, lag=lag, size=size, **more)
-
-
-def _reason(world: Simulation | None, edge: Edge, effects: Effects, observed: set[EdgeKey]) -> str:
+def _reason(world: Simulation | None, effects: Effects, observed: set[EdgeKey], edge: Edge) -> str:
     """Say why an edge was not seen, as far as the experiments tell."""
     cause, states = edge.cause, effects.changed[edge.cause]
     if not states:

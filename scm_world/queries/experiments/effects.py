@@ -43,7 +43,7 @@ class Effects:
     Attributes:
         largest: By cause, effect and lag.
         settings: Where it was seen, if it is not zero.
-        violations: The largest effect, and where, of what changed while all its parents were held.
+        violations: By how much, and where, something changed while all its parents were held.
         unstable: By how much a variable differed though nothing had been changed.
         changed: In how many probe states each variable got another value.
         refused: Targets for which no feasible value was found, with how often.
@@ -69,11 +69,6 @@ class Effects:
             if setting is not None and size > 0.0:
                 self.settings[key] = setting
 
-    def see_violation(self, key: EdgeKey, size: float, setting: ProbeSetting) -> None:
-        """Keep an effect on what has other parents if it is the largest of its pair."""
-        if size > self.violations.get(key, (0.0,))[0]:
-            self.violations[key] = size, setting
-
     def see_unstable(self, name: str, size: float) -> None:
         """Keep a difference that nothing explains if it is the largest of its variable."""
         if size > self.unstable.get(name, 0.0):
@@ -83,8 +78,7 @@ class Effects:
         """Add what was seen in another probe state."""
         for key, size in other.largest.items():
             self.see(key, size, other.settings.get(key))
-        for key, violation in other.violations.items():
-            self.see_violation(key, *violation)
+        self.violations = other.violations | self.violations
         for name, size in other.unstable.items():
             self.see_unstable(name, size)
         self.changed += other.changed

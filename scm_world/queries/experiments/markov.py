@@ -98,7 +98,7 @@ class Markov:
             for turn in range(min(MOST_GROUPS, len(groups))):
                 parents, children = groups[(number + draw * MOST_GROUPS + turn) % len(groups)]
                 some = {name: value for name, value in changed.items() if name not in parents}
-                later = actions[: 0 if turn else len(base.values) - 2]
+                later = actions[:0] if turn or len(base.values) == 2 else actions
                 self._see(some, partial(self._differing, base, parents, children, later))
 
     # --- the pieces -------------------------------------------------------------------------------
@@ -226,7 +226,7 @@ class Markov:
             first, setting = self._paired.first, self._paired.setting
             change = np.concatenate([np.ravel(changed[n]) - np.ravel(first[n]) for n in causes])
             setting = setting._replace(kind=f"{setting.kind}, together", change=change)
-            self._effects.see_violation((" & ".join(causes), *effect), size(causes), setting)
+            self._effects.violations[" & ".join(causes), *effect] = size(causes), setting
 
     def _size(
         self,
