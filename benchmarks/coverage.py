@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from rich.progress import track
 
+from benchmarks import as_json
 from scm_world._types import Floats
 from scm_world.evaluation.statistics import (
     METRICS,
@@ -325,7 +326,7 @@ def main() -> None:
     if asked.out is not None:
         asked.out.mkdir(parents=True, exist_ok=True)
         results, into = asked.out / "coverage.json", asked.out / "coverage.md"
-    write_durably(results, (json.dumps({**about, "results": found}, indent=1) + "\n").encode())
+    write_durably(results, (as_json({**about, "results": found}) + "\n").encode())
     write_durably(into, page(found, about).encode())
 
 

@@ -1,4 +1,4 @@
-"""Figures of discovery: ``python benchmarks/discovery.py PART``; parts are listed by ``--help``.
+"""Figures of discovery: ``python -m benchmarks.discovery PART``; parts are listed by ``--help``.
 
 Results are written to ``benchmarks/discovery/PART.json``. Times are those of one core: start it
 with ``OMP_NUM_THREADS=1 taskset -c 0``.
@@ -20,6 +20,7 @@ from typing import Any
 import networkx as nx
 import numpy as np
 
+from benchmarks import as_json
 from scm_world.discovery.data import Dataset, Design, collect
 from scm_world.discovery.data.truth import projected
 from scm_world.discovery.learners import baselines, learn
@@ -478,7 +479,7 @@ def main() -> None:
     started = time.perf_counter()
     found = {"part": part, "versions": versions(), "results": PARTS[part]()}
     found["seconds"] = time.perf_counter() - started
-    text = json.dumps(found, indent=1, default=str)
+    text = as_json(found)
     HERE.mkdir(exist_ok=True)
     (HERE / f"{part}.json").write_text(text + "\n")
     print(text)

@@ -2,7 +2,7 @@
 
 ::
 
-    python benchmarks/evaluation.py --predecessor /path/to/environment/bin/python
+    python -m benchmarks.evaluation --predecessor /path/to/environment/bin/python
 
 Twelve protocols of pushing on MuJoCo, 200 episodes each, played by a small network. First the two
 pipelines take turns on one core: this one, and CausalWorld 1.2 in the environment of its own that
@@ -38,6 +38,7 @@ from typing import Any
 from evaluation_policy import Mlp
 from evaluation_steps import shares
 
+from benchmarks import as_json
 from scm_world.evaluation.pipeline import evaluate, played
 from scm_world.evaluation.protocols import protocols_of
 from scm_world.evaluation.setups import SHARD, prepare
@@ -234,9 +235,7 @@ def main() -> None:
     print(json.dumps(results, indent=1, ensure_ascii=False))
     about = {"machine": platform.machine(), "system": platform.system(), "cores": os.cpu_count()}
     asked.out.parent.mkdir(parents=True, exist_ok=True)
-    asked.out.write_text(
-        json.dumps({"about": about, "results": results}, indent=1, ensure_ascii=False) + "\n"
-    )
+    asked.out.write_text(as_json({"about": about, "results": results}) + "\n")
     print(f"\nwritten to {asked.out}")
     if not results["whole"]["all equal"]:
         raise SystemExit("the tables differ")

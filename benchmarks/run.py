@@ -1,13 +1,12 @@
 """Measure sampling, drawing, geometry, walls and discovery; ``benchmarks.speed`` has the rest.
 
-``python benchmarks/run.py [--out FILE]`` prints a table and writes it as JSON. Times are medians of
+``python -m benchmarks.run [--out FILE]`` prints a table and writes it as JSON. Times are medians of
 several repeats on whatever machine this is.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import platform
 import statistics
 import time
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 import scm_world as sw
+from benchmarks import as_json
 from scm_world.backends.renderer import camera_pixels
 from scm_world.geometry.filling import overlap_fraction
 from scm_world.queries.experiments.versions import versions
@@ -139,7 +139,7 @@ def main() -> None:
         for name, value in figures.items():
             print(f"  {name:<45} {value:>14,.3f}")
     about = {"machine": platform.machine(), "system": platform.system(), **versions()}
-    out.write_text(json.dumps({"about": about, "results": results}, indent=1) + "\n")
+    out.write_text(as_json({"about": about, "results": results}) + "\n")
     print(f"\nwritten to {out}")
 
 

@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 from scm_world.evaluation import evaluate
-from scm_world.evaluation.outputs import radar_figure, save
+from scm_world.evaluation.figures import radar_figure, save
 from scm_world.training.loop import train
 from scm_world.training.recipe import recipe
 

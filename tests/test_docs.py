@@ -48,7 +48,6 @@ SHORT_COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {  # numbers that make t
     "agents.md": {
         "train": ("--steps=1024", "--no-evaluate"),
         "evaluate zoo": ("-n", "4", "--env=max_episode_length=20", "--workers=1"),
-        "evaluate --check": ("--part=2",),
     }
 }
 

@@ -162,9 +162,9 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
         {"path": "results", "reason": "No space left on device"},
     ),
     (
-        MissingExtra("trimesh", "mesh"),
-        "this needs the package 'trimesh'; install it with: pip install 'scm-world[mesh]'",
-        {"package": "trimesh", "extra": "mesh"},
+        MissingExtra("minari", "data"),
+        "this needs the package 'minari'; install it with: pip install 'scm-world[data]'",
+        {"package": "minari", "extra": "data"},
     ),
     (
         MissingEngine("bullet", "pip install pybullet", "no wheel"),

@@ -20,6 +20,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from benchmarks import as_json
 from scm_world.queries import World, verify
 from scm_world.testing.model import check_model
 
@@ -107,7 +108,7 @@ def main(picked: list[str]) -> None:
         for one in rows
     ]
     (HERE / "proof.md").write_text("\n".join(lines) + "\n")
-    (HERE / "proof.json").write_text(json.dumps(rows, indent=1) + "\n")
+    (HERE / "proof.json").write_text(as_json(rows) + "\n")
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ import pandas as pd
 from benchmarks.reproduction.paper import paper
 from scm_world.errors import in_one_line
 from scm_world.evaluation import Evaluation, evaluate, protocols_of
-from scm_world.evaluation.outputs.report import write_outputs
+from scm_world.evaluation.figures import write_figures
 from scm_world.evaluation.statistics import aggregate
 from scm_world.output.durable import locked, write_whole
 from scm_world.training.loop import train
@@ -140,7 +140,7 @@ def run_cell(asked: argparse.Namespace, cell: Cell) -> None:
     if not is_done(asked, place, policy):
         agent = {f"{cell.algo.upper()} curriculum {cell.curriculum}": str(policy)}
         play(asked, place, agent, cell.task)
-        write_outputs(Evaluation.load(place), place)
+        write_figures(Evaluation.load(place), place)
 
 
 def play(asked: argparse.Namespace, place: Path, agent: Any, task: str, **env: Any) -> None:

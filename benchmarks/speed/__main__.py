@@ -25,6 +25,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from benchmarks import as_json
 from benchmarks.speed.adapter import adapting
 from benchmarks.speed.batches import batching
 from benchmarks.speed.changing import changing, making
@@ -142,7 +143,7 @@ def main(given: list[str] | None = None) -> None:
     for name in asked.only:
         if not measured(name, settings, core, document):
             broken.append(name)
-        write_durably(path, (json.dumps(document, indent=1, ensure_ascii=False) + "\n").encode())
+        write_durably(path, (as_json(document) + "\n").encode())
     draw(document["results"], (DOCS / "images" if asked.out == HERE else asked.out) / "speed.png")
     if asked.page is not None:
         put(page(document), asked.page)

@@ -79,7 +79,7 @@ def discover(
     """Recover a causal graph by experiments, and score it; or benchmark learners.
 
     Without --learner the one-step graph of a system is recovered by paired experiments. With it,
-    and for families, learners run over budgets and seeds, and a table, a picture and a report are
+    and for families, learners run over budgets and seeds, and a table and a picture are
     written. Exits 1 if an effect is found that no edge declares. After Ctrl-C (exit code 130) the
     same command resumes.
     Example: scm-world discover er2:20 --learner do_order,gies
@@ -210,7 +210,7 @@ def _benchmark(
     out: Location | None,
 ) -> None:
     """Run learners over budgets and seeds; print a table per problem."""
-    from scm_world.discovery.benchmark_report import HEADS, MARKED, columns, size, summary
+    from scm_world.discovery.benchmark_summary import HEADS, MARKED, columns, size, summary
     from scm_world.discovery.benchmarks import benchmark, slug
     from scm_world.discovery.learners.registry import baselines as trivial
     from scm_world.discovery.learners.registry import learner as find
@@ -269,7 +269,7 @@ def _benchmark(
                 about += f", {title} {spreads[f'{key}_sortability'].mean:.2f}"
         console.table(
             (*HEADS[1:], *(column.title for column in shown)),
-            [  # the means over seeds; the ranges are in report.html
+            [  # the means over seeds; the ranges are in results.csv
                 (
                     *row.heads[1:],
                     *(
@@ -284,7 +284,7 @@ def _benchmark(
     ended = Counter((r.learner, r.problem, r.message) for r in result.runs if r.status != "done")
     for (name, problem, reason), runs in ended.items():
         console.say(f"{name} on {problem}, not done in {runs} run(s): {' '.join(reason.split())}")
-    console.written(*(folder / name for name in ("report.html", "results.csv", "budget.png")))
+    console.written(*(folder / name for name in ("results.csv", "budget.png")))
 
 
 def verify(

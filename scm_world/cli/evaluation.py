@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,17 +31,13 @@ def evaluate(
     executor: options.Executor = None,
     address: options.Address = None,
     format_: options.Files = "parquet",
-    videos: bool = False,
     out: options.Out = None,
-    check: options.Place = None,
-    part: options.Count = 12,
     trust: options.Trust = None,
 ) -> None:
     """Score policies in protocols, with 95 % intervals.
 
-    Writes results.json, a table of all episodes, plots and an HTML report. After Ctrl-C (exit code
-    130) the same command resumes. With --check PATH nothing is evaluated: a part of PATH is
-    repeated; exit code 1 if anything differs.
+    Writes results.json, a table of all episodes, and plots. After Ctrl-C (exit code 130) the same
+    command resumes.
     Example: scm-world evaluate zoo:pushing,random --protocols P0,P5 -n 100
 
     Args:
@@ -61,37 +56,20 @@ def evaluate(
         env: Option of the environment, such as frame_skip=3; repeat it for more.
         metric: Score that is shown and drawn; all are written. By default
             last_fractional_success, or return where a task has none.
-        videos: Film the best, median and worst episodes.
-        check: Repeat a random part of these results, and compare every bit.
-        part: Episodes that --check repeats.
     """
     from scm_world import evaluation
     from scm_world.evaluation import METRICS
+    from scm_world.evaluation.figures import write_figures
     from scm_world.evaluation.files import CODECS
-    from scm_world.evaluation.outputs.report import write_outputs
     from scm_world.evaluation.setups import task_of
 
     if trust or policy is not None:
         sys.path.insert(0, str(Path.cwd()))  # for what is defined beside where this is called
-    if check is not None:
-        again = None if policy is None else policies_of(policy)
-        with console.progress("episodes") as tell:
-            repeated = evaluation.check(
-                check, episodes=part, policy=again, trusted=tuple(trust or ()), progress=tell
-            )
-        console.say(repeated)
-        raise typer.Exit(0 if repeated else 1)
 
     if policy is None:
         raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")
     one_of("metric", metric, (None, *METRICS))
     one_of("format", format_, CODECS)
-    if format_ == "parquet" and find_spec("pyarrow") is None:
-        allowed = ("csv", "parquet after: pip install 'scm-world[data]'")
-        raise UnknownOption("format", "parquet", allowed)
-    if videos and find_spec("moviepy") is None:
-        needed = ("none, or after: pip install 'scm-world[video]'",)
-        raise UnknownOption("videos", "--videos", needed)
     agents = policies_of(policy)
     task = task or task_of(agents)
     made = load_task(task, option)
@@ -122,8 +100,7 @@ def evaluate(
         )
     metric = metric or next(name for name in METRICS if name in found.metrics)
     files = found.save(folder, kind=format_)
-    with console.progress("control steps") as tell:
-        more = write_outputs(found, folder, metric=metric, videos=videos, progress=tell)
+    more = write_figures(found, folder, metric)
 
     who = [(agent, engine) for engine in found.engines for agent in found.agents]
     heads = [agent if len(found.engines) == 1 else f"{agent}, {engine}" for agent, engine in who]

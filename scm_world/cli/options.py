@@ -153,7 +153,6 @@ def read_location(text: str) -> Location:
         raise typer.BadParameter(str(error)) from None
 
 
-Place = Annotated[Any, typer.Option(parser=read_location, metavar="PATH")]
 Out = Annotated[
     Any,  # a Location or None, which typer does not know
     typer.Option(

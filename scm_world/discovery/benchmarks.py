@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, final
 import numpy as np
 from pydantic import FiniteFloat, PlainValidator, TypeAdapter
 
-from scm_world._arguments import load, typed, whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world._fingerprint import changes, fingerprint
 from scm_world.discovery.data import Dataset
 from scm_world.discovery.data.truth import Pair
@@ -166,16 +166,14 @@ class BenchmarkResult:
         return [run.record for run in self.runs]
 
     def to_dataframe(self) -> Any:
-        """Return the rows as a ``pandas.DataFrame``.
+        """Return the rows as a ``pandas.DataFrame``."""
+        import pandas
 
-        Raises:
-            MissingExtra: pandas is not installed.
-        """
-        return load("pandas", "pandas", "data").DataFrame(self.records)
+        return pandas.DataFrame(self.records)
 
     def write(self, folder: Location | str) -> None:
         """Write ``benchmark.json``, ``results.csv``, a picture and a report."""
-        from scm_world.discovery.benchmark_report import write_files
+        from scm_world.discovery.benchmark_summary import write_files
 
         plain = {
             "format": FORMAT,
@@ -260,7 +258,7 @@ def benchmark(
         progress: Called with (done, planned) after each run.
 
     Returns:
-        All runs and scores; in ``out`` also ``results.csv``, ``budget.png`` and ``report.html``.
+        All runs and scores; in ``out`` also ``results.csv`` and ``budget.png``.
 
     Raises:
         UnknownOption: Something does not exist, or a learner cannot use a kind of data.

@@ -75,7 +75,7 @@ def sid_bounds(found: Bools, true: Bools) -> tuple[int, int] | None:
         Peters and Bühlmann, *Structural intervention distance for evaluating causal graphs*,
         Neural Computation 2015; computed by ``gadjid``.
     """
-    distance = load("gadjid", "gadjid", "discovery").sid
+    distance = load("gadjid", "gadjid", "learn").sid
     members = list(islice(extensions(found), MEMBERS + 1))
     if not 0 < len(members) <= MEMBERS:
         return None
@@ -110,7 +110,7 @@ def aid(found: Bools, true: Bools, kind: Adjustment) -> int | None:
         Henckel, Würtzen and Weichwald, *Adjustment identification distance: a gadjid for causal
         structure learning*, UAI 2024.
     """
-    distance = getattr(load("gadjid", "gadjid", "discovery"), f"{kind}_aid")
+    distance = getattr(load("gadjid", "gadjid", "learn"), f"{kind}_aid")
     member = extension(found)
     if member is None or not is_acyclic(true):
         return None

@@ -372,7 +372,7 @@ def _within_an_instant(edges: Bools, true: Bools, counts: Bools) -> dict[str, An
         else:
             result["sid_lower"], result["sid_upper"] = bounds
     else:
-        notes.append("no SID, no adjustment distances: pip install 'scm-world[discovery]'")
+        notes.append("no SID, no adjustment distances: pip install 'scm-world[learn]'")
     return {**result, "notes": tuple(notes)}
 
 

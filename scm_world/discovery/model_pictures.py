@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
+from string import Template
 from typing import TYPE_CHECKING, Any, final
 
 import networkx as nx
@@ -17,7 +18,6 @@ from scm_world.discovery.names import Families, by_entity
 from scm_world.graph import SCM
 from scm_world.graph.exchange import to_digraph
 from scm_world.output.canvas import DPI, INK, WIDTH, blank, save
-from scm_world.output.pages import render
 from scm_world.output.remote import Location
 
 if TYPE_CHECKING:
@@ -238,6 +238,23 @@ def draw_model(model: SCM, path: Location | str, *, title: str = "") -> None:
     save(_drawn(model, lay_out(model), title), path)
 
 
+PAGE = Template("""<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8">
+<title>$title</title><style>
+body{margin:0;background:#fff}svg{display:block}
+.node{cursor:pointer}text{pointer-events:none}.edge{pointer-events:none}
+.on .edge{opacity:.06}.on .edge.hot{opacity:1}
+</style></head><body>
+$picture
+<script>
+const svg=document.querySelector("svg");
+for(const node of svg.querySelectorAll(".node"))
+  for(const [event,on] of [["pointerenter",true],["pointerleave",false]])
+    node.addEventListener(event,()=>{svg.classList.toggle("on",on);
+      for(const edge of svg.querySelectorAll(".of"+node.id.slice(4)))
+        edge.classList.toggle("hot",on)});
+</script></body></html>
+""")
 MOST = 12  # variables of a node, or causes, that are described one by one
 
 
@@ -267,7 +284,7 @@ def to_html(model: SCM, *, title: str = "Causal graph") -> str:
         group = f'<g id="edge{number}"'
         ends = f"of{at.index(cause)} of{at.index(effect)}"
         picture = picture.replace(f"{group}>", f'{group} class="edge {ends}">')
-    return render("discovery/model.html", title=title, picture=picture)
+    return PAGE.substitute(title=escape(title), picture=picture)
 
 
 def _described(graph: nx.MultiDiGraph, name: str) -> str:

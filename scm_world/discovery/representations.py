@@ -108,7 +108,7 @@ def dci(codes: ArrayLike, factors: ArrayLike, *, trees: int = 50, seed: int = 0)
         representations*, ICLR 2018.
     """
     number = whole_number("seed", seed, least=0)
-    ensemble = load("sklearn.ensemble", "scikit-learn", "discovery")
+    ensemble = load("sklearn.ensemble", "scikit-learn", "learn")
     z, truth = _checked(codes, factors)
     half = len(z) // 2
     importances, foretold = [], []

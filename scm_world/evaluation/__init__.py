@@ -8,7 +8,6 @@ An evaluation is one call::
     found.save("results")
 """
 
-from scm_world.evaluation.checking import Check, check
 from scm_world.evaluation.episodes import METRICS
 from scm_world.evaluation.explanation import Explanation, Otherwise, why
 from scm_world.evaluation.pipeline import evaluate
@@ -21,7 +20,6 @@ from scm_world.evaluation.statistics import Causes, Interval
 __all__ = [
     "METRICS",
     "Causes",
-    "Check",
     "Evaluation",
     "Explanation",
     "Interval",
@@ -32,7 +30,6 @@ __all__ = [
     "Recording",
     "WorldPolicy",
     "as_player",
-    "check",
     "evaluate",
     "in_world",
     "player_from",

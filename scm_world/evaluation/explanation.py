@@ -14,7 +14,7 @@ from scm_world._arguments import one_of
 from scm_world.curricula.base import AnyPart, Part, Situation
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
-from scm_world.evaluation.checking import shard_runner_of
+from scm_world.evaluation.again import shard_runner_of
 from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation

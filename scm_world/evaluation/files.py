@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from scm_world._arguments import load as load_library
 from scm_world._arguments import one_of
 from scm_world.errors import DAMAGED, UnreadableFile
 from scm_world.evaluation.results import KEYS, TEXTS, WHOLE, Columns, Evaluation
@@ -73,27 +72,6 @@ def summarized(evaluation: Evaluation) -> list[dict[str, Any]]:
     ]
 
 
-def false_scores(path: Location, evaluation: Evaluation) -> list[str]:
-    """Compute the scores of a file again from its table; say which of them are others.
-
-    Args:
-        path: The folder, or its ``results.json``.
-        evaluation: That was read from it.
-    """
-    data = json.loads(read_text(path / RESULTS if path.is_dir() else path))
-    right = json.loads(json.dumps(summarized(evaluation)))
-    written = data.get("scores")
-    if not isinstance(written, list) or len(written) != len(right):
-        return [f"it has scores of {written and len(written)} rows, its table of {len(right)}"]
-    return [
-        f"{now['agent']}, {now['engine']}, {now['protocol']}: {name} is {then.get(name)!r} in the "
-        f"file, and {now[name]!r} by its table"
-        for now, then in zip(right, written, strict=True)
-        for name in now
-        if now[name] != then.get(name)
-    ]
-
-
 def load(path: Location) -> Evaluation:
     """Read an evaluation; see ``Evaluation.load``."""
     file = path / RESULTS if path.is_dir() else path
@@ -123,8 +101,9 @@ def _said(error: Exception) -> str:
 
 
 def _to_parquet(columns: Columns) -> bytes:
-    arrow = load_library("pyarrow", "pyarrow", "data")
-    parquet = load_library("pyarrow.parquet", "pyarrow", "data")
+    import pyarrow as arrow
+    from pyarrow import parquet
+
     table = arrow.table({n: arrow.array(c, from_pandas=False) for n, c in columns.items()})
     sink = arrow.BufferOutputStream()
     parquet.write_table(table, sink, compression="zstd", use_dictionary=list(TEXTS))

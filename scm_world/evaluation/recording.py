@@ -187,7 +187,6 @@ class Recording:
             path: Of the file; it gets the ending ``.parquet`` if it has another one.
 
         Raises:
-            MissingExtra: pyarrow is not installed.
             ModelError: Something cannot be written: a function without a name, say.
             UnwritableFolder: There is no such folder, no room, or no permission.
         """
@@ -208,7 +207,6 @@ class Recording:
             trusted: Packages other than this one whose functions may be mechanisms.
 
         Raises:
-            MissingExtra: pyarrow is not installed.
             UnreadableFile: It is no recording, or damaged.
             ModelError: A mechanism is a function of no trusted package.
         """

@@ -303,10 +303,11 @@ def to_parquet(header: str, episodes: Sequence[Recorded]) -> bytes:
     """Return the content of a Parquet file; the same bytes every time.
 
     Raises:
-        MissingExtra: pyarrow is not installed.
         ModelError: There is no episode, or some have other parts of the observation than others.
     """
-    arrow, parquet = load("pyarrow", "pyarrow", "data"), load("pyarrow.parquet", "pyarrow", "data")
+    import pyarrow as arrow
+    from pyarrow import parquet
+
     if len({tuple(parts(episode.observations[0])) for episode in episodes}) != 1:
         raise ModelError(["a recording to save has episodes of one environment, and one at least"])
     counts = [len(episode) + 1 for episode in episodes]
@@ -347,7 +348,6 @@ def from_parquet(
     """Read the header and the episodes of a Parquet file.
 
     Raises:
-        MissingExtra: pyarrow is not installed.
         UnreadableFile: It is something else, or damaged.
         ModelError: A mechanism is a function of no trusted package.
     """
@@ -420,13 +420,13 @@ def _array(row: NDArray[Any], *shape: int) -> NDArray[Any]:
 
 def to_minari(episodes: Sequence[Recorded], dataset_id: str, **about: Any) -> Any:
     """Write a dataset of Minari; see ``Recording.to_minari``."""
-    minari = load("minari", "minari", "minari")
-    local = load("minari.storage.local", "minari", "minari")
+    minari = load("minari", "minari", "data")
+    local = load("minari.storage.local", "minari", "data")
     folder = Path(local.get_dataset_path(str(dataset_id)))
     if folder.exists():
         allowed = f"one that is not taken: minari.delete_dataset({dataset_id!r}) removes this one"
         raise UnknownOption("id of a dataset", dataset_id, (allowed,))
-    buffer = load("minari.data_collector.episode_buffer", "minari", "minari").EpisodeBuffer
+    buffer = load("minari.data_collector.episode_buffer", "minari", "data").EpisodeBuffer
     arguments = _gym_arguments(as_data(episodes[0].environment))
     env: Any = gymnasium.make(disable_env_checker=True, **arguments)
     shapes = {

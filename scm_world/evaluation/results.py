@@ -399,7 +399,6 @@ class Evaluation:
         """Write ``results.json`` and the table beside it, ``"parquet"`` or ``"csv"``.
 
         Raises:
-            MissingExtra: pyarrow is not installed.
             UnwritableFolder: There is no room, or no permission.
         """
         from scm_world.evaluation.files import save

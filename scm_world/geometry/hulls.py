@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import ArrayLike, Floats, Integers
-from scm_world.errors import MissingExtra, ModelError, UnknownOption
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.filling import remainder_kernel
 from scm_world.geometry.rotations import rotation_matrix
 
@@ -103,7 +103,6 @@ def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
     Raises:
         ModelError: The file has no volume, too many corners, or cannot be read.
         UnknownOption: The file has another format.
-        MissingExtra: The extra ``mesh`` is not installed.
     """
     file = Path(path)
     kind = file.suffix.lower().removeprefix(".")
@@ -111,10 +110,8 @@ def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
         raise UnknownOption("mesh format", kind, FORMATS)
     if not (np.isfinite(scale) and scale > 0.0):
         raise ModelError([f"the scale of {file} must be positive and finite, got {scale}"])
-    try:
-        import trimesh
-    except ImportError as error:
-        raise MissingExtra("trimesh", "mesh") from error
+    import trimesh
+
     try:
         if not file.is_file():
             raise FileNotFoundError("it is no regular file, or not there")

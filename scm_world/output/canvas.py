@@ -24,7 +24,6 @@ PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 Source:
     Okabe and Ito, *Color universal design*, 2008.
 """
-COLORS = 64  # of a picture in a page: a third of the bytes
 STYLE: Any = {
     "text.parse_math": False,  # a name with two dollar signs is no formula
     "font.size": 8,
@@ -81,13 +80,3 @@ def png(figure: Figure) -> bytes:
 
 
 WHOLE: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.15}
-
-
-def small_png(figure: Figure) -> bytes:
-    """Return a figure with 64 colors, for a page that holds its figures in itself."""
-    from PIL import Image  # matplotlib brings it
-
-    small = io.BytesIO()
-    with Image.open(io.BytesIO(png(figure))) as image:
-        image.convert("RGB").quantize(COLORS).save(small, format="png", optimize=True)
-    return small.getvalue()

@@ -7,14 +7,12 @@ import io
 import os
 import stat
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import load
 from scm_world.output.remote import Location, located
 
 LARGEST = 2**28
@@ -87,13 +85,13 @@ def read_table(data: bytes) -> Any:
     """Read the content of a Parquet file: a ``pyarrow.Table``.
 
     Raises:
-        MissingExtra: pyarrow is not installed.
         ValueError: It is no whole Parquet file, or has more numbers than can be read.
     """
-    arrow = load("pyarrow", "pyarrow", "data")
-    parquet: Callable[..., Any] = load("pyarrow.parquet", "pyarrow", "data").ParquetFile
+    import pyarrow as arrow
+    from pyarrow.parquet import ParquetFile
+
     try:
-        file: Any = parquet(arrow.BufferReader(data))
+        file: Any = ParquetFile(arrow.BufferReader(data))
         groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
         parts = [group.column(i) for group in groups for i in range(group.num_columns)]
         size = sum(max(8 * part.num_values, part.total_uncompressed_size) for part in parts)

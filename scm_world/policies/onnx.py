@@ -41,7 +41,7 @@ class OnnxPolicy:
     """
 
     def __init__(self, path: Path, content: bytes | None = None) -> None:
-        runtime: Any = load("onnxruntime", "onnxruntime", "onnx")
+        runtime: Any = load("onnxruntime", "onnxruntime", "train")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.execution_mode = runtime.ExecutionMode.ORT_SEQUENTIAL

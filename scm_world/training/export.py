@@ -242,7 +242,7 @@ def to_onnx(policy: MlpPolicy | Path | str, path: Path | str) -> Path:
         UnreadableFile: The file is no policy.
         UnwritableFolder: There is no room, or no permission.
     """
-    onnx: Any = load("onnx", "onnx")
+    onnx: Any = load("onnx", "onnx", "train")
     given = policy if isinstance(policy, MlpPolicy) else load_policy(policy)
     if given.about.memory:
         raise UnknownOption("memory of an ONNX network", given.about.memory, ("0: none",))

@@ -138,7 +138,7 @@ def connected(workers: int | None, address: str | None) -> RayEngine:
     try:
         ray = import_module("ray")
     except ImportError as error:
-        raise MissingExtra("ray", "ray") from error
+        raise MissingExtra("ray", "cloud") from error
     if ray.is_initialized():
         _check_same(ray, address)
         return RayEngine(ray, workers, is_mine=False)

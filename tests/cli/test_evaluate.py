@@ -78,7 +78,7 @@ def test_evaluate_writes_everything_and_prints_a_table() -> None:
     data = json.loads((folder / "results.json").read_text())
     assert {*METRICS} <= {*data["scores"][0]}
     names = {path.name for path in folder.iterdir()}
-    assert {"results.json", "episodes.parquet", "bars.png", "report.html", "parts"} <= names
+    assert {"results.json", "episodes.parquet", "bars.png", "radar.png", "parts"} <= names
     assert all(name in " ".join(done.stdout.split()) for name in names - {"parts"})
 
 
@@ -96,25 +96,10 @@ def test_a_policy_beside_where_it_is_called(tmp_path: Path) -> None:
     Path("policies_of_a_test.py").write_text("def lazy(observation):\n    return [0.0] * 9\n")
     done = call("evaluate", "policies_of_a_test:lazy", "--protocols=P8", "-n2", *QUICK, "--out=o")
     assert done.exit_code == 0, done.output
-    refused = call("evaluate", "--check", "o")  # a file does not decide what is run
+    refused = call("explain", "o", "--protocol=P8", "--episode=1")  # a file does not decide
     assert refused.exit_code == 2
-    again = call("evaluate", "--check", "o", "--trust", "policies_of_a_test")
-    assert (again.exit_code, "the same bits in all of them" in again.stdout) == (0, True)
     told = call("explain", "o", "--protocol=P8", "--episode=1", "--trust=policies_of_a_test")
     assert told.exit_code == 0
-
-
-def test_check_plays_again(results: Evaluation) -> None:
-    """Exit code 0 for the same bits; 1 if a number was changed, with the place."""
-    again = call("evaluate", "--check", "out", "--part", "48")
-    assert again.exit_code == 0, again.output
-    assert "48 of 48 episodes" in again.stdout
-    changed = results.columns["return"] + 1.0
-    Evaluation(results.about, {**results.columns, "return": changed}).save("forged")
-    forged = call("evaluate", "--check", "forged/results.json", "--part", "5")
-    assert forged.exit_code == 1
-    assert "5 differ" in forged.stdout
-    assert "return is" in forged.stdout
 
 
 @pytest.mark.usefixtures("results")
@@ -181,7 +166,6 @@ def test_an_agent_of_another_task_is_told() -> None:
         (("evaluate", "still", "--metric", "beauty"), "beauty"),
         (("evaluate", "still", "--format", "parket"), "parquet"),
         (("evaluate", "still", "-n", "0"), "n"),
-        (("evaluate", "--check", "nowhere"), "nowhere"),
         (("explain", "nowhere"), "nowhere"),
         (("explain", "out"), "agent"),
         (("explain", "out", "--agent=still", "--protocol=P5"), "P5"),

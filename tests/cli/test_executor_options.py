@@ -81,7 +81,6 @@ def test_the_header_of_a_benchmark_is_about_all_seeds() -> None:
     said = " ".join(done.output.split())
     assert len({*edges}) > 1
     assert f"6 variables, {min(edges)} to {max(edges)} true edges, {min(hidden)} to" in said
-    assert f"{min(edges)} to {max(edges)} true edges" in Path("out", "report.html").read_text()
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -186,7 +186,7 @@ def test_everything_is_run_and_written(done: tuple[BenchmarkResult, Path]) -> No
     assert all(run.status == "done" for run in result.runs)
     assert all(run.scores["shd"] == 0 for run in by_learner(result)["paired"])
     assert set(files(folder)) == {str(run_path(folder, run)) for run in result.runs}
-    for name in ("benchmark.json", "results.csv", "budget.png", "report.html"):
+    for name in ("benchmark.json", "results.csv", "budget.png"):
         assert (folder / name).stat().st_size > 0
     assert not list(folder.rglob("*.part"))
     again = BenchmarkResult.read(folder)

@@ -111,7 +111,7 @@ def test_adjustment_distances_are_those_of_gadjid(monkeypatch: pytest.MonkeyPatc
     assert aid(ring, np.zeros((3, 3), bool), "parent") is None
 
     monkeypatch.setitem(sys.modules, "gadjid", None)
-    with pytest.raises(MissingExtra, match=r"scm-world\[discovery\]"):
+    with pytest.raises(MissingExtra, match=r"scm-world\[learn\]"):
         aid(two, two, "parent")
 
 

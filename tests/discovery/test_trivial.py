@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scm_world.discovery.benchmark_report import summary
+from scm_world.discovery.benchmark_summary import summary
 from scm_world.discovery.benchmarks import benchmark
 from scm_world.discovery.data import Column, Dataset, Design, collect
 from scm_world.discovery.learners import baselines, learn, learners

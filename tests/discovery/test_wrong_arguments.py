@@ -29,7 +29,6 @@ from scm_world.discovery import (
     score,
     sweep,
 )
-from scm_world.discovery.benchmark_report import compare
 from scm_world.discovery.data import (
     as_causal_learn,
     as_dcdi,
@@ -90,7 +89,6 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "evaluate_marks": (evaluate_marks, {"found": FOUND, "truth": TRUTH}),
     "effect_rmse": (effect_rmse, {"found": FOUND, "train": TABLE, "test": TABLE}),
     "sortability": (sortability, {"data": TABLE, "edges": TRUTH}),
-    "compare": (compare, {"truth": TRUTH, "found": FOUND}),
     "mag": (TRUTH.mag, {"lags": 0}),
     "problem": (problem, {"name": "er2:4", "seed": 0, "view": None}),
     "view": (TaskView, {"view": "step", "causes": None, "steps": 2, "options": {}}),

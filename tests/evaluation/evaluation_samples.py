@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.evaluation import METRICS, Evaluation, evaluate
+from scm_world.evaluation.again import shard_runner_of
 from scm_world.evaluation.episodes import EpisodeRow
 
 rng = np.random.default_rng(0)
@@ -113,3 +115,19 @@ def by_hand(
         )
         for episode, score in enumerate(scores)
     ]
+
+
+def played_again(found: Evaluation, **options: Any) -> list[str]:
+    """Play every episode of an evaluation again; list what is another number."""
+    wrong = []
+    with closing(shard_runner_of(found, **options)) as runner:
+        for place in range(len(found)):
+            row = {name: column[place].item() for name, column in found.columns.items()}
+            shard = runner.setup.shard_of(row)
+            again = Evaluation.of({}, [runner.play(shard, shard.first)]).columns
+            wrong += [
+                f"{place}: {name}"
+                for name, value in row.items()
+                if value == value and again[name][0] != value  # NaN: was not drawn
+            ]
+    return wrong

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from evaluation_samples import played_again
 from typer.testing import CliRunner
 
 from scm_world import ModelTask
@@ -19,13 +20,13 @@ from scm_world.evaluation import (
     Evaluation,
     Recording,
     WorldPolicy,
-    check,
     evaluate,
     protocols_of,
     record,
     why,
 )
-from scm_world.evaluation.outputs.report import write_outputs
+from scm_world.evaluation.again import shard_runner_of
+from scm_world.evaluation.figures import write_figures
 from scm_world.tasks.factories import load_factory
 
 FILE = Path(__file__).parents[1] / "env" / "model_tasks.py"
@@ -73,15 +74,15 @@ def test_a_file_is_evaluated_kept_and_checked(tmp_path: Path) -> None:
     assert loaded == found
     assert loaded.about["task"] == task
     with pytest.raises(UnknownOption, match="trusted"):
-        check(loaded, policy=agents)
-    assert check(loaded, policy=agents, task=task, episodes=4, seed=0)
-    assert check(found, episodes=4, seed=0)
-    files = write_outputs(found, tmp_path / "out")
-    assert {file.name for file in files} >= {"bars.png", "report.html"}
+        shard_runner_of(loaded, policy=agents)
+    assert not played_again(loaded, policy=agents, task=task)
+    assert not played_again(found)
+    files = write_figures(found, tmp_path / "out")
+    assert {file.name for file in files} >= {"bars.png", "radar.png"}
     text = file.read_text().replace('mass=".1"', 'mass=".12"')
     file.write_text(text)
     with pytest.raises((UnknownOption, SnapshotMismatch), match=r"model|tasks"):
-        check(loaded, policy=agents, task=task, episodes=1)
+        shard_runner_of(loaded, policy=agents, task=task)
     other = evaluate(agents, "P0", task=task, n=6, out=tmp_path / "out")
     assert other != found.only(protocol="P0")
 

@@ -9,11 +9,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from evaluation_samples import SHORT
+from evaluation_samples import SHORT, played_again
 from policy_samples import RELATIVE, policy, trained
 
 from scm_world.errors import EvaluationError, UnknownOption
-from scm_world.evaluation import Evaluation, WorldPolicy, check, evaluate, why
+from scm_world.evaluation import Evaluation, WorldPolicy, evaluate, why
 from scm_world.evaluation.agents import shared_options, task_for
 from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.setups import prepare
@@ -77,7 +77,7 @@ def test_results_say_how_each_agent_acted(agents: dict[str, Any], tmp_path: Path
     assert found.about["env"] == SHORT
     found.save(tmp_path / "results", kind="csv")
     again = Evaluation.load(tmp_path / "results")
-    assert check(again, episodes=len(again)).wrong == ()
+    assert not played_again(again)
     found = why(again.only(agent="two"), "P6", 1)
     assert found.others or found.left_out
 

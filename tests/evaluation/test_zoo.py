@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from evaluation_samples import played_again
 from policy_samples import RELATIVE, tensors, trained
 
 from benchmarks.baselines import publish as publishing
@@ -13,7 +14,7 @@ from benchmarks.baselines.cards import card_text, page_text
 from benchmarks.baselines.publish import command_of, publish
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation import check, evaluate, in_world
+from scm_world.evaluation import evaluate, in_world
 from scm_world.evaluation.players import as_player, player_from
 from scm_world.policies import file_of, load_policy, save_policy
 from scm_world.policies import zoo as zoo_module
@@ -68,7 +69,7 @@ def test_a_published_policy_acts_by_its_name(published: str) -> None:
     assert player_from(about).about == about
     found = evaluate(published, "P0", n=2, backend="fake", env={"max_episode_length": 5})
     assert found.agents == ("small",)
-    assert check(found, episodes=2).wrong == ()
+    assert not played_again(found)
     file_of(published).write_bytes(
         trained(zoo_module.FOLDER / "other.safetensors", seed=1).read_bytes()
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from itertools import product
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from robot_scenes import box_hull
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from scm_world._types import Floats
-from scm_world.errors import MissingExtra, ModelError, UnknownOption
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.filling import overlap_fraction
 from scm_world.geometry.hulls import Hull, hull_of, hull_overlap, load_hull
 from scm_world.geometry.rotations import rotation_matrix
@@ -211,14 +210,6 @@ def test_files_that_are_no_meshes(tmp_path: Path) -> None:
         load_hull(flat)
     with pytest.raises(ModelError, match="positive and finite, got -1"):
         load_hull(flat, scale=-1.0)
-
-
-def test_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the package, the command that installs it is given."""
-    file = write_obj(tmp_path / "cube.obj", cube_corners())
-    monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(MissingExtra, match="mesh"):
-        load_hull(file)
 
 
 @pytest.mark.parametrize("seed", range(40))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import pytest
 from matplotlib.image import imread
 
 from scm_world.errors import UnwritableFolder
-from scm_world.output.canvas import HEIGHT, PALETTE, WIDTH, blank, png, save, small_png
+from scm_world.output.canvas import HEIGHT, WIDTH, blank, png, save
 
 
 def test_a_picture_is_written_whole(tmp_path: Path) -> None:
@@ -26,15 +25,3 @@ def test_a_picture_nowhere_is_an_error_of_ours(tmp_path: Path) -> None:
     """The folder has to be there."""
     with pytest.raises(UnwritableFolder, match=r"sheet\.png"):
         save(blank(), tmp_path / "none" / "sheet.png")
-
-
-def test_a_picture_in_a_page_is_small() -> None:
-    """It shows the same within what 64 colors can, in fewer bytes."""
-    figure = blank()
-    axes = figure.add_subplot()
-    for number, color in enumerate(PALETTE):
-        axes.plot([0, 1], [number, number + 1], color=color)
-    large, small = png(figure), small_png(figure)
-    seen = [imread(io.BytesIO(data))[..., :3] for data in (large, small)]
-    assert len(small) < 0.7 * len(large)
-    assert abs(seen[0] - seen[1]).max() < 0.2

@@ -21,7 +21,8 @@ from scm_world.curricula import Curriculum
 from scm_world.discovery.data.folders import SIDECAR
 from scm_world.discovery.data.folders import load as dataset_of
 from scm_world.errors import ModelError, ScmWorldError, UnreadableFile
-from scm_world.evaluation import Evaluation, check, evaluate
+from scm_world.evaluation import Evaluation, evaluate
+from scm_world.evaluation.again import shard_runner_of
 from scm_world.evaluation.players import as_player
 from scm_world.evaluation.recording import Recording
 from scm_world.geometry.hulls import load_hull
@@ -174,12 +175,12 @@ def test_an_episode_of_other_equations_is_refused(tmp_path: Path, written: Any) 
 @pytest.mark.parametrize(
     "changed", [{"agents": [3]}, {"env": {"start": {"kind": "x"}}}, {"seeds": 3}]
 )
-def test_results_that_say_something_else_are_not_checked(changed: dict[str, Any]) -> None:
+def test_results_that_say_something_else_are_not_played_again(changed: dict[str, Any]) -> None:
     """With an error of this package."""
     short = {"max_episode_length": 1}
     found = evaluate("still", "P0", task="reaching", n=1, backend="fake", env=short)
     with pytest.raises(ScmWorldError):
-        check(Evaluation({**found.about, **changed}, found.columns))
+        shard_runner_of(Evaluation({**found.about, **changed}, found.columns))
 
 
 def test_damaged_episodes_are_told(episode_file: Path, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from scm_world.discovery.data import Dataset, Design, collect, load, save
 from scm_world.discovery.run import Checkpoint
 from scm_world.errors import UnreadableFile, UnwritableFolder
 from scm_world.evaluation import Evaluation, evaluate
-from scm_world.evaluation.outputs.report import write_outputs
+from scm_world.evaluation.figures import write_figures
 from scm_world.evaluation.recording import Recording
 from scm_world.output.remote import Location
 from scm_world.queries import World
@@ -42,11 +42,11 @@ def stop_at(number: int) -> Any:
 
 
 def evaluated(out: Path | str, *, drawn: bool = False, **more: Any) -> Evaluation:
-    """Evaluate, and write the results; plots and report take longer."""
+    """Evaluate, and write the results; plots take longer."""
     found = evaluate({"one": "still", "other": "random"}, "P0,P5", out=out, **HOW, **more)
     found.save(out, kind="csv")
     if drawn:
-        write_outputs(found, out)
+        write_figures(found, out)
     return found
 
 
@@ -114,7 +114,7 @@ def test_a_benchmark_resumes_from_a_store() -> None:
     assert [run.as_dict() for run in again.runs] == [run.as_dict() for run in done.runs]
     assert everything(folder) == first
     assert sum(name.startswith("runs/") for name in first) == 2
-    files = {"benchmark.json", "budget.png", "report.html", "results.csv"}
+    files = {"benchmark.json", "budget.png", "results.csv"}
     assert {name for name in first if "/" not in name} == {*files, "settings.json"}
     assert BenchmarkResult.read(str(folder)).problems.keys() == {"er2:4"}
     with pytest.raises(UnreadableFile, match="another benchmark: seeds"):

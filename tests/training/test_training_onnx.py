@@ -68,5 +68,5 @@ def test_what_cannot_be_written_is_said(tmp_path: Path, monkeypatch: pytest.Monk
     with pytest.raises(UnreadableFile, match="nothing"):
         to_onnx(tmp_path / "nothing.safetensors", tmp_path / "policy.onnx")
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(MissingExtra, match=r"scm-world\[onnx\]"):
+    with pytest.raises(MissingExtra, match=r"scm-world\[train\]"):
         to_onnx(policy(), tmp_path / "policy.onnx")

@@ -165,5 +165,5 @@ def test_an_executor_is_left_open() -> None:
 def test_ray_is_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without it, the error says how it is installed."""
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingExtra, match=r"scm-world\[ray\]"):
+    with pytest.raises(MissingExtra, match=r"scm-world\[cloud\]"):
         engine_of("ray")

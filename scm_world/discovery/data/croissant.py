@@ -7,7 +7,7 @@ import io
 import json
 from typing import Any
 
-from scm_world._arguments import load, typed
+from scm_world._arguments import typed
 from scm_world.errors import UnreadableFile
 from scm_world.output.durable import write_durably
 from scm_world.output.remote import Location, located
@@ -55,12 +55,13 @@ def as_huggingface(folder: Location | str, **about: Any) -> Location:
 
     Raises:
         UnreadableFile: There are no Parquet files of ours.
-        MissingExtra: pyarrow is not installed.
 
     Source:
         MLCommons, *Croissant Format Specification*, version 1.1.
     """
-    parquet, place = load("pyarrow.parquet", "pyarrow", "data"), located(folder)
+    from pyarrow import parquet
+
+    place = located(folder)
     said = "Data of interventions on a simulated system, written by scm-world."
     about = {"name": place.name, "description": said, "version": "1.0.0", **about}
     if isinstance(about.get("creator"), str):

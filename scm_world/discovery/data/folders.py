@@ -11,7 +11,6 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import load as load_library
 from scm_world._arguments import typed, whole_number
 from scm_world._fingerprint import changes
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
@@ -191,7 +190,6 @@ class Folder:
             UnknownOption: It has more episodes already.
             UnwritableFolder: There is no permission.
         """
-        load_library("pyarrow.parquet", "pyarrow", "data")  # before time is spent on rows
         check_names(self.head.columns)
         with locked(self.path):
             for stale in self.path.glob(f".*{PARTIAL}"):  # of a process that was killed
@@ -304,7 +302,6 @@ def load(folder: Location | str, *, trusted: Sequence[str] = (), partial: bool =
     """
     place = located(folder)
     head = head_of(read_sidecar(place))
-    load_library("pyarrow.parquet", "pyarrow", "data")
     files = Folder(place, head, trusted)
     parts, ranges = [], head.ranges()
     known = {files.shard(index) for index in range(len(ranges))}
@@ -356,7 +353,6 @@ def save(
         UnreadableFile: Something else is in the folder, be it a dataset with other numbers only.
         UnwritableFolder: There is no room, or no permission.
         ModelError: A part of it cannot be written.
-        MissingExtra: pyarrow, which writes Parquet, is not installed.
     """
     try:
         about = json.loads(json.dumps(dataset.about, allow_nan=False))

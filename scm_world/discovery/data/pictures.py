@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
-from scm_world._arguments import load, one_of, typed, whole_number
+from scm_world._arguments import one_of, typed, whole_number
 from scm_world.backends.renderer import png, render, scene_camera
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Scene
@@ -35,7 +35,6 @@ class Pictures:
 
     Raises:
         UnknownOption: There is no such format, or a size is no positive number.
-        MissingExtra: pyarrow, which writes Parquet, is not installed.
     """
 
     cameras: tuple[str | None, ...] = (None,)
@@ -49,8 +48,6 @@ class Pictures:
         cameras = (self.cameras,) if isinstance(self.cameras, str) else tuple(self.cameras)
         object.__setattr__(self, "cameras", cameras or (None,))
         object.__setattr__(self, "size", (height, width))
-        if self.format == "parquet":
-            load("pyarrow.parquet", "pyarrow", "data")
 
     def take(self, scene: Scene, placed: Iterable[Camera], label: str = "image") -> Row:
         """Take the pictures of a scene with the software renderer, alike on all machines.
@@ -85,8 +82,9 @@ class Pictures:
 
 def _parquet(rows: Sequence[Row]) -> bytes:
     """Write Parquet, and in its metadata the features of Hugging Face ``datasets``."""
-    arrow = load("pyarrow", "pyarrow", "data")
-    parquet = load("pyarrow.parquet", "pyarrow", "data")
+    import pyarrow as arrow
+    from pyarrow import parquet
+
     image = arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])
     columns, features = dict[str, Any](), dict[str, Any]()
     for name, first in rows[0].items() if rows else ():

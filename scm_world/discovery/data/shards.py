@@ -10,7 +10,6 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import load as load_library
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Column, Dataset, Ints, Regime
 from scm_world.discovery.data.sources import SourceRows
@@ -158,8 +157,9 @@ def _regimes(regimes: Sequence[Regime]) -> dict[str, Any]:
 
 
 def _to_parquet(raw: Raw, names: Sequence[str]) -> bytes:
-    arrow = load_library("pyarrow", "pyarrow", "data")
-    parquet = load_library("pyarrow.parquet", "pyarrow", "data")
+    import pyarrow as arrow
+    from pyarrow import parquet
+
     columns = {
         **raw.numbers,
         TARGETS: arrow.array(raw.targets, arrow.string()),

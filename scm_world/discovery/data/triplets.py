@@ -79,7 +79,6 @@ def triplets(
         UnknownVariable: A factor does not exist.
         UnknownOption: A factor has no space A, or a number is none.
         UnreadableFile: The folder holds something else.
-        MissingExtra: pyarrow is not installed.
 
     Source:
         Ahuja et al., *Weakly supervised representation learning with sparse perturbations*, NeurIPS

@@ -161,10 +161,10 @@ def as_frame(dataset: Dataset) -> Any:
         ``from_frame`` gives the same dataset.
 
     Raises:
-        MissingExtra: pandas is not installed.
         ModelError: A column has the name of one of the four, or something is no plain data.
     """
-    pandas = load("pandas", "pandas", "data")
+    import pandas
+
     check_names(dataset.columns)
     rows = {name: getattr(dataset, name).copy() for name in NUMBERS}
     data = pandas.DataFrame(dataset.values.copy(), columns=list(dataset.names))
@@ -275,7 +275,7 @@ def as_tigramite(dataset: Dataset) -> Any:
         raise ModelError(
             ["every episode is one row, which is no time series: collect with every_step=True"]
         )
-    processing = load("tigramite.data_processing", "tigramite")
+    processing = load("tigramite.data_processing", "tigramite", "learn")
     starts = np.flatnonzero(np.diff(dataset.episode, prepend=dataset.episode[0] - 1))
     pieces = np.split(np.arange(len(dataset)), starts[1:])
     gaps = [p[0] for p in pieces if np.any(np.diff(dataset.step[p]) != 1)]

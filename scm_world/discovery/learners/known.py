@@ -35,11 +35,9 @@ OURS = (
         ("interventional",), doc="do_order for curves, outliers, and causes of spread",
     ),
 )  # fmt: skip
-_causal_learn = partial(
-    Learner, takes=("observational",), extra="causal-learn", package="causal-learn"
-)
+_causal_learn = partial(Learner, takes=("observational",), extra="learn", package="causal-learn")
 _tigramite = partial(
-    Learner, takes=("observational",), temporal=True, extra="tigramite", package="tigramite"
+    Learner, takes=("observational",), temporal=True, extra="learn", package="tigramite"
 )
 OTHERS = (
     _causal_learn("pc", libraries.pc, doc="tests of partial correlation"),
@@ -50,16 +48,16 @@ OTHERS = (
         "fci", libraries.fci, marked=True, doc="tests of partial correlation; causes may be hidden"
     ),
     Learner(
-        "gies", libraries.gies, ("observational", "interventional"), extra="discovery",
+        "gies", libraries.gies, ("observational", "interventional"), extra="learn",
         package="gies", doc="greedy search over interventional equivalence classes by BIC",
     ),
     Learner(
         "gies_shared", partial(libraries.gies, intercept="shared"),
-        ("observational", "interventional"), extra="discovery", package="gies",
+        ("observational", "interventional"), extra="learn", package="gies",
         doc="gies with one intercept in all regimes: means count",
     ),
     Learner(
-        "permscore", libraries.permscore, ("interventional",), extra="discovery",
+        "permscore", libraries.permscore, ("interventional",), extra="learn",
         package="permscore", doc="best order by BIC, and what was set, without being told",
     ),
     _tigramite(

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scm_world._arguments import load
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.tasks.trifinger.platform import turned, turned_orientations
@@ -64,7 +63,6 @@ def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
         …), ``action``, ``reward`` and ``intervention_targets``.
 
     Raises:
-        MissingExtra: pandas is not installed.
         UnreadableFile: Something is missing.
         UnknownOption: Something has another shape, is filtered or scaled, or is not finite.
 
@@ -81,7 +79,8 @@ def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
         >>> found["episode"].tolist(), found["step"].tolist(), "action[8]" in found
         ([0, 0, 1], [0, 1, 0], True)
     """
-    pandas: Any = load("pandas", "pandas", "data")
+    import pandas
+
     missing = sorted({"observations", "actions", "rewards"} - set(data))
     if not {"timeouts", "terminals"} & set(data):
         missing.append("timeouts")

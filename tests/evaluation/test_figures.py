@@ -1,12 +1,9 @@
-"""Pictures and pages of evaluations: what is on them, and that all of it can be read."""
+"""Pictures of evaluations: what is on them, and that all of it can be read."""
 
 from __future__ import annotations
 
-import json
-import math
 import re
 from collections.abc import Callable, Iterator
-from html import unescape
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -14,31 +11,26 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
-from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from output_samples import LONG, NAMES, made
 
 from scm_world.errors import UnknownOption
-from scm_world.evaluation.outputs import (
+from scm_world.evaluation.figures import (
     bars_figure,
-    causes_figure,
-    gap_figure,
+    lines_of,
+    looks_of,
+    metric_words,
     profile_figure,
     radar_figure,
     save,
-    write_report,
+    write_figures,
 )
-from scm_world.evaluation.outputs.comparisons import Pairs, best, lines_of, metric_words
-from scm_world.evaluation.outputs.figures import SURE, looks_of
 from scm_world.evaluation.protocols import protocols_of
 from scm_world.evaluation.results import Evaluation
-from scm_world.evaluation.statistics import Interval
 
 DOCS = {protocol.name: protocol.doc for protocol in protocols_of("pushing")}
 BOTH = ("mujoco", "bullet")
-FEW = ("P0", "P5", "P7")
-BAD = "<script>alert(1)</script> & $x$"
 
 EVALUATIONS: dict[str, Callable[[], Evaluation]] = {
     "one agent": lambda: made(1, 3),
@@ -51,17 +43,11 @@ EVALUATIONS: dict[str, Callable[[], Evaluation]] = {
 }
 
 
-def causes(evaluation: Evaluation) -> Figure:
-    """Draw the causes of the first agent on the first engine."""
-    return causes_figure(evaluation, evaluation.agents[0], evaluation.engines[0])
-
-
 FIGURES: dict[str, Callable[[Evaluation], Figure]] = {
     "bars": bars_figure,
     "returns": lambda evaluation: bars_figure(evaluation, "return"),
     "radar": radar_figure,
     "profile": profile_figure,
-    "causes": causes,
 }
 
 
@@ -121,7 +107,6 @@ def assert_readable(figure: Figure) -> None:
         *((which, figure) for which in list(EVALUATIONS)[:4] for figure in FIGURES),
         *((which, "bars") for which in list(EVALUATIONS)[4:]),
         ("one episode", "returns"),
-        ("zeros", "causes"),
         ("zeros", "radar"),
     ],
 )
@@ -130,25 +115,16 @@ def test_no_text_hides_another(which: str, figure: str) -> None:
     assert_readable(FIGURES[figure](EVALUATIONS[which]()))
 
 
-def test_no_text_hides_another_in_gaps() -> None:
-    """That holds for three engines as well, of which each pair has its panel."""
-    figure = gap_figure(made(9, 5, engines=(*BOTH, "fake")))
-    assert_readable(figure)
-    labels = {ax.get_xlabel() for ax in figure.axes}
-    assert labels == {"mujoco minus bullet", "mujoco minus fake", "bullet minus fake"}
-
-
-EVERY = (bars_figure, radar_figure, profile_figure, causes_figure, gap_figure)
+EVERY = (bars_figure, radar_figure, profile_figure)
 
 
 @pytest.mark.parametrize("draw", EVERY)
 def test_the_same_evaluation_gives_the_same_bytes(draw: Any, tmp_path: Path) -> None:
     """Nothing of the time or the place is in a picture."""
     evaluation = made(1, 4, engines=BOTH, runs=2)
-    given = {"agent": "ppo", "engine": "bullet"} if draw is causes_figure else {}
     pictures = []
     for name in ("one.png", "other.png"):
-        save(draw(evaluation, **given), tmp_path / name)
+        save(draw(evaluation), tmp_path / name)
         pictures.append((tmp_path / name).read_bytes())
     assert pictures[0] == pictures[1]
     assert pictures[0].startswith(b"\x89PNG")
@@ -157,7 +133,7 @@ def test_the_same_evaluation_gives_the_same_bytes(draw: Any, tmp_path: Path) -> 
 @pytest.mark.parametrize("draw", EVERY)
 def test_an_unknown_metric_is_refused(draw: Any) -> None:
     """The metrics that there are, are named."""
-    evaluation = made(1, 3, engines=("mujoco",) if draw is causes_figure else BOTH)
+    evaluation = made(1, 3, engines=BOTH)
     with pytest.raises(UnknownOption, match="last_fractional_success"):
         draw(evaluation, metric="luck")
 
@@ -296,196 +272,15 @@ def test_agents_in_other_protocols_have_no_profile() -> None:
         profile_figure(evaluation)
 
 
-# --- causes -----------------------------------------------------------------------------------
+# --- files ------------------------------------------------------------------------------------
 
 
-def test_causes_are_ranked_and_marked() -> None:
-    """Heavy blocks make the score lower from P7 on, and nothing does so before."""
-    figure = causes(made(1, n=40))
-    panels = {ax: [bar.get_gid() for bar in ax.patches] for ax in figure.axes}
-    assert len(panels) == 11  # nothing varies in P0
-    for ax, bars in panels.items():
-        protocol = bars[0].partition("|")[0]
-        signs = [text.get_text().split("\n")[-1] for text in ax.get_yticklabels()]
-        assert len(bars) == len(signs) == 2
-        stars = [sign.endswith("*") for sign in signs]
-        assert [to_hex(bar.get_facecolor()) == SURE.lower() for bar in ax.patches] == stars
-        if int(protocol[1:]) > 6:
-            assert bars[0] == f"{protocol}|tool_block.mass"
-            assert signs[0].startswith("▼ -0.")
-            assert stars[0]
-    assert any("P0: nothing varies." in word for word in words(figure))
-
-
-def test_a_score_that_never_changes_has_no_causes() -> None:
-    """There is nothing to explain; the picture says where."""
-    figure = causes(made(1, 3, score=0.0))
-    assert not figure.axes
-    assert any(
-        "the same score in P1. All episodes had the same score in P2." in word
-        for word in words(figure)
-    )
-
-
-def test_too_few_episodes_say_nothing() -> None:
-    """The picture says what is left out."""
-    figure = causes(made(1, 3, n=5))
-    assert not figure.axes
-    (note,) = (word for word in words(figure) if word.startswith("Share of"))
-    assert note.count("only 5 episodes varied it") == 2
-
-
-# --- gaps -------------------------------------------------------------------------------------
-
-
-def test_gaps_are_paired_differences() -> None:
-    """Everybody is better by 0.1 on the second engine where the best score leaves room."""
-    evaluation = made(3, 4, engines=BOTH)
-    figure = gap_figure(evaluation)
-    points = {point.get_gid(): point.get_xdata()[0] for point in named(figure, r"\w+\|P\d+")}
-    assert len(points) == 12
-    assert points["td3|P2"] == evaluation.gap("mujoco", "bullet", "P2", agent="td3").value
-    assert points["td3|P2"] == pytest.approx(-0.1, abs=0.03)
-
-
-def test_one_engine_has_no_gap() -> None:
-    """The message says what is needed."""
-    with pytest.raises(UnknownOption, match="two engines"):
-        gap_figure(made(1, 3))
-
-
-# --- the report -------------------------------------------------------------------------------
-
-
-def report(evaluation: Evaluation, folder: Path, **given: Any) -> str:
-    """Write a report and read it."""
-    write_report(evaluation, folder / "report.html", **given)
-    return (folder / "report.html").read_text(encoding="utf-8")
-
-
-def sections(page: str) -> dict[str, str]:
-    """Cut a page into its sections, by anchor."""
-    return dict(re.findall(r'<section id="(\w+)">(.*?)</section>', page, flags=re.S))
-
-
-def test_a_report_has_everything(tmp_path: Path) -> None:
-    """Two agents on two engines: scores, pictures, differences, gaps, causes, and what it was."""
-    evaluation = made(2, 8, engines=BOTH, runs=2, kept=lambda row: row.protocol in FEW)
-    page = report(evaluation, tmp_path)
-    found = sections(page)
-    assert list(found) == [
-        "summary", "overall", "bars", "radar", "profile", "differences", "gap", "causes", "numbers",
-        "about",
-    ]  # fmt: skip
-    score = evaluation.score("P5", agent="sac", engine="bullet")
-    assert str(score) in found["summary"]
-    assert str(evaluation.difference("ppo", "sac", "P5", engine="bullet")) in found["differences"]
-    assert str(evaluation.gap("mujoco", "bullet", "P5", agent="sac")) in found["gap"]
-    assert (
-        str(evaluation.overall(agent="sac", engine="bullet")["interquartile_mean"])
-        in found["overall"]
-    )
-    assert "2 training runs" in found["overall"]
-    assert "tool_block.mass explains" in found["causes"]
-    assert "mean_full_integrated_fractional_success" in found["numbers"]
-    assert "std_last_fractional_success" in found["numbers"]
-    assert "5ha256 of sac" in found["about"]
-    assert "scm-world evaluate --check results.json" in found["about"]
-    assert evaluation.digest in found["about"]
-    assert page.count("data:image/png") == 8  # four of all, and causes of two agents on two engines
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Evaluation, str]:
-    """Give an evaluation of three agents whose names are markup, and its page with a video."""
-    evaluation = made([BAD, "b", "c"], 3)
-    folder = tmp_path_factory.mktemp("report")
-    return evaluation, report(evaluation, folder, videos=[folder / "videos" / "worst P6.mp4"])
-
-
-def test_a_report_needs_nothing_else(small: tuple[Evaluation, str]) -> None:
-    """It loads nothing, and holds its numbers."""
-    evaluation, page = small
-    assert not re.search(r"https?://|<link|src=\"(?!data:)", page)
-    (text,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', page)
-    data = json.loads(text)
-    assert (data["rows"], data["digest"]) == (len(evaluation), evaluation.digest)
-    row = next(one for one in data["scores"] if (one["agent"], one["protocol"]) == ("b", "P2"))
-    assert row["success"] == evaluation.score("P2", "success", agent="b").as_dict()
-    assert row["success"]["n"] == 12
-
-
-def test_only_who_is_better_is_bold(small: tuple[Evaluation, str], tmp_path: Path) -> None:
-    """The best agent stands out if its paired differences exclude 0, and nobody else does."""
-    better = sections(report(made(3, 3, n=120), tmp_path))["summary"]
-    assert better.count('class="best"') == 3
-    assert len(re.findall(r'<td class="best"[^>]*>0\.[89]', better)) == 3
-    assert 'class="best"' not in sections(small[1])["summary"]  # twelve episodes are too few
-    equal = sections(report(made(3, 2, score=1.0), tmp_path))["summary"]
-    assert 'class="best"' not in equal
-
-
-def test_a_better_mean_alone_is_not_bold() -> None:
-    """An interval that holds 0, or is unknown, says that it may be chance."""
-    sure, unsure = Interval(0.2, 0.1, 0.3, 0.95, 9), Interval(0.2, -0.1, 0.3, 0.95, 9)
-    worse = Interval(-0.2, -0.3, -0.1, 0.95, 9)
-    unknown = Interval(0.2, math.nan, math.nan, 0.95, 1)
-    several = ((sure, {"sac"}), (unsure, set()), (unknown, set()), ("other episodes", set()))
-    for third, expected in several:
-        pairs: Pairs = {
-            ("mujoco", "P0", "ppo", "sac"): worse,
-            ("mujoco", "P0", "ppo", "td3"): unsure,
-            ("mujoco", "P0", "sac", "td3"): third,
-        }
-        assert {line.agent for line, _ in best(pairs)} == expected
-
-
-def test_a_report_of_little_says_what_is_missing(tmp_path: Path) -> None:
-    """One episode of one agent in two protocols has neither radar, nor profile, nor intervals."""
-    found = sections(report(made(1, 2, n=1), tmp_path))
-    assert not {"radar", "gap", "differences"} & set(found)
-    assert "There are none" in found["profile"]
-    assert "[0.00, 1.00]" in found["summary"]
-    assert "too few episodes varied anything" in found["causes"]
+def test_every_figure_that_has_numbers_is_written(tmp_path: Path) -> None:
+    """One episode in two protocols has bars only; nothing of an earlier evaluation stays."""
+    many = write_figures(made(2, 4, runs=2), tmp_path)
+    assert [path.name for path in many] == ["bars.png", "radar.png", "profile.png"]
+    few = write_figures(made(1, 2, n=1), tmp_path)
+    assert [path.name for path in few] == ["bars.png"]
+    assert [path.name for path in tmp_path.iterdir()] == ["bars.png"]
     with pytest.raises(UnknownOption, match="without episodes"):
-        write_report(Evaluation.of({"task": "pushing"}, []), tmp_path / "none.html")
-
-
-def test_a_report_of_unequal_agents_is_written(tmp_path: Path) -> None:
-    """Where an agent did not act, or played other episodes, the page says so."""
-    unequal = made(2, 3, kept=lambda row: row.agent == "ppo" or row.protocol != "P1")
-    found = sections(report(unequal, tmp_path))
-    assert '<td data-v="">–</td>' in found["summary"]
-    assert "There are none" in found["profile"]
-    fewer = made(2, 3, kept=lambda row: row.agent == "ppo" or row.episode > 3)
-    found = sections(report(fewer, tmp_path))
-    assert "they played other episodes" in found["differences"]
-
-
-def test_names_cannot_harm_a_page(small: tuple[Evaluation, str]) -> None:
-    """Names of agents are written as texts."""
-    page = small[1]
-    assert "<script>alert" not in page
-    assert BAD in unescape(sections(page)["summary"])
-
-
-def test_videos_are_linked_beside_the_page(small: tuple[Evaluation, str]) -> None:
-    """Links are relative, so that the folder can be moved."""
-    assert '<a href="videos/worst%20P6.mp4">worst P6.mp4</a>' in small[1]
-
-
-def test_the_same_evaluation_gives_the_same_page(
-    small: tuple[Evaluation, str], tmp_path: Path
-) -> None:
-    """Byte for byte, wherever it is written."""
-    videos = [tmp_path / "videos" / "worst P6.mp4"]
-    assert report(small[0], tmp_path, videos=videos) == small[1]
-
-
-def test_a_report_can_be_about_another_metric(tmp_path: Path) -> None:
-    """Returns have their own scale."""
-    evaluation = made(1, 2)
-    found = sections(report(evaluation, tmp_path, metric="return"))
-    assert str(evaluation.score("P1", "return")) in found["summary"]
-    with pytest.raises(UnknownOption, match="metric"):
-        report(evaluation, tmp_path, metric="luck")
+        write_figures(Evaluation.of({"task": "pushing"}, []), tmp_path)

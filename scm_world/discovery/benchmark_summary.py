@@ -1,4 +1,4 @@
-"""The table, the picture and the report of a benchmark."""
+"""The table and the picture of a benchmark."""
 
 from __future__ import annotations
 
@@ -12,17 +12,11 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, final
 
 import numpy as np
 
-from scm_world._arguments import typed
 from scm_world.discovery.benchmarks import BenchmarkResult, BenchmarkRun
-from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import baselines
-from scm_world.discovery.problems import GroundTruth
-from scm_world.graph.ancestral import HEAD, SIGNS, Marks
-from scm_world.output.canvas import PALETTE, blank, save, small_png, styled
+from scm_world.output.canvas import PALETTE, blank, save, styled
 from scm_world.output.durable import write_whole
-from scm_world.output.pages import Entry, render
 from scm_world.output.remote import Location
-from scm_world.queries.experiments.effects import EdgeKey
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -203,17 +197,6 @@ def columns(rows: Iterable[SummaryRow]) -> list[ScoreColumn]:
     return [column for column in COLUMNS if column.key in there or column.key not in MARKED]
 
 
-def counted(result: BenchmarkResult) -> str:
-    """Say how many runs there are and how they ended."""
-    ends = [run.status for run in result.runs]
-    return (
-        f"{len(result.problems)} problem{'s' * (len(result.problems) != 1)}, "
-        f"{len({run.learner for run in result.runs})} learners, "
-        f"{len(ends)} runs: {ends.count('done')} done, "
-        f"{ends.count('timeout')} timed out, {ends.count('failed')} failed"
-    )
-
-
 def size(result: BenchmarkResult, name: str) -> str:
     """Say how large the graph of a problem is; a range where seeds have graphs of their own."""
     first = result.problems[name]
@@ -229,10 +212,9 @@ def size(result: BenchmarkResult, name: str) -> str:
 
 
 def write_files(result: BenchmarkResult, folder: Location) -> None:
-    """Write ``results.csv``, ``budget.png`` and ``report.html``; a missing number is empty."""
+    """Write ``results.csv`` and ``budget.png``; a missing number is empty."""
     write_whole(_csv(result), folder / "results.csv")
     save(draw_budgets(result), folder / "budget.png")
-    write_whole(report(result), folder / "report.html")
 
 
 def _csv(result: BenchmarkResult) -> str:
@@ -319,163 +301,3 @@ def _line(ax: Axes, rows: Sequence[SummaryRow], key: str, aside: float, style: i
         linestyle=DASHES[rows[0].run.data],
         capsize=2.5,
     )
-
-
-# --- the report -----------------------------------------------------------------------------------
-
-VERDICTS = {
-    "correct": ("●", "true and found", "#0072B2"),
-    "missing": ("−", "true, not found", "#B34700"),
-    "extra": ("+", "found, not true", "#B0508C"),
-    "reversed": ("⇄", "found the other way round", "#00785A"),
-    "undirected": ("?", "true, found without direction", "#222222"),
-    "marked": ("≠", "found with other marks than in the partial ancestral graph", "#7A4B00"),
-    "unscored": ("∘", "not scored", "#6B7280"),
-}
-"""The sign in a matrix, what it means, and its color; each sign alone is enough."""
-BESIDE = ("shd", "f1", "precision", "recall", "pag_distance")  # scores beside a single run
-
-
-class Link(NamedTuple):
-    """An edge and its verdict; an undirected one has its true direction, if it has one.
-
-    Of a graph with edge marks it has the signs that are written between the two.
-    """
-
-    cause: str
-    effect: str
-    lag: int
-    verdict: str
-    directed: bool = True
-    signs: str = ""
-
-    @property
-    def words(self) -> str:
-        """Cause, effect and lag, such as ``"x → y, t−1"``."""
-        between = self.signs or ("→" if self.directed else "—")
-        return f"{self.cause} {between} {self.effect}" + f", t−{self.lag}" * (self.lag > 0)
-
-
-@typed
-def compare(truth: GroundTruth, found: EstimatedGraph) -> list[Link]:
-    """Compare an estimated graph with the true one: one link per edge, sorted.
-
-    A reversed edge is one link, in the direction that was found.
-
-    Example:
-        >>> edges = (("x", "y", 0), ("y", "z", 0))
-        >>> truth = GroundTruth(name="chain", names=("x", "y", "z"), edges=edges)
-        >>> found = EstimatedGraph.of_edges(truth.names, [("y", "x", 0), ("x", "z", 1)])
-        >>> links = compare(truth, found)
-        >>> [(link.words, link.verdict) for link in links]
-        [('x → z, t−1', 'extra'), ('y → x', 'reversed'), ('y → z', 'missing')]
-    """
-    kept = found.restricted(truth.names)
-    if kept.marks is not None:
-        return _compare_marks(truth, kept.marks)
-    missing, directed = set(truth.edges), set(kept.directed)
-    links: list[Link] = []
-    for one, other in kept.undirected:
-        ways: list[EdgeKey] = [(one, other, 0), (other, one, 0)]
-        known = next((way for way in ways if way in missing), None)
-        verdict = "extra" if known is None else "undirected"
-        links.append(Link(*(known or ways[0]), verdict, directed=False))
-        missing -= set(ways)
-    for cause, effect, lag in directed:
-        key, back = (cause, effect, lag), (effect, cause, lag)
-        if key in missing:
-            verdict = "correct"
-        elif lag == 0 and back in missing and back not in directed:
-            verdict = "reversed"
-        else:
-            verdict = "extra"
-        links.append(Link(*key, verdict))
-        missing -= {back} if verdict == "reversed" else {key}
-    links += [Link(*key, "missing") for key in missing]
-    apart = {frozenset(pair) for pair in truth.unscored}
-    return sorted(
-        link._replace(verdict="unscored") if {*link[:2]} in apart else link for link in links
-    )
-
-
-def _compare_marks(truth: GroundTruth, marks: Marks) -> list[Link]:
-    """Compare edge marks with the partial ancestral graph of the truth."""
-    known = truth.pag(len(marks) - 1 or None)
-    made = np.concatenate([marks, np.zeros_like(known)[len(marks) :]])
-    links = []
-    for lag, i, j in np.argwhere((made != 0) | (known != 0)).tolist():
-        if lag == 0 and i > j:
-            continue
-        said, true = ((m[lag, i, j], m[0, j, i] if lag == 0 else HEAD) for m in (made, known))
-        verdict = "missing" if not said[0] else "extra" if not true[0] else "marked"
-        left, right = (int(mark) for mark in (said if said[0] else true))
-        links.append(
-            Link(
-                truth.names[i],
-                truth.names[j],
-                lag,
-                "correct" if said == true else verdict if truth.pairs[i, j] else "unscored",
-                directed=lag > 0,
-                signs=f"{SIGNS[left][0]}-{SIGNS[right][1]}",
-            )
-        )
-    return sorted(links)
-
-
-def report(result: BenchmarkResult) -> str:
-    """Return the report: one HTML page that needs no network.
-
-    It has the tables, the picture of the budgets, and of each learner on each problem, at the
-    largest budget with the first seed, the estimated graph compared with the true one.
-    """
-    problems = []
-    for name, truth in result.problems.items():
-        groups: dict[tuple[str, str, bool], BenchmarkRun] = {}
-        for run in (run for run in result.runs if run.problem == name):
-            key = (run.learner, run.data, run.standardised)
-            groups[key] = max(groups.get(key, run), run, key=lambda r: (r.budget, -r.seed))
-        compared = [_compared(result.truth_of(run), run) for run in groups.values()]
-        problems.append((truth, size(result, name), compared))
-    rows = [row for found in summary(result).values() for row in found]
-    return render(
-        "discovery/benchmark_report.html",
-        title="Benchmark of learners",
-        lead=f"{counted(result)}.",
-        contents=[
-            ("summary", "Summary"),
-            ("budget", "Budget"),
-            *((f"s{at}", name) for at, name in enumerate(result.problems)),
-        ],
-        note=NOTE,
-        heads=[*HEADS, *(column.title for column in columns(rows))],
-        rows=_entries((row for row in rows if not row.is_oracle), columns(rows)),
-        oracles=_entries((row for row in rows if row.is_oracle), columns(rows)),
-        oracle_note=ORACLES,
-        budgets=small_png(draw_budgets(result)),
-        problems=problems,
-        verdicts=VERDICTS,
-        settings=result.settings,
-    )
-
-
-def _entries(rows: Iterable[SummaryRow], shown: Sequence[ScoreColumn]) -> list[list[str | Entry]]:
-    return [[*row.heads, *(_entry(row, column) for column in shown)] for row in rows]
-
-
-def _entry(row: SummaryRow, column: ScoreColumn) -> Entry:
-    by = f"{row.spreads[column.key].mean:.6g}" if column.key in row.spreads else ""
-    return Entry(row.text(column), by=by, looks="best" if column.key in row.best else "")
-
-
-def _compared(truth: GroundTruth, run: BenchmarkRun) -> dict[str, Any]:
-    links = [] if run.found is None else compare(truth, run.found)
-    cells: dict[tuple[str, str], list[Link]] = {}
-    for link in links:
-        for ends in [link[:2]] if link.directed else [link[:2], link[1::-1]]:
-            cells.setdefault(ends, []).append(link)
-    scores = {
-        c.title: number(run.scores.get(c.key), c)
-        for c in COLUMNS
-        if c.key in BESIDE and (c.key in run.scores or c.key not in MARKED)
-    }
-    return {"run": run, "cells": cells, "scores": scores}

@@ -1,16 +1,10 @@
-"""Checks of evaluations: a random part is run again and compared bit for bit."""
+"""Episodes of an evaluation, run again: the same task, options, agents and versions."""
 
 from __future__ import annotations
 
-import math
-import secrets
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
-import numpy as np
-
-from scm_world._arguments import whole_number
 from scm_world._fingerprint import differing, fingerprint
 from scm_world.curricula import Do
 from scm_world.errors import (
@@ -23,47 +17,15 @@ from scm_world.errors import (
 )
 from scm_world.evaluation.agents import AgentRun, listed
 from scm_world.evaluation.episodes import EpisodeRunner
-from scm_world.evaluation.files import false_scores
 from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.players import as_player, player_from
 from scm_world.evaluation.protocols import Protocol
-from scm_world.evaluation.results import KEYS, Evaluation
+from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import EvaluationPlace, Setup
-from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.progress import Progress
 from scm_world.tasks import Task, tasks
 from scm_world.tasks.factories import is_model, refuse_untrusted
 from scm_world.variables.mechanisms import check_trusted
-
-
-@final
-@dataclass(frozen=True)
-class Check:
-    """The result of a check.
-
-    Attributes:
-        episodes: How many were run again.
-        seed: With which they were chosen.
-        wrong: Each difference, in words.
-        of: How many episodes there are.
-        scores: Of a file: each score that is another one by its table, in words.
-    """
-
-    episodes: int
-    seed: int
-    wrong: tuple[str, ...]
-    of: int
-    scores: tuple[str, ...] = ()
-
-    def __bool__(self) -> bool:
-        """Whether there was no difference."""
-        return not (self.wrong or self.scores)
-
-    def __str__(self) -> str:
-        said = f"{len(self.wrong)} differ" if self.wrong else "the same bits in all of them"
-        chosen = f"{self.episodes} of {self.of} episodes, chosen with seed {self.seed}"
-        return "\n".join((*self.scores, *self.wrong, f"played again: {chosen}: {said}"))
 
 
 def shard_runner_of(
@@ -211,68 +173,3 @@ def _same_versions(place: EvaluationPlace, made: Mapping[str, Mapping[str, str]]
                 f"it was made with {', '.join(differ)}; the same bits are promised for the same "
                 "versions only: install those"
             )
-
-
-def check(
-    evaluation: Evaluation | Location | str,
-    *,
-    episodes: int = 12,
-    seed: int | None = None,
-    policy: Any = None,
-    task: Task | str | None = None,
-    trusted: Sequence[str] = (),
-    progress: Progress | None = None,
-) -> Check:
-    """Run a random part of an evaluation again, and compare it bit for bit.
-
-    Args:
-        evaluation: That was run, here or elsewhere; or where it was saved: then the scores in the
-            file are compared with its table, too.
-        episodes: How many.
-        seed: Chooses them; None: a random one.
-        policy: As it was given to ``evaluate``; only needed in another process, for a policy that
-            is no file and has no name.
-        task: If it is a task of the user's own class.
-        trusted: Packages whose functions may be policies, or parts of protocols.
-        progress: Called with how many are done.
-
-    Raises:
-        SnapshotMismatch: It was made with other versions.
-        UnknownOption: A policy cannot be made again.
-    """
-    scores: list[str] = []
-    if not isinstance(evaluation, Evaluation):
-        path, evaluation = located(evaluation), Evaluation.load(evaluation)
-        scores = false_scores(path, evaluation)
-    count = min(whole_number("episodes", episodes, least=1), len(evaluation))
-    drawn = secrets.randbits(32) if seed is None else whole_number("seed", seed, least=0)
-    places = np.random.default_rng(drawn).choice(len(evaluation), count, replace=False)
-    shard_runner = shard_runner_of(evaluation, policy=policy, task=task, trusted=trusted)
-    wrong = []
-    try:
-        for done, place in enumerate(sorted(places.tolist())):
-            wrong += _compared(shard_runner, evaluation, place)
-            if progress is not None:
-                progress(done + 1, count)
-    finally:
-        shard_runner.close()
-    return Check(count, drawn, tuple(wrong), len(evaluation), tuple(scores))
-
-
-def _compared(shard_runner: ShardRunner, evaluation: Evaluation, place: int) -> list[str]:
-    """Run the episode of one row again; name each difference."""
-    row = {name: column[place].item() for name, column in evaluation.columns.items()}
-    shard = shard_runner.setup.shard_of(row)
-    found = Evaluation.of({}, [shard_runner.play(shard, shard.first)])
-    again = {name: column[0].item() for name, column in found.columns.items()}
-    where = ", ".join(f"{key} {row[key]}" for key in KEYS)
-    if again["hash"] != row["hash"]:
-        noisy = shard_runner.setup.agents[shard.agent].about.get("repeats") == "no"
-        why = "; the policy gives two actions for one observation" if noisy else ""
-        return [f"{where}: other states or actions{why}"]
-    wrong = []
-    for name, value in row.items():
-        now = again.get(name, math.nan)
-        if now != value and not (now != now and value != value):  # NaN: was not drawn
-            wrong.append(f"{where}: {name} is {again.get(name)!r}, not {value!r}")
-    return wrong

@@ -1,4 +1,4 @@
-"""Figures of evaluations: bars, radars, profiles, gaps between backends, causes.
+"""Figures of evaluations: bars, radars and performance profiles.
 
 Each function returns a matplotlib figure; ``save`` writes it, with the same bytes for the same
 evaluation. matplotlib is loaded when one is drawn.
@@ -8,48 +8,170 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
+from scm_world._arguments import one_of
 from scm_world.errors import UnknownOption
-from scm_world.evaluation.outputs.comparisons import (
-    Comparison,
-    Gaps,
-    Line,
-    causes_of,
-    comparisons_of,
-    counted,
-    gaps_of,
-    is_flat,
-    is_fraction,
-    lines_of,
-    metric_words,
-    protocol_words,
-    scores_of,
-)
+from scm_world.evaluation.episodes import LAST, METRICS
 from scm_world.evaluation.results import Evaluation
-from scm_world.evaluation.statistics import Cause, Causes, Interval
-from scm_world.output.canvas import INK, PALETTE, blank, styled
+from scm_world.evaluation.statistics import (
+    Interval,
+    Profile,
+    performance_profile,
+    probability_of_improvement,
+)
+from scm_world.output.canvas import INK, PALETTE, blank, save, styled
+from scm_world.output.durable import removed
+from scm_world.output.remote import Location, located
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ALPHA = 0.05
-"""Effects with a corrected p-value up to this are marked."""
 BAR = 0.16  # [inches] of a bar, and of a line of text
-MOST_CAUSES = 10  # variables in a panel, unless more of them have an effect
-SURE, UNSURE = PALETTE[0], "#aab2bd"
 PAPER = {"fc": "white", "ec": "none", "pad": 0.6}
-SIGNS: Mapping[str, str] = {"up": "▲", "down": "▼", "unclear": "?"}
 HATCHES = ("", "////", "....", "xxxx")
 MARKERS = "osD^vPX*<>ph"
 DASHES: Sequence[Any] = ("solid", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
+
+
+WORDS: Mapping[str, str] = {
+    "last_fractional_success": "fractional success at the end",
+    "last_integrated_fractional_success": f"fractional success over the last {LAST} steps",
+    "full_integrated_fractional_success": "fractional success over the whole episode",
+    "success": "success rate",
+    "return": "return",
+    "published_overlap": "overlap at the end as CausalWorld has it",
+}
+
+
+@final
+@dataclass(frozen=True)
+class Line:
+    """An agent on a backend: one line of a figure, or one bar of each protocol."""
+
+    agent: str
+    engine: str
+
+
+def lines_of(evaluation: Evaluation) -> list[Line]:
+    """List which agent acted on which backend, agents in their order and then backends."""
+    columns = evaluation.columns
+    there = set(zip(columns["agent"].tolist(), columns["engine"].tolist(), strict=True))
+    every = (Line(a, e) for a in evaluation.agents for e in evaluation.engines)
+    return [line for line in every if (line.agent, line.engine) in there]
+
+
+def metric_words(metric: str) -> str:
+    """Return in words what a metric is, or raise ``UnknownOption``."""
+    one_of("metric", metric, METRICS)
+    return WORDS[metric]
+
+
+def is_fraction(metric: str) -> bool:
+    """Whether a metric goes from 0 to 1."""
+    return metric != "return"
+
+
+def counted(evaluation: Evaluation) -> str:
+    """Return how many runs and episodes a number is of."""
+    keys = ("agent", "engine", "protocol", "run")
+    rows = zip(*(evaluation.columns[key].tolist() for key in keys), strict=True)
+    each = Counter(rows).values()
+    runs = [len(evaluation.runs(agent)) for agent in evaluation.agents]
+    some = "" if max(runs) == 1 else f" and {_range(runs)} training runs of each agent"
+    return f"{_range(each)} episodes of each protocol{some}"
+
+
+def _range(numbers: Collection[int]) -> str:
+    low, high = min(numbers), max(numbers)
+    return f"{low}" if low == high else f"{low} to {high}"
+
+
+def protocol_words(evaluation: Evaluation) -> dict[str, str]:
+    """Return what varies in each protocol, as far as the evaluation says so."""
+    declared = {one["name"]: one for one in evaluation.about.get("protocols", ())}
+    return {name: _varies(declared.get(name, {})) for name in evaluation.protocols}
+
+
+def _varies(protocol: Mapping[str, Any]) -> str:
+    text = str(protocol.get("doc") or "")
+    varies, space = protocol.get("varies") or (), protocol.get("space")
+    if not text and varies:
+        text = ", ".join(varies) + (f" from {space}" if isinstance(space, str) else "")
+    step = protocol.get("step") or 0
+    return f"{text} after {step} steps".strip() if step else text
+
+
+Scores = Mapping[tuple[Line, str], Interval]
+"""By line and protocol; a line has no entry for a protocol in which it did not act."""
+
+
+def scores_of(evaluation: Evaluation, metric: str) -> Scores:
+    """Estimate all mean scores."""
+    return {
+        (line, protocol): mine.score(protocol, metric)
+        for line in lines_of(evaluation)
+        for mine in [evaluation.only(agent=line.agent, engine=line.engine)]
+        for protocol in mine.protocols
+    }
+
+
+@final
+@dataclass(frozen=True)
+class Comparison:
+    """Agents on a backend compared as rliable defines it.
+
+    Attributes:
+        over: ``"runs"`` if each agent has several of them, else ``"episodes"``.
+        profiles: By agent.
+        better: Probability that the first of a pair scores higher, by pair of agents.
+    """
+
+    over: str
+    profiles: Mapping[str, Profile]
+    better: Mapping[tuple[str, str], Interval]
+
+
+def comparisons_of(evaluation: Evaluation, metric: str) -> dict[str, Comparison]:
+    """Compare the agents on each backend over all protocols.
+
+    Raises:
+        UnknownOption: Agents have not played the same protocols, or one episode only.
+    """
+    return {
+        engine: _compared(evaluation.only(engine=engine), metric) for engine in evaluation.engines
+    }
+
+
+def _compared(here: Evaluation, metric: str) -> Comparison:
+    for agent in here.agents:
+        if missing := set(here.protocols) - set(here.only(agent=agent).protocols):
+            played = (f"agents that have all played {', '.join(sorted(missing))}",)
+            raise UnknownOption("agent of a comparison", agent, played)
+    scores = {agent: here.scores(metric, agent=agent) for agent in here.agents}
+    over = "runs" if all(len(one) > 1 for one in scores.values()) else "episodes"
+    units = [one.mean(axis=2) if over == "runs" else one for one in scores.values()]
+    low, high = min(one.min() for one in units), max(one.max() for one in units)
+    room = 0.02 * ((high - low) or 1.0)
+    if is_fraction(metric):
+        low, high, room = 0.0, 1.0, 0.0
+    at = np.linspace(low - room, high + room, 101)
+    return Comparison(
+        over,
+        {agent: performance_profile(one, at, over=over) for agent, one in scores.items()},
+        {
+            (one, other): probability_of_improvement(scores[one], scores[other], over=over)
+            for one, other in combinations(scores, 2)
+        },
+    )
 
 
 @final
@@ -171,52 +293,6 @@ def bars_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     return figure
 
 
-@styled
-def gap_figure(
-    evaluation: Evaluation, metric: str | None = None, gaps: Gaps | None = None
-) -> Figure:
-    """Draw the gap between backends in each protocol, with paired 95 % intervals.
-
-    Each pair of backends gets a panel. ``gaps`` are given if they are known already.
-
-    Raises:
-        UnknownOption: There is one backend only, no such metric, or an agent did not play the same
-            episodes on both.
-    """
-    from matplotlib.lines import Line2D
-
-    metric = evaluation.metric(metric)
-    gaps = gaps_of(evaluation, metric) if gaps is None else gaps
-    pairs, words = list(combinations(evaluation.engines, 2)), protocol_words(evaluation)
-    looks = {
-        line.agent: {**look.line, "linestyle": "none", "label": look.label}
-        for line, look in looks_of([Line(agent, "") for agent in evaluation.agents]).items()
-    }
-    row, height = _row(words, len(looks))
-    figure = _sheet(
-        4.2 * len(pairs) + 2.4,
-        height,
-        f"{evaluation.task}: gap between engines, {metric_words(metric)}",
-        f"Paired differences of the same episodes, with 95 % intervals; {counted(evaluation)}. "
-        "Where an interval excludes 0, the engine makes a difference.",
-        [Line2D([], [], **style) for style in looks.values()],
-    )
-    reach = 1.15 * max([abs(end) for one in gaps.values() for end in one.ends], default=0.0) or 1.0
-    axes = figure.subplots(1, len(pairs), squeeze=False, sharey=True)[0]
-    for pair, ax in zip(pairs, axes, strict=True):
-        _protocol_axis(ax, words)
-        ax.axvline(0.0, color=INK, lw=0.9, zorder=1.5)
-        ax.set_xlim(-reach, reach)
-        ax.set_xlabel(f"{pair[0]} minus {pair[1]}")
-        for place, protocol in enumerate(words):
-            for number, (agent, style) in enumerate(looks.items()):
-                y = place + (number - (len(looks) - 1) / 2) * BAR / row
-                if (one := gaps.get((*pair, agent, protocol))) is not None:
-                    point = ax.errorbar(one.value, y, xerr=_reach(one), **style)
-                    point.lines[0].set_gid(f"{agent}|{protocol}")
-    return figure
-
-
 def _row(words: Mapping[str, str], count: int) -> tuple[float, float]:
     """Return the heights of a row and of all rows [inches]: one for each protocol.
 
@@ -312,93 +388,9 @@ def _improvement(ax: Axes, better: Mapping[tuple[str, str], Interval]) -> None:
     ax.set_ylim(len(better) - 0.5, -0.5)
     ax.grid(visible=False, axis="y")
     for y, (pair, one) in enumerate(better.items()):
-        color = SURE if one.excludes(0.5) else "#6b7686"
+        color = PALETTE[0] if one.excludes(0.5) else "#6b7686"
         point = ax.errorbar(one.value, y, xerr=_reach(one), color=color, marker="o")
         point.lines[0].set_gid(" > ".join(pair))
-
-
-# --- causes -----------------------------------------------------------------------------------
-
-
-@styled
-def causes_figure(
-    evaluation: Evaluation,
-    agent: str | None = None,
-    engine: str | None = None,
-    metric: str | None = None,
-    found: Mapping[str, Causes] | None = None,
-) -> Figure:
-    """Draw what each varied variable does to the score, the strongest one above.
-
-    A bar is the share of the score's variance that a variable explains, with its 95 % interval. It
-    is blue with a star if the effect is significant (Holm p at most 0.05 within the protocol).
-    Below the name stands how much higher the score is in the upper third of the drawn values than
-    in the lower third: ▲ if it rises, ▼ if it falls. Agent and backend need not be named if there
-    is only one; ``found`` are effects by protocol that are known already.
-
-    Raises:
-        UnknownOption: There is no such agent, backend or metric, or it has to be named.
-    """
-    metric = evaluation.metric(metric)
-    agent, engine = evaluation.the("agent", agent), evaluation.the("engine", engine)
-    found = causes_of(evaluation, Line(agent, engine), metric) if found is None else found
-    words = protocol_words(evaluation)
-    note = (
-        "Share of the score's variance that a variable explains, with 95 % intervals. Blue with a "
-        "star: it has an effect (Holm p ≤ 0.05). Below the name: mean score with high values minus "
-        "that with low ones, ▲ it rises, ▼ it falls with the value, ? unclear."
-    )
-    panels: dict[str, tuple[Sequence[Cause], str]] = {}
-    for protocol, one in found.items():
-        shown = one.ranked()[: max(MOST_CAUSES, len(one.found(ALPHA)))]
-        if is_flat(one):
-            note += f" All episodes had the same score in {protocol}."
-        elif shown:
-            panels[protocol] = shown, _rest(one, shown)
-        else:
-            note += f" {protocol}: {_rest(one, shown) or 'nothing varies'}."
-    across = 2 if len(panels) > 1 else 1
-    parts = [list(panels)[i : i + across] for i in range(0, len(panels), across)]
-    rows = [max(len(panels[name][0]) for name in part) for part in parts]
-    title = f"{evaluation.task}: what the {metric_words(metric)} of {agent} on {engine} depends on"
-    figure = _sheet(6.6 * across, sum(0.4 * n + 1.1 for n in rows), title, note)
-    grid = figure.add_gridspec(len(parts) or 1, across, height_ratios=rows or [1])
-    for number, (name, (causes, rest)) in enumerate(panels.items()):
-        ax = figure.add_subplot(grid[divmod(number, across)])
-        head = textwrap.fill(f"{name}: {words[name]}".removesuffix(": "), 70)
-        ax.set_title(head, loc="left", weight="bold")
-        ax.set_xlabel("\n".join(["share of variance", *textwrap.wrap(rest, 90)]))
-        ax.set_xlim(0.0, 1.02)
-        ax.set_ylim(rows[number // across] - 0.5, -0.5)
-        ax.set_yticks(range(len(causes)), [_effect(cause) for cause in causes])
-        ax.grid(visible=False, axis="y")
-        for y, cause in enumerate(causes):
-            color = SURE if cause.p_holm <= ALPHA else UNSURE
-            gid, whisker = f"{name}|{cause.variable}", {"ecolor": INK, "elinewidth": 1.0}
-            ax.barh(y, cause.share.value, 0.6, color=color, gid=gid, xerr=_reach(cause.share),
-                    error_kw=whisker)  # fmt: skip
-    return figure
-
-
-def _effect(cause: Cause) -> str:
-    """Return the name of a variable, and below it what its values do to the score."""
-    column, star = cause.column, " *" if cause.p_holm <= ALPHA else ""
-    part = column.name.removeprefix(cause.variable)
-    text = f"{SIGNS[column.direction]} {column.contrast.value:+z.2f} {part}".rstrip() + star
-    return f"{textwrap.fill(cause.variable, 34)}\n{text}"
-
-
-def _rest(found: Causes, shown: Sequence[Cause]) -> str:
-    """Return in words what is not drawn."""
-    said = []
-    if hidden := found.ranked()[len(shown) :]:
-        most = max(cause.share.value for cause in hidden)
-        said.append(f"{len(hidden)} more explain {most:.2f} or less each, none significantly")
-    if found.left_out:
-        name, reason = next(iter(found.left_out.items()))
-        more = f", and {len(found.left_out) - 1} more" if len(found.left_out) > 1 else ""
-        said.append(f"left out: {name} ({reason}){more}")
-    return "; ".join(said)
 
 
 @styled
@@ -447,3 +439,42 @@ def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
         band = {"color": style["color"], "alpha": 0.16, "lw": 0, "gid": f"band {gid}"}
         ax.fill_between(turns, lows, highs, **band)
     return figure
+
+
+FIGURES = {"bars": bars_figure, "radar": radar_figure, "profile": profile_figure}
+
+
+def write_figures(
+    evaluation: Evaluation, folder: Location | str, metric: str | None = None
+) -> tuple[Location, ...]:
+    """Draw every figure that an evaluation has numbers for.
+
+    Args:
+        evaluation: What is drawn.
+        folder: Where to; it is there. It may be a URL. Figures of an earlier evaluation go.
+        metric: One of ``METRICS``; the first that the evaluation has if None.
+
+    Returns:
+        The files: ``bars.png``, ``radar.png`` of three protocols or more, and ``profile.png``
+        where all agents have played the same protocols.
+
+    Raises:
+        UnknownOption: There is no such metric, or no episode.
+        UnwritableFolder: There is no room, or no permission.
+    """
+    metric, place = evaluation.metric(metric), located(folder)
+    if not len(evaluation):
+        raise UnknownOption("evaluation", "without episodes", ("one with an episode or more",))
+    files = []
+    for name, draw in FIGURES.items():
+        path = place / f"{name}.png"
+        removed(path)
+        try:
+            figure = draw(evaluation, metric)
+        except UnknownOption:
+            if draw is bars_figure:
+                raise
+            continue
+        save(figure, path)
+        files.append(path)
+    return tuple(files)

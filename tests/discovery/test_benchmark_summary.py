@@ -1,0 +1,162 @@
+"""Tables and the picture of a benchmark of learners."""
+
+import csv
+import io
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmark_samples import CHAIN, TRUTHS, run, sample_result
+from matplotlib.image import imread
+
+from scm_world.discovery import BenchmarkResult
+from scm_world.discovery.benchmark_summary import (
+    STANDARDISED,
+    Spread,
+    SummaryRow,
+    summary,
+)
+from scm_world.discovery.benchmarks import BenchmarkRun
+from scm_world.discovery.problems import GroundTruth
+from scm_world.errors import ModelError
+from scm_world.output.canvas import PALETTE
+
+
+@pytest.fixture(scope="module")
+def result() -> BenchmarkResult:
+    """Make the sample once."""
+    return sample_result()
+
+
+@pytest.fixture(scope="module")
+def folder(result: BenchmarkResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write the sample once."""
+    place = tmp_path_factory.mktemp("benchmark")
+    result.write(place)
+    return place
+
+
+def of(*runs: BenchmarkRun) -> BenchmarkResult:
+    """Make a result on the chain."""
+    return BenchmarkResult({"chain": CHAIN}, runs)
+
+
+def row(result: BenchmarkResult, learner: str, budget: int) -> SummaryRow:
+    """Find a row of the chain."""
+    rows = summary(result)["chain"]
+    return next(r for r in rows if (r.run.learner, r.run.budget) == (learner, budget))
+
+
+# --- tables ---------------------------------------------------------------------------------------
+
+
+def test_a_result_survives_its_file(result: BenchmarkResult, folder: Path) -> None:
+    """Problems, runs and settings come back."""
+    again = BenchmarkResult.read(folder)
+    assert [run.as_dict() for run in again.runs] == [run.as_dict() for run in result.runs]
+    assert (again.problems, again.settings) == (result.problems, result.settings)
+
+
+def test_results_that_do_not_fit_are_refused(result: BenchmarkResult) -> None:
+    """A run of no problem, and one run twice."""
+    with pytest.raises(ModelError, match="no problem"):
+        of(*result.runs)
+    with pytest.raises(ModelError, match="two runs"):
+        BenchmarkResult(result.problems, (result.runs[0], result.runs[0]))
+
+
+def test_means_leave_out_what_is_missing(result: BenchmarkResult) -> None:
+    """A run that ran out of time is counted, and is no zero in a mean."""
+    found = row(result, "gies", 1000)
+    assert sorted(found.statuses) == ["done", "done", "timeout"]
+    assert found.heads[-1] == "2 of 3, 1 timed out"
+    assert found.spreads["shd"] == Spread(2.5, 2.0, 3.0, 2)
+    assert found.spreads["seconds"].high == 500.0
+    assert "sid" not in row(result, "pc", 10).spreads
+
+
+def test_standardised_runs_are_beside_the_others() -> None:
+    """Their SHD has a column of its own; alone, they are marked."""
+    plain = run(CHAIN, "gies", "interventional", 10, 0)
+    scaled = replace(plain, standardised=True, scores={"shd": 40})
+    (both,) = summary(of(plain, scaled))["chain"]
+    assert both.spreads["shd"].mean == 3.0
+    assert both.spreads[STANDARDISED].mean == 40.0
+    assert both.statuses == ("done",)
+    (alone,) = summary(of(scaled))["chain"]
+    assert alone.heads[1] == "interventional, standardised"
+
+
+def test_the_best_needs_all_seeds() -> None:
+    """A learner that solved the easy seed only is not the best, whatever its mean."""
+    runs = [run(CHAIN, "ours", "interventional", 10, seed) for seed in (1, 2)]
+    lucky = replace(run(CHAIN, "gies", "interventional", 10, 1), scores={"shd": 0})
+    late = replace(lucky, seed=2, status="timeout", found=None, scores={})
+    bad = [replace(lucky, learner="pc", seed=seed, scores={"shd": 9}) for seed in (1, 2)]
+    rows = summary(of(*runs, lucky, late, *bad))["chain"]
+    assert [row.run.learner for row in rows if "shd" in row.best] == ["ours"]
+
+
+def test_oracles_are_not_ranked_among_learners_from_data() -> None:
+    """Who had the simulator is best of nothing, and has a table of its own."""
+    oracle = replace(run(CHAIN, "ours", "paired", 10, 1), scores={"shd": 0})
+    runs = [run(CHAIN, name, "interventional", 10, 1) for name in ("ours", "gies")]
+    rows = summary(of(oracle, *runs))["chain"]
+    assert [(row.is_oracle, "shd" in row.best) for row in rows] == [
+        (False, False),
+        (False, True),
+        (True, False),
+    ]
+
+
+def test_the_csv_has_a_line_per_run(result: BenchmarkResult, folder: Path) -> None:
+    """Every run, every score that some run has; what is missing is empty."""
+    lines = list(csv.DictReader(io.StringIO((folder / "results.csv").read_text())))
+    assert len(lines) == len(result.runs)
+    assert {"shd", "fdp", "bound", "message"} <= set(lines[0])
+    late = [line for line in lines if line["status"] == "timeout"]
+    assert [line["shd"] for line in late] == ["", "", ""]
+    assert late[0]["message"] == "more than 60 s"
+
+
+def test_the_dataframe_has_the_rows_of_the_csv(result: BenchmarkResult) -> None:
+    """A row per run."""
+    frame = result.to_dataframe()
+    assert len(frame) == len(result.runs)
+    assert frame[frame.status == "timeout"].shd.isna().all()
+
+
+@pytest.mark.parametrize(("problems", "learners"), [(1, 1), (5, 12)])
+def test_the_budget_picture_shows_every_learner(
+    problems: int, learners: int, tmp_path: Path
+) -> None:
+    """Few or many: there is a line in the color of each learner."""
+    names = [f"$problem_{i}$ with quite a long name, too long" for i in range(problems)]
+    truths = {name: replace(CHAIN, name=name) for name in names}
+    runs = [
+        replace(run(truth, "ours", "paired", budget, 0), learner=f"_learner {i}")
+        for truth, i, budget in product(truths.values(), range(learners), (0, 10, 100))
+    ]
+    BenchmarkResult(truths, tuple(runs)).write(tmp_path)
+    picture = imread(tmp_path / "budget.png")[..., :3]
+    for color in PALETTE[:learners]:
+        rgb = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+        assert (np.abs(picture - rgb).max(axis=-1) < 0.02).sum() > 20
+
+
+@pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.parametrize("truths", [(), TRUTHS])
+def test_nothing_finished_is_written_as_well(
+    truths: tuple[GroundTruth, ...], count: int, tmp_path: Path
+) -> None:
+    """Without a finished run, without a run and without a problem there are files."""
+    runs = [
+        BenchmarkRun(problem=truth.name, learner="pc", data="observational", budget=9, seed=0,
+            status="failed", message="<b>no</b>")
+        for truth in truths[:count]
+    ]  # fmt: skip
+    BenchmarkResult({truth.name: truth for truth in truths}, tuple(runs)).write(tmp_path)
+    assert (tmp_path / "budget.png").exists()
+    assert len((tmp_path / "results.csv").read_text().splitlines()) == 1 + len(runs)
