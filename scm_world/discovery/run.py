@@ -19,7 +19,7 @@ from scm_world.output.durable import made, removed, write_durably, write_whole
 from scm_world.output.reading import read_text
 from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.effects import EdgeKey, Effects
-from scm_world.queries.experiments.paired import Paired
+from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
@@ -141,7 +141,8 @@ def discover(
         options: Arguments of ``World``, where ``system`` is a name.
 
     Raises:
-        UnknownOption: ``probes`` is not a positive number, or a name does not exist.
+        UnknownOption: ``probes`` is not a positive number, a name does not exist, or there are
+            options for a world that is made.
         UnreadableFile: The checkpoint is damaged, or of another discovery.
 
     Example:
@@ -154,65 +155,44 @@ def discover(
         0
     """
     whole_number("number of probes", probes, least=1)
-    started = time.perf_counter()
-    if isinstance(system, SCM):
-        return _discovered(system, probes, seed, progress, found, checkpoint, started)
-    world = Simulation(system, **options) if isinstance(system, str) else system
-    try:
-        with world.unchanged():
-            return _discovered(world, probes, seed, progress, found, checkpoint, started)
-    finally:
-        if isinstance(system, str):
-            world.close()
-
-
-def _discovered(
-    system: Simulation | SCM,
-    probes: int,
-    seed: int,
-    progress: Progress | None,
-    found: Callable[[set[EdgeKey]], object] | None,
-    path: Location | str | None,
-    started: float,
-) -> DiscoveryReport:
-    model = system if isinstance(system, SCM) else system.model
-    declared = {edge.key for edge in model.edges}
-    paired = Paired(system, seed)
-    effects, first, saved = Effects(exact=paired.exact), 0, None
-    if path is not None and isinstance(system, Simulation):
-        saved = Checkpoint(path, _terms(system, seed))
-        first = min(saved.read(effects), probes)
-    done = first
-    try:
-        for probe in probe_states(system, probes, seed, first=first):
-            effects.add(paired.run(done, probe))
-            done += 1
-            if found is not None:
-                found(effects.edges(declared))
-            if saved is not None:
-                saved.write(effects, done)
-            if progress is not None:
-                progress(done, probes)
-    except KeyboardInterrupt:
-        if not done:
-            raise
-    if saved is not None and done == probes:
-        saved.end()
-    edges = effects.edges(declared)
-    inert = [size for key, size in effects.largest.items() if key not in edges]
-    effects.settings.clear()  # a file of progress does not have them
-    return DiscoveryReport.of(
-        system,
-        effects,
-        edge_reports(model, effects),
-        seed=seed,
-        probes=done,
-        planned=probes,
-        bound=done * sum(effects.changed[name] > 0 for name in paired.targets),
-        inert=max(inert, default=0.0),
-        refused=dict(effects.refused),
-        seconds=time.perf_counter() - started,
-    )
+    with opened(system, options) as there:
+        started, paired = time.perf_counter(), Paired(there, seed)
+        declared = {edge.key for edge in paired.model.edges}
+        effects, first, saved = Effects(exact=paired.exact), 0, None
+        if checkpoint is not None and isinstance(there, Simulation):
+            saved = Checkpoint(checkpoint, _terms(there, seed))
+            first = min(saved.read(effects), probes)
+        done = first
+        try:
+            for probe in probe_states(there, probes, seed, first=first):
+                effects.add(paired.run(done, probe))
+                done += 1
+                if found is not None:
+                    found(effects.edges(declared))
+                if saved is not None:
+                    saved.write(effects, done)
+                if progress is not None:
+                    progress(done, probes)
+        except KeyboardInterrupt:
+            if not done:
+                raise
+        if saved is not None and done == probes:
+            saved.end()
+        edges = effects.edges(declared)
+        inert = [size for key, size in effects.largest.items() if key not in edges]
+        effects.settings.clear()  # a file of progress does not have them
+        return DiscoveryReport.of(
+            there,
+            effects,
+            edge_reports(paired.model, effects),
+            seed=seed,
+            probes=done,
+            planned=probes,
+            bound=done * sum(effects.changed[name] > 0 for name in paired.targets),
+            inert=max(inert, default=0.0),
+            refused=dict(effects.refused),
+            seconds=time.perf_counter() - started,
+        )
 
 
 def _terms(world: Simulation, seed: int) -> dict[str, Any]:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 from scm_world._arguments import whole_number
-from scm_world.errors import UnknownOption
 from scm_world.graph import SCM, Edge
 from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.markov import Markov
-from scm_world.queries.experiments.paired import Paired
+from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.progress import Progress
 from scm_world.queries.verification import Verification, edge_reports
@@ -86,69 +84,52 @@ def verify(
     """
     whole_number("number of probes", probes, least=1)
     whole_number("number of held-out probes", held_out, least=0)
-    if isinstance(system, Simulation | SCM):
-        if options:
-            raise UnknownOption("option for a world that is made", next(iter(options)), ())
-        with system.unchanged() if isinstance(system, Simulation) else contextlib.nullcontext():
-            return _verified(system, probes, held_out, seed, progress, found)
-    world = Simulation(system, **options)
-    with contextlib.closing(world):
-        return _verified(world, probes, held_out, seed, progress, found)
-
-
-def _verified(
-    system: Simulation | SCM,
-    probes: int,
-    held_out: int,
-    seed: int,
-    progress: Progress | None,
-    found: Callable[[set[EdgeKey]], object] | None,
-) -> Verification:
-    started, paired = time.perf_counter(), Paired(system, seed)
-    model, world = paired.model, system if isinstance(system, Simulation) else None
-    markov = None if world is None else Markov(paired)
-    generated = world is not None and world.task.generated_graph
-    declared = {edge.key for edge in model.edges}
-    missing, after = set(declared), dict[EdgeKey, int]()
-    effects, done, searched, interrupted = Effects(exact=generated), 0, 0, False
-    search = probe_states(system, probes, seed)
-    others = probe_states(system, held_out, seed + OTHER, scenarios=False)
-    try:
-        for held, states in ((False, search), (True, others)):
-            for probe in states:
-                one = paired.run(done, probe, missing)
-                if held and markov is not None and not one.unstable:
-                    markov.run(one)
-                effects.add(one)
-                done, searched = done + 1, searched + (not held)
-                now = effects.edges(declared)
-                after.update(dict.fromkeys(missing & now, done))
-                missing -= now
-                quiet = generated and done - max(after.values(), default=0) >= QUIET
-                last = not held and (quiet or not missing)
-                if found is not None:
-                    found(now)
-                if progress is not None:
-                    progress(done, held_out + (searched if held or last else probes))
-                if last:
-                    break
-    except KeyboardInterrupt:
-        if not done:
-            raise
-        interrupted = True
-    reason = partial(_reason, world, effects, effects.edges(declared))
-    return Verification.of(
-        system,
-        effects,
-        edge_reports(model, effects, after, reason),
-        seed=seed,
-        generated=generated,
-        probes=searched,
-        held_out=done - searched,
-        planned=probes,
-        interrupted=interrupted,
-        seconds=time.perf_counter() - started,
-    )
+    with opened(system, options) as there:
+        started, paired = time.perf_counter(), Paired(there, seed)
+        model, world = paired.model, there if isinstance(there, Simulation) else None
+        markov = None if world is None else Markov(paired)
+        generated = world is not None and world.task.generated_graph
+        declared = {edge.key for edge in model.edges}
+        missing, after = set(declared), dict[EdgeKey, int]()
+        effects, done, searched, interrupted = Effects(exact=generated), 0, 0, False
+        search = probe_states(there, probes, seed)
+        others = probe_states(there, held_out, seed + OTHER, scenarios=False)
+        try:
+            for held, states in ((False, search), (True, others)):
+                for probe in states:
+                    one = paired.run(done, probe, missing)
+                    if held and markov is not None and not one.unstable:
+                        markov.run(one)
+                    effects.add(one)
+                    done, searched = done + 1, searched + (not held)
+                    now = effects.edges(declared)
+                    after.update(dict.fromkeys(missing & now, done))
+                    missing -= now
+                    quiet = generated and done - max(after.values(), default=0) >= QUIET
+                    last = not held and (quiet or not missing)
+                    if found is not None:
+                        found(now)
+                    if progress is not None:
+                        progress(done, held_out + (searched if held or last else probes))
+                    if last:
+                        break
+        except KeyboardInterrupt:
+            if not done:
+                raise
+            interrupted = True
+        reason = partial(_reason, world, effects, effects.edges(declared))
+        return Verification.of(
+            there,
+            effects,
+            edge_reports(model, effects, after, reason),
+            seed=seed,
+            generated=generated,
+            probes=searched,
+            held_out=done - searched,
+            planned=probes,
+            interrupted=interrupted,
+            seconds=time.perf_counter() - started,
+        )
 
 
 def _reason(world: Simulation | None, effects: Effects, observed: set[EdgeKey], edge: Edge) -> str:

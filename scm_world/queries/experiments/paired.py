@@ -14,12 +14,13 @@ Equations have the first kind only, so that everything here serves them, too.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from typing import Any, NamedTuple, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.errors import EngineFailure, InterventionError, SnapshotMismatch
+from scm_world.errors import EngineFailure, InterventionError, SnapshotMismatch, UnknownOption
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier
 from scm_world.policies.planning import action_range
@@ -270,6 +271,25 @@ class Paired:
         effects.rollouts += 1
         for state, size in self.gaps(self.states, later).items():
             effects.see((name, state, 1), size, setting)
+
+
+@contextmanager
+def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM]:
+    """Give a world that is afterwards as it was, one that is made and closed, or equations.
+
+    Raises:
+        UnknownOption: There are options for a world that is made.
+    """
+    if options and isinstance(system, Simulation | SCM):
+        raise UnknownOption("option for a world that is made", next(iter(options)), ())
+    if isinstance(system, SCM):
+        yield system
+    elif isinstance(system, Simulation):
+        with system.unchanged():
+            yield system
+    else:
+        with closing(Simulation(system, **options)) as world:
+            yield world
 
 
 def settable(model: SCM) -> tuple[str, ...]:
