@@ -74,7 +74,7 @@ def building(backend: str) -> dict[str, float]:
                 world.do(world.task.solution(world.values()))
             rest = np.array(world["joint_positions"])
             step = micros(lambda: world.step(rest), 25)  # noqa: B023 # called at once
-            found[f"{task}, {title}: times real time"] = world.control_period / step * 1e6
+            found[f"{task}, {title}: times real time"] = world.options.control_period / step * 1e6
         world.close()
     return found
 

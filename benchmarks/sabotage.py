@@ -107,7 +107,7 @@ class Sabotaged(BackendWrapper):
 
     def value(self, name: str) -> Any:
         """Give the present value of a variable of the world."""
-        return self.world.current()[0][name]
+        return self.world.row[name]
 
     def build(self, scene: Scene) -> None:
         """Realise a scene."""
@@ -456,7 +456,7 @@ class OtherCommands:
     def __call__(self, action: Any, index: int) -> Any:
         """Turn an action into a command."""
         command = np.array(self.honest(action, index))
-        return self.wrong(command, self.world.current()[0], self.world.noise_key(index))
+        return self.wrong(command, self.world.row, self.world.noise_key(index))
 
 
 def with_commands(world: Any, wrong: Callable[[Any, Any, NoiseKey], Any]) -> Any:
@@ -915,7 +915,7 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "readout",
         "pushing, mujoco",
         (COLOR, r"reward\.block_to_goal"),
-        lambda: rewarded(lambda w: float(w.current()[0]["tool_block.color"][0])),
+        lambda: rewarded(lambda w: float(w.row["tool_block.color"][0])),
     ),
     Sabotage(
         "the reward reads the friction in the engine",
@@ -938,7 +938,7 @@ SABOTAGES: tuple[Sabotage, ...] = (
         "readout",
         "cart, mujoco",
         (r"slider\.position", "height"),
-        lambda: outcome(CART, lambda w: 0.1 * float(w.current()[0]["slider.position"])),
+        lambda: outcome(CART, lambda w: 0.1 * float(w.row["slider.position"])),
     ),
     Sabotage(
         "an outcome reads the engine",

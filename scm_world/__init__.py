@@ -1,7 +1,6 @@
 """Structural causal models of physical systems: any MJCF, URDF or step function.
 
-Importing this registers the environments with Gymnasium and nothing else; what is named below is
-loaded when it is first used.
+Importing this registers the environments with Gymnasium; a name is loaded when it is first used.
 """
 
 from __future__ import annotations
@@ -118,23 +117,16 @@ for _task in (
     "stacked_blocks",
     "creative_stacked_blocks",
     "general",
+    "model",  # any file
 ):
-    _id = f"scm_world/{''.join(part.capitalize() for part in _task.split('_'))}-v0"
+    _id = f"scm_world/{_task.title().replace('_', '')}-v0"
     if _id not in gymnasium.registry:
+        _model = _task == "model"
         gymnasium.register(
             id=_id,
-            entry_point="scm_world.env:ScmWorldEnv",
+            entry_point=f"scm_world.env:{'make_env' if _model else 'ScmWorldEnv'}",
             vector_entry_point="scm_world.env:vector_env",
-            kwargs={"task": _task},
+            kwargs={"task": None if _model else _task},  # a model takes its place
             order_enforce=False,  # it refuses steps before a reset itself
             disable_env_checker=True,  # tests check it; wrappers would hide compute_reward
         )
-
-if "scm_world/Model-v0" not in gymnasium.registry:
-    gymnasium.register(
-        id="scm_world/Model-v0",
-        entry_point="scm_world.env:model_env",
-        vector_entry_point="scm_world.env:model_vector_env",
-        order_enforce=False,
-        disable_env_checker=True,
-    )

@@ -16,28 +16,20 @@ from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scm_world._types import Floats
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
 
 def whole_number(option: str, value: Any, *, least: int) -> int:
-    """Return an option that is a whole number.
-
-    Raises:
-        UnknownOption: It is none, or too small.
-    """
+    """Return an option that is a whole number from ``least`` on, or raise ``UnknownOption``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise UnknownOption(option, value, (f"any whole number from {least} on",))
     return int(value)
 
 
 def real_number(option: str, value: Any, *, least: float = -math.inf) -> float:
-    """Return an option that is a finite number.
-
-    Raises:
-        UnknownOption: It is none, or too small.
-    """
+    """Return an option that is a finite number from ``least`` on, or raise ``UnknownOption``."""
     kinds = int | float | np.integer | np.floating
     is_number = isinstance(value, kinds) and not isinstance(value, bool)
     if not is_number or not math.isfinite(value) or value < least:
@@ -47,11 +39,7 @@ def real_number(option: str, value: Any, *, least: float = -math.inf) -> float:
 
 
 def one_of(option: str, value: Any, allowed: Collection[Any]) -> None:
-    """Refuse an option that is none of those allowed; None is left out of the message.
-
-    Raises:
-        UnknownOption: It is none of them.
-    """
+    """Refuse an option that is none of those allowed; None is left out of the message."""
     try:
         known = value in allowed
     except (TypeError, ValueError):  # an array, or not hashable
@@ -65,10 +53,10 @@ NUMBERS = {float: (int, float, np.number), int: (int, np.integer), bool: (bool, 
 
 
 def typed(function: F) -> F:
-    """Make a function refuse arguments of another kind than annotated; of a class, its fields.
+    """Make a function, or a class, refuse arguments of another kind than annotated.
 
-    Numbers may be those of NumPy, and sequences arrays. Annotations that are no classes allow
-    everything. Whether a number or a name is in range is for the function to say.
+    Numbers may be those of NumPy, and sequences arrays. Annotations other than classes allow
+    everything. The function itself checks ranges.
     """
     if isinstance(function, type):
         kind: Any = function
@@ -134,13 +122,8 @@ def _fits(value: Any, hint: Any) -> bool:
     return all(_fits(one, parts[0]) for one in each)
 
 
-def real_numbers(value: Any) -> NDArray[np.float64]:
-    """Return real numbers as 64-bit floats.
-
-    Raises:
-        TypeError: They are complex, a text, dates, or no numbers at all.
-        ValueError: A list of lists of several lengths.
-    """
+def real_numbers(value: Any) -> Floats:
+    """Return real numbers as 64-bit floats; raise ``TypeError`` or ``ValueError`` for others."""
     found = np.asarray(value)
     if found.dtype.kind not in "biufO":
         raise TypeError(f"{value!r} does not consist of real numbers")
@@ -148,15 +131,9 @@ def real_numbers(value: Any) -> NDArray[np.float64]:
 
 
 def load(module: str, library: str, extra: str = "") -> Any:
-    """Import a module of an optional library.
+    """Import a module of an optional library, which an extra of this package installs.
 
-    Args:
-        module: Its full name.
-        library: As it is called on the package index.
-        extra: The optional dependency of this package that brings it; named like it if empty.
-
-    Raises:
-        MissingExtra: It is not installed, or something that it needs.
+    The extra has the name of the library on the package index, unless another one is given.
     """
     try:
         return import_module(module)
@@ -165,14 +142,7 @@ def load(module: str, library: str, extra: str = "") -> Any:
 
 
 def missing(error: ImportError, module: str, library: str, extra: str = "") -> MissingExtra:
-    """Return the error that names what is not installed: a library, or one that it imports.
-
-    Args:
-        error: That importing it raised.
-        module: As in ``load``.
-        library: As in ``load``.
-        extra: As in ``load``.
-    """
+    """Return the error that names the missing library, or one that it imports, for ``load``."""
     absent = (error.name or "").partition(".")[0]
     other = absent not in ("", module.partition(".")[0]) and find_spec(absent) is None
     return MissingExtra(absent if other else library, extra or library)
@@ -187,30 +157,19 @@ def enter(
     taken: Container[str],
     check: Callable[[Any], Iterable[str]],
 ) -> None:
-    """Enter a class of a user into a registry, by its ``name``.
+    """Enter a user's class into a registry, by its ``name``; ``check`` lists further faults.
 
-    Args:
-        registry: The classes that were entered.
-        kind: The class. One whose module was run again takes its own place.
-        base: What it must be derived from.
-        what: What it is called in errors.
-        taken: Names that it may not have.
-        check: Lists what else is wrong with it.
-
-    Raises:
-        ModelError: It is no such class, it lacks methods or a name, or what ``check`` says.
-        UnknownOption: Another one has this name.
+    A class whose module was run again replaces the earlier one.
     """
     if not (inspect.isclass(kind) and issubclass(kind, base)):
         public = f"{base.__module__.rpartition('.')[0]}.{base.__name__}"
-        raise ModelError([f"{kind!r} is no class derived from {public}"])
+        raise ModelError([f"{kind!r} is not a class derived from {public}"])
     missing = sorted(getattr(kind, "__abstractmethods__", ()))
     problems = [f"{kind.__name__} does not define {method!r}" for method in missing]
     name = getattr(kind, "name", None)
     if not isinstance(name, str) or not name:
         problems.append(f"{kind.__name__} has no name; set name = 'mine' in the class")
-    problems += check(kind)
-    if problems:
+    if problems := [*problems, *check(kind)]:
         raise ModelError(problems)
     other = registry.get(str(name), kind)
     same = (other.__module__, other.__qualname__) == (kind.__module__, kind.__qualname__)

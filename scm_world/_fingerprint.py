@@ -34,9 +34,6 @@ Fingerprint = dict[str, str]
 """A hash for each part of a system, by its name, and the version of each library that it uses."""
 
 PACKAGE = __name__.partition(".")[0]
-UNREAD = "unread"
-"""Stands for the hash of a part of which something has no content that can be compared."""
-
 _PLAIN = (bool, int, float, complex, str, bytes, NoneType, EllipsisType, range, slice, PurePath)
 _AROUND: dict[type, tuple[str, ...]] = {
     MethodType: ("__func__", "__self__"),
@@ -47,6 +44,13 @@ _AROUND: dict[type, tuple[str, ...]] = {
     staticmethod: ("__func__",),
 }
 """Attributes of objects that hold a function."""
+
+_LIBRARIES = (
+    *(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+    *site.getsitepackages(),
+    site.getusersitepackages(),
+)
+"""Folders of Python and of installed packages."""
 
 _NO_EFFECT = {"CACHE", "EXTENDED_ARG", "NOP", "PRECALL", "RESUME"}
 _OF_CLASSES = {
@@ -67,7 +71,7 @@ _OF_CLASSES = {
 
 
 def fingerprint(parts: Any, *, libraries: bool = True) -> Fingerprint:
-    """Compute a hash of each part of a system.
+    """Compute a hash of each part of a system: of each value of a dictionary, or of an object.
 
     The hash of a part is the same in any process in which it has the same values and its functions
     compute the same. For a function of the user's project, its code with the constants, its
@@ -76,15 +80,9 @@ def fingerprint(parts: Any, *, libraries: bool = True) -> Fingerprint:
     package, count by name and by the version of the library. An object with a method
     ``__fingerprint__`` counts as what that returns; other objects count by their attributes.
 
-    Args:
-        parts: The parts by name, or an object whose ``__fingerprint__`` returns them.
-        libraries: Whether versions of libraries count: not where results are compared bit for bit
-            anyhow.
-
-    Returns:
-        The hashes by name, in this order; then ``"version of …"`` for each library that is used.
-        Where something in a part cannot be compared, such as an open file, ``"unread: …"`` follows
-        the hash.
+    ``"version of …"`` follows for each library that is used, unless results are compared bit for
+    bit anyhow. After the hash of a part, ``"unread: …"`` names what cannot be compared in it, such
+    as an open file.
 
     Example:
         >>> before = fingerprint({"gain": 2.0, "colors": {"red", "blue"}})
@@ -97,7 +95,7 @@ def fingerprint(parts: Any, *, libraries: bool = True) -> Fingerprint:
     for name, part in named.items():
         reader = _Reader(versions)
         reader.read(part)
-        unread = "".join(f" {UNREAD}: {what}" for what in dict.fromkeys(reader.unread))
+        unread = "".join(f" unread: {what}" for what in dict.fromkeys(reader.unread))
         found[name] = reader.hash.hexdigest() + unread
     met = sorted(versions) if libraries else ()
     return found | {f"version of {name}": versions[name] for name in met}
@@ -115,12 +113,7 @@ def differing(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:
 
 
 def changes(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
-    """Name the settings in which two runs differ, and of their ``"fingerprint"`` the parts.
-
-    Args:
-        there: Settings of the run that is in a file, as plain data.
-        here: Settings of the present run.
-    """
+    """Name the settings in which two runs differ, and of their ``"fingerprint"`` the parts."""
     found = []
     for name in dict.fromkeys((*there, *here)):
         before, now = there.get(name), here.get(name)
@@ -138,19 +131,15 @@ def digest(parts: Mapping[str, str]) -> str:
 
 
 class _Reader:
-    """Feeds a hash with the content of objects.
-
-    Args:
-        libraries: Where the versions of libraries are noted.
-    """
+    """Feeds a hash with the content of objects, and notes the versions of libraries."""
 
     def __init__(self, libraries: dict[str, str]) -> None:
         self.hash = blake2b(digest_size=12)
         self.unread: list[str] = []
         self._libraries = libraries
-        # Each with the object, which keeps its id its own while it is here.
-        self._open: dict[int, tuple[int, Any]] = {}  # those that are being read, by their depth
-        self._done: dict[int, tuple[str, Any]] = {}  # digests of those that were read
+        # By id, each with the object, so that no other one gets its id.
+        self._open: dict[int, tuple[int, Any]] = {}  # with its depth
+        self._done: dict[int, tuple[str, Any]] = {}  # with its digest
 
     def read(self, value: Any) -> None:
         """Feed the hash with an object; one object met twice counts like two equal ones."""
@@ -281,9 +270,12 @@ class _Reader:
             self._read_all("items", [part for item in value.items() for part in item])
         if is_dataclass(value):
             names = [one.name for one in fields(value)]
-        elif hasattr(value, "__dict__") and (_is_project(kind.__module__) or _is_ours(kind)):
-            slots = [name for each in kind.__mro__ for name in _slots(each)]
-            names = sorted({*vars(value), *slots} - _lazy(kind))
+        elif hasattr(value, "__dict__") and (
+            _is_project(kind.__module__) or kind.__module__.partition(".")[0] == PACKAGE
+        ):
+            slots = (vars(each).get("__slots__", ()) for each in kind.__mro__)
+            lists = [(one,) if isinstance(one, str) else one for one in slots]
+            names = sorted({*vars(value)}.union(*lists) - _lazy(kind))
         else:
             try:  # what it would be pickled as, except tensors of torch, whose pickles differ
                 tensor = hasattr(value, "detach") and hasattr(value, "numpy")
@@ -291,18 +283,14 @@ class _Reader:
             except Exception:  # whatever the class raises
                 self.unread.append(f"{kind.__module__}.{kind.__qualname__}")
                 return
-            inside = isinstance(state, tuple)
-            self._read_all("state", [_listed(part) for part in state] if inside else [state])
+            parts = state if isinstance(state, tuple) else (state,)
+            listed = [list(part) if isinstance(part, Iterator) else part for part in parts]
+            self._read_all("state", listed)
             return
         for name in names:
             if hasattr(value, name):
                 self._note(name)
                 self.read(getattr(value, name))
-
-
-def _listed(part: Any) -> Any:
-    """Return the elements of an iterator, as a class may give for its items, as a list."""
-    return list(part) if isinstance(part, Iterator) else part
 
 
 def _cells(function: FunctionType) -> list[Any]:
@@ -322,11 +310,6 @@ def _names_in(code: CodeType) -> set[str]:
     return set(code.co_names).union(*inner)
 
 
-def _slots(kind: type) -> Iterable[str]:
-    slots = vars(kind).get("__slots__", ())
-    return (slots,) if isinstance(slots, str) else slots
-
-
 @functools.cache
 def _lazy(kind: Any) -> frozenset[str]:
     """Return the attributes of a class that are computed when they are first asked for."""
@@ -335,25 +318,9 @@ def _lazy(kind: Any) -> frozenset[str]:
     return frozenset(name for name, value in every.items() if isinstance(value, lazy))
 
 
-def _is_ours(kind: type) -> bool:
-    return kind.__module__.partition(".")[0] == PACKAGE
-
-
-@functools.cache
-def _library_folders() -> tuple[str, ...]:
-    paths = sysconfig.get_paths()
-    found = [paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
-    return tuple({*found, *site.getsitepackages(), site.getusersitepackages()})
-
-
 @functools.cache
 def _is_project(module: str | None, file: str | None = None) -> bool:
-    """Tell whether a module is neither of this package, nor of Python, nor installed.
-
-    Args:
-        module: Its name.
-        file: Where the code stands; the file of the module if None.
-    """
+    """Return whether a module is neither of this package, nor of Python, nor installed."""
     top = (module or "").partition(".")[0]
     if top in ("__main__", "__mp_main__"):
         return True
@@ -363,4 +330,4 @@ def _is_project(module: str | None, file: str | None = None) -> bool:
     place = getattr(found, "__file__", None) or file
     if place is None or place.startswith("<"):
         return top not in sys.stdlib_module_names
-    return not any(place.startswith(folder) for folder in _library_folders())
+    return not place.startswith(_LIBRARIES)

@@ -1,14 +1,12 @@
-"""What can go wrong, and what to do about it.
-
-Every error of the package is a ``ScmWorldError``, carries its data as attributes, and says what was
-given, what is allowed and what to do.
-"""
+"""Errors of the package: each carries its data, and says what was given and what is allowed."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 SHOWN = 8
 """Near names that a message lists."""
@@ -28,8 +26,7 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     return matches[0] if matches else None
 
 
-def suggested(suggestion: str | None) -> str:
-    """Return a suggestion as a question; nothing if there is none."""
+def _suggested(suggestion: str | None) -> str:
     return f"; did you mean {suggestion!r}?" if suggestion else ""
 
 
@@ -72,9 +69,6 @@ class ScmWorldError(Exception):
         return _rebuild, (type(self), str(self), self.__dict__)
 
 
-# --- models and interventions -----------------------------------------------------------------
-
-
 class ModelError(ScmWorldError, ValueError):
     """A causal model, a table or a graph that cannot be used; ``problems`` has all its faults."""
 
@@ -85,7 +79,7 @@ class ModelError(ScmWorldError, ValueError):
 
 
 class FunctionFailure(ModelError):
-    """A function of a user that raised an error, or gave what it must not give.
+    """A function of a user that raised an error, or returned a wrong value.
 
     Attributes:
         row: Of several worlds, the number of the one in which it happened.
@@ -96,22 +90,16 @@ class FunctionFailure(ModelError):
     def __init__(self, problem: str) -> None:
         super().__init__([problem])
 
-    @classmethod
-    def of(cls, name: str, error: Exception) -> Self:
-        """Return the one that names who raised an error."""
-        return cls(f"{name} raised {in_one_line(error)}")
 
-
-class blamed:  # noqa: N801 # used like the functions of ``contextlib``
+@contextmanager
+def blamed(name: str | Callable[[], str]) -> Iterator[None]:
     """Name a function, module or policy of a user in the errors that it raises.
 
-    Errors of this package pass through as they are.
-
     Args:
-        name: Begins the message; or a function that gives it, where this is done often.
+        name: The beginning of the message; or a function that returns it, where this is done often.
 
     Raises:
-        FunctionFailure: Another error was raised, which is its cause.
+        FunctionFailure: Another error than those of this package was raised, which is its cause.
 
     Example:
         >>> with blamed("the policy 'mine'"):
@@ -119,16 +107,13 @@ class blamed:  # noqa: N801 # used like the functions of ``contextlib``
         Traceback (most recent call last):
         scm_world.errors.FunctionFailure: the policy 'mine' raised KeyError: 'speed'
     """
-
-    def __init__(self, name: str | Callable[[], str]) -> None:
-        self.name = name
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if isinstance(error, Exception) and not isinstance(error, ScmWorldError):
-            name = self.name() if callable(self.name) else self.name
-            raise FunctionFailure.of(name, error) from error
+    try:
+        yield
+    except ScmWorldError:
+        raise
+    except Exception as error:
+        who = name() if callable(name) else name
+        raise FunctionFailure(f"{who} raised {in_one_line(error)}") from error
 
 
 class ImpossibleObservation(ModelError):
@@ -167,7 +152,7 @@ class UnknownVariable(InterventionError):
         parts = (n for n in known if n.startswith(f"{name}.") or n.endswith(f".{name}"))
         near = tuple(sorted(parts, key=len))
         suggestion = near[0] if near else nearest(name, known)
-        hint, said = suggested(suggestion), f"is named {name!r}"
+        hint, said = _suggested(suggestion), f"is named {name!r}"
         if near:
             hint = f"; near it are: {', '.join(near[:SHOWN])}"
             hint += f" and {len(near) - SHOWN} more" * (len(near) > SHOWN)
@@ -176,7 +161,7 @@ class UnknownVariable(InterventionError):
             patterns = [*dict.fromkeys(ends)] or known
             suggestion = next(iter(difflib.get_close_matches(name, patterns, 1, 0.75)), None)
             shown = f"; there are: {', '.join(patterns[:SHOWN])}" + ", …" * (len(patterns) > SHOWN)
-            hint, said = suggested(suggestion) or shown, f"fits the pattern {name!r}"
+            hint, said = _suggested(suggestion) or shown, f"fits the pattern {name!r}"
         message = f"no variable {said}{hint}"
         super().__init__(message, variable=name, near=near, suggestion=suggestion)
 
@@ -246,14 +231,27 @@ class Infeasible(InterventionError):
 
     Attributes:
         problems: One sentence for each pair of bodies that would overlap.
-        nearest: The nearest value that is feasible, where one was found.
+        nearest: The nearest value that is feasible, where one was found; it is searched for when
+            it, or the message, is first read.
     """
 
     def __init__(self, name: str, value: Any, problems: Sequence[str], nearest: Any = None) -> None:
-        hint = f"; the nearest feasible value is {nearest!r}" if nearest is not None else ""
-        message = f"do({name}): {value!r} is not feasible: {'; '.join(problems)}{hint}"
-        data = {"problems": tuple(problems), "nearest": nearest}
-        super().__init__(message, variable=name, value=value, **data)
+        message = f"do({name}): {value!r} is not feasible: {'; '.join(problems)}"
+        super().__init__(message, variable=name, value=value, problems=tuple(problems))
+        self._search = nearest if callable(nearest) else lambda: nearest
+
+    @cached_property
+    def nearest(self) -> Any:
+        """The nearest value that is feasible, or None."""
+        return self._search()
+
+    def __str__(self) -> str:
+        hint = f"; the nearest feasible value is {self.nearest!r}"
+        return super().__str__() + (hint if self.nearest is not None else "")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        data = {**vars(self), "nearest": self.nearest}
+        return _rebuild, (type(self), *self.args, {n: data[n] for n in data if n != "_search"})
 
 
 class SeveralProblems(InterventionError):
@@ -269,9 +267,6 @@ def raise_all(problems: Sequence[InterventionError]) -> None:
     """Raise the one problem, or all of them together; nothing if there is none."""
     if problems:
         raise problems[0] if len(problems) == 1 else SeveralProblems(problems)
-
-
-# --- engines, options, files and extras ---------------------------------------------------------
 
 
 class EngineError(ScmWorldError, RuntimeError):
@@ -332,7 +327,7 @@ class UnknownOption(ScmWorldError, ValueError):
     def __init__(self, option: str, value: Any, choices: Iterable[str]) -> None:
         choices, what = tuple(choices), f"{option} cannot be {value!r}; it can be"
         if isinstance(value, str) and not any(" " in choice for choice in choices):
-            near = suggested(nearest(value, choices))
+            near = _suggested(nearest(value, choices))
             what = f"no {option} is named {value!r}{near}; there are"
         message = f"{what}: {', '.join(choices)}"
         super().__init__(message, option=option, value=value, choices=choices)

@@ -88,10 +88,10 @@ def watched_batch(envs: Any, watch: Stopwatch) -> None:
     rewards, and what is known beside them.
     """
     inner = envs.unwrapped
-    tables, readers = inner._batch._tables.values(), inner._readers.values()
+    tables, readers = inner._batch._tables, inner._readers.values()
     places: list[tuple[str, Any, str]] = [
         (PHYSICS, inner._batch._engine, "step"),
-        *(("mechanisms", one, "evaluate") for one in {t.compiled.mechanisms for t in tables}),
+        *(("mechanisms", one, "evaluate") for one in {compiled.mechanisms for compiled in tables}),
         *(("observation", reader, "write") for reader in readers),
         ("observation", inner, "_observations"),
         ("info", inner, "_infos"),

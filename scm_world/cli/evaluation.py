@@ -41,7 +41,7 @@ def evaluate(
     Example: scm-world evaluate zoo:pushing,random --protocols P0,P5 -n 100
 
     Args:
-        policy: A file (.safetensors, .onnx, .zip, .npz, .parquet; a .zip of Stable-Baselines3 with
+        policy: A file (.safetensors, .zip, .npz, .parquet; a .zip of Stable-Baselines3 with
             --trust stable_baselines3), the folder of a training run,
             zoo:NAME, random, still, sweep, feedback, or module:function; several with commas;
             NAME=POLICY names one, and A+B are its runs.
@@ -141,8 +141,8 @@ def policies_of(text: str) -> dict[str, list[str]]:
         UnknownOption: A name is missing or stands twice.
 
     Example:
-        >>> policies_of("mine=a.onnx+b.onnx,random")
-        {'mine': ['a.onnx', 'b.onnx'], 'random': ['random']}
+        >>> policies_of("mine=a.zip+b.zip,random")
+        {'mine': ['a.zip', 'b.zip'], 'random': ['random']}
     """
     from scm_world.evaluation.players import NAMES
 

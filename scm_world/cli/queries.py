@@ -246,10 +246,6 @@ def counterfactual(
             {"step": step, "bodies": pair, "in": ("episode", "counterfactual")[which]}
             for step, pair, which in apart.contacts
         ],
-        "noise_in_one_only": [
-            {"variable": name, "in": ("episode", "counterfactual")[which]}
-            for name, which in apart.noise
-        ],
     }
     with console.staged(folder) as draft:
         save_episode(episode, draft / "episode.npz")

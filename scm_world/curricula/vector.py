@@ -19,8 +19,9 @@ from scm_world.curricula.curriculum import Curriculum, as_curriculum
 from scm_world.curricula.wrapper import CurriculumEnv, place
 from scm_world.env import ScmWorldEnv
 from scm_world.env.arguments import RESETS, reset_options
-from scm_world.env.many import MASK, read_mask
+from scm_world.env.many import MASK
 from scm_world.errors import UnknownOption
+from scm_world.world.batch import read_mask
 
 SUCCESS = "is_success"
 
@@ -192,7 +193,7 @@ class CurriculumVectorEnv(VectorWrapper):
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in all of them, or in those of ``options["reset_mask"]``."""
-        begun = read_mask(reset_options(options, (*RESETS, MASK)).get(MASK), self.num_envs)
+        begun = read_mask(MASK, reset_options(options, (*RESETS, MASK)).get(MASK), self.num_envs)
         for index in np.flatnonzero(begun):
             self._ended(index, counts=bool(self._stepped[index]))
         self._hand_out(begun)

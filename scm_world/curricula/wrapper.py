@@ -102,7 +102,7 @@ class CurriculumRunner:
         for step in self._due:
             due = self._schedule.due(world, step, self._fired)
             if any(name in world.structures.head for name in due):  # names mean what there is then
-                now = world.current()[0], world.noise_key(world.index)
+                now = world.row, world.noise_key(world.index)
                 found = structure_after(world.structures, due, world.graph, *now)
                 self._schedule = Schedule([(0, self._plan(found or world.compiled))])
                 due = self._schedule.due(world, step, self._fired)
@@ -299,8 +299,8 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return not over and self._turn.stepped(self._inner, step)
 
     def act(self) -> bool:
-        """Do what is due; tell whether that was anything."""
-        return self._turn.act(self._inner)
+        """Do what is due, after the plan of the reset; return whether that was anything."""
+        return self._inner.act() | self._turn.act(self._inner)
 
 
 def place(given: Any) -> tuple[int, int] | None:

@@ -196,12 +196,12 @@ def discover(
 
 
 def _terms(world: Simulation, seed: int) -> dict[str, Any]:
-    backend, usual = world.backend, world.resolution == world.task.choices["resolution"][0]
+    backend, usual = world.backend, world.options.resolution == world.task.choices["resolution"][0]
     return {
-        **({} if usual else {"resolution": world.resolution}),
+        **({} if usual else {"resolution": world.options.resolution}),
         "task": world.task.name,
         "arguments": {name: str(value) for name, value in sorted(world.task.given.items())},
-        "action_mode": world.action_mode,
+        "action_mode": world.options.action_mode,
         "preset": world.options.preset,
         "seed": seed,
         "versions": versions(f"{backend.name} {backend.version}"),

@@ -2,21 +2,22 @@
 
 import gymnasium
 
-from scm_world.env.environment import ScmWorldEnv
+from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.env.many import ScmWorldVectorEnv
-from scm_world.env.models import MODEL_ID, model_env, model_vector_env, vector_env
+from scm_world.env.models import MODEL_ID, make_env, vector_env
 from scm_world.env.observer import CONTEXTS, MODES, Observation
 from scm_world.env.wrappers import MovingAverageAction
 
 IDS = {
     name: str(spec.kwargs["task"])
     for name, spec in gymnasium.registry.items()
-    if spec.namespace == "scm_world" and "task" in spec.kwargs
+    if spec.namespace == "scm_world" and spec.kwargs.get("task")
 }
 """The registered environments of tasks, each with its task."""
 
 __all__ = [
     "CONTEXTS",
+    "ENV_OPTIONS",
     "IDS",
     "MODEL_ID",
     "MODES",
@@ -24,7 +25,6 @@ __all__ = [
     "Observation",
     "ScmWorldEnv",
     "ScmWorldVectorEnv",
-    "model_env",
-    "model_vector_env",
+    "make_env",
     "vector_env",
 ]

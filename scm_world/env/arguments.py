@@ -2,52 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import wraps
-from inspect import signature
-from typing import Any, TypeVar, cast
+from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from scm_world._arguments import one_of, real_numbers
 from scm_world._types import Floats, Values
-from scm_world.errors import ActionError, Infeasible, InterventionError, UnknownOption
+from scm_world.errors import ActionError, InterventionError, UnknownOption
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.tasks import Task, make_task
+from scm_world.queries.plans import Plan
 from scm_world.variables import Draw, Null
-from scm_world.variables.kinds import SPACES, SpaceName
-from scm_world.variables.subsets import AnyRegion
+from scm_world.variables.kinds import SPACES
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.structures import StructureCache
 
-Init = TypeVar("Init", bound=Callable[..., None])
-
 RESETS = ("do", "episode", "space")
 """Options of a reset."""
-
-
-def refuse_unknown(given: Iterable[str], *known: Callable[..., Any]) -> None:
-    """Refuse keywords that none of some functions takes, with the nearest one that there is."""
-    names = dict.fromkeys(name for one in known for name in signature(one).parameters)
-    choices = [name for name in names if name not in ("self", "options", "member")]
-    for name in given:
-        if name not in names:
-            raise UnknownOption("option of the environment", name, choices)
-
-
-def known_options(init: Init) -> Init:
-    """Let an ``__init__`` refuse unknown keywords by ``UnknownOption``."""
-
-    @wraps(init)
-    def checked(*args: Any, **given: Any) -> None:
-        refuse_unknown(given, init)
-        init(*args, **given)
-
-    return cast(Init, checked)
 
 
 def reset_options(options: Any, known: Iterable[str]) -> dict[str, Any]:
@@ -61,14 +35,14 @@ def reset_options(options: Any, known: Iterable[str]) -> dict[str, Any]:
 
 
 def limited(spec: EnvSpec | None, steps: int) -> EnvSpec | None:
-    """Give what Gymnasium knows of an environment the length of its episodes, if it has none."""
+    """Return what Gymnasium knows of an environment the length of its episodes, if it has none."""
     if spec is None or spec.max_episode_steps is not None:
         return spec
     return replace(spec, max_episode_steps=steps)
 
 
 def finite(size: int) -> str:
-    """Say what an action of so many numbers is, for messages."""
+    """Return what an action of so many numbers is, for messages."""
     return "a finite number" if size == 1 else f"{size} finite numbers"
 
 
@@ -81,32 +55,15 @@ def doubles(action: Any, size: int) -> Floats:
 
 
 def action_scale(world: Simulation) -> tuple[Floats, Floats]:
-    """Give what normalized actions stand for: ``middle + half * action``, shape (n_actions,) each.
+    """Return middle and half of the range of actions, shape (n_actions,) each.
 
-    What has no two bounds keeps its unit.
+    A normalized action stands for ``middle + half * action``. What has no two bounds keeps its
+    unit: 0 and 1.
     """
     low, high = world.action_low, world.action_high
     bounded = np.isfinite(low) & np.isfinite(high) & (low < high)
     low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
     return (low + high) / 2.0, (high - low) / 2.0
-
-
-def names_of(option: str, given: Sequence[str]) -> tuple[str, ...]:
-    """Read a list of names."""
-    if isinstance(given, str):
-        raise UnknownOption(option, given, (f"a list of names, such as [{given!r}]",))
-    return tuple(given)
-
-
-def made_task(
-    task: Task | StructureCache | str, options: Mapping[str, Any] | None
-) -> Task | StructureCache:
-    """Make a task of a name, with its options; or take one, or its structures."""
-    if isinstance(task, str):
-        return make_task(task, **(options or {}))
-    if options:
-        raise UnknownOption("task_options", dict(options), ("none, with a task that is made",))
-    return task
 
 
 def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -118,7 +75,8 @@ def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
     """
     flat = flatten(given or {})
     for name, value in flat.items():
-        if isinstance(value, Null):
+        several = value if isinstance(value, list | tuple) else ()
+        if isinstance(value, Null) or any(isinstance(act, Null) for act in several):
             raise InterventionError(
                 f"do({name}): an environment observes all that its task has; take something away "
                 "in a World instead",
@@ -131,44 +89,8 @@ def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
     }
 
 
-def begin(
-    world: Simulation,
-    seed: int | None,
-    acts: Mapping[str, Any],
-    attempts: int,
-    episode: int | None = None,
-    space: AnyRegion | None = None,
-) -> None:
-    """Reset a world, with an intervention that may draw something impossible."""
-    if episode is not None and seed is None:
-        seed = world.noise.seed
-    for left in reversed(range(attempts)):
-        try:
-            world.reset(seed=seed, episode=episode or 0, do=acts, space=space)
-        except Infeasible:
-            if not left:
-                raise
-            seed = episode = None
-        else:
-            return
-
-
-def warn_of_changes(
-    structure: CompiledTask, start: Mapping[str, Any], goals: SpaceName | None
-) -> None:
-    """Warn where episodes draw which bodies there are: what is observed has several shapes then."""
-    goal = {} if goals is None else structure.task.sample_goal(goals)
-    deciding = structure.task.decided_by
-    drawn = [name for name in deciding if isinstance({**goal, **start}.get(name), Draw)]
-    if drawn:
-        gymnasium.logger.warn(
-            f"{', '.join(drawn)}, drawn in every episode, decides which bodies exist, so that "
-            "observation_space changes; pad={…} with the largest values keeps one shape"
-        )
-
-
 def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledTask:
-    """Give the structure in which an episode begins after an intervention at its reset."""
+    """Return the structure in which an episode begins after an intervention at its reset."""
     family, key = world.structures, world.noise_key(0)
     found = structure_after(family, acts, family.head, family.head.solve(), key)
     return found or family.natural(None)
@@ -179,11 +101,11 @@ def structure_after(
 ) -> CompiledTask | None:
     """Return the structure after an intervention; None where it decides nothing of that."""
     mine: dict[str, Any] = {}
-    for name, value in acts.items():
-        if name in structures.head:
-            try:
-                mine[name] = structures.head.accept(name, value)
-            except InterventionError:  # the intervention will be refused
-                continue
+    deciding = Plan({name: acts[name] for name in acts if name in structures.head})
+    for name, value in deciding.at_start().items():
+        try:
+            mine[name] = structures.head.accept(name, value)
+        except InterventionError:  # the intervention will be refused
+            continue
     found = structures.after(mine, held, static, key)
     return None if found is None else structures.compiled(found)

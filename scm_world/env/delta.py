@@ -2,36 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, final
 
-import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world._arguments import one_of
 from scm_world._types import Floats
 from scm_world.env.vector import box
 from scm_world.errors import UnknownOption
-from scm_world.tasks import Task
 from scm_world.world import Simulation
-from scm_world.world.structures import StructureCache
 
 PREFIX = "delta_"
 JOINTS, TIPS = "joint_positions", "end_effector_positions"
 COMMAND, MEASURED = "command", "measured"
-ORIGINS = (COMMAND, MEASURED)
-"""What relative joint positions are relative to."""
 
 
-def checked_mode(mode: Any, task: Task | StructureCache) -> str:
-    """Check what actions should mean; None stands for the first mode of the task."""
-    given = task.task if isinstance(task, StructureCache) else task
-    modes: tuple[str, ...] = given.choices["action_mode"]
-    allowed = (*modes, *(PREFIX + one for one in modes))
+def checked_mode(mode: Any, modes: tuple[str, ...]) -> str:
+    """Check an action mode; None stands for the first mode of the task."""
     if mode is None:
         return modes[0]
-    one_of("action_mode", mode, allowed)
+    one_of("action_mode", mode, (*modes, *(PREFIX + one for one in modes)))
     return str(mode)
 
 
@@ -54,46 +44,30 @@ class Delta:
 
     Attributes:
         reads: The variable that actions are relative to; None if that is the last command.
+        space: Of relative actions: by itself, half of the range to either side.
     """
 
     def __init__(
-        self,
-        world: Simulation,
-        middle: Floats,
-        half: Floats,
-        *,
-        scale: float = 1.0,
-        origin: str = COMMAND,
+        self, world: Simulation, middle: Floats, half: Floats, *, scale: float, origin: str
     ) -> None:
         self._world, self._middle, self._half = world, middle, half
-        low, high = world.action_low, world.action_high
-        self._low, self._high = (low - middle) / half, (high - middle) / half
-        share = scale if isinstance(scale, int | float) else math.nan
-        if not 0.0 < share <= 1.0:
+        self._low, self._high = (
+            (world.action_low - middle) / half,
+            (world.action_high - middle) / half,
+        )
+        if not (isinstance(scale, int | float) and 0.0 < scale <= 1.0):
             raise UnknownOption("delta_scale", scale, ("a number in (0, 1]",))
-        one_of("delta_origin", origin, ORIGINS)
+        one_of("delta_origin", origin, (COMMAND, MEASURED))
         # Normalized actions fill [-1, 1] at every scale; others keep their unit.
         normalized = bool(np.any(half != 1.0) or np.any(middle != 0.0))
         reach = (self._high - self._low) / 2.0
-        self._gain, self._reach = (share, reach) if normalized else (1.0, share * reach)
-        mode = world.action_mode
+        self._gain, self._reach = (scale, reach) if normalized else (1.0, scale * reach)
+        self.space = box(-self._reach, self._reach)
+        mode = world.options.action_mode
         self.reads = TIPS if mode == TIPS else None if origin == COMMAND else mode
         if self.reads not in (None, TIPS, JOINTS):
             allowed = f"{COMMAND!r}, or action_mode={PREFIX + JOINTS!r}"
             raise UnknownOption(f"delta_origin of {PREFIX}{mode}", origin, (allowed,))
-        self._version = self._fresh = -1
-
-    def space(self) -> gymnasium.Space[NDArray[np.float32]]:
-        """Give the space of relative actions: by itself, half of the range to either side."""
-        return box(-self._reach, self._reach)
-
-    def absolute(self, action: Floats) -> Floats:
-        """Add what the action is relative to; what leaves the range of actions is clipped.
-
-        Args:
-            action: Shape (9,), in the units of the environment.
-        """
-        return self.moved(action, self._offset())
 
     def moved(self, action: Floats, offset: Floats) -> Floats:
         """Add what actions are relative to, shape (..., n) [SI units]; clip to the range."""
@@ -103,33 +77,25 @@ class Delta:
         return found
 
     def toward(self, command: Floats) -> Floats:
-        """Give the relative action that leads to a command, or as near to it as one can.
-
-        Args:
-            command: Shape (9,) [SI units].
-        """
-        step = (command - self._offset()) / self._half
+        """Return the relative action that leads to a command [SI units], or as near as one can."""
+        step = (command - self.offset()) / self._half
         found: Floats = np.clip(step / self._gain, -self._reach, self._reach)
         return found
 
-    def _offset(self) -> Floats:
+    def offset(self) -> Floats:
+        """Return what actions are relative to now, shape (n,) [SI units]."""
         world = self._world
         if self.reads is not None:
             measured: Floats = world.evaluate((self.reads,))[self.reads]
             return measured
-        now, state = world.current()
-        if world.action_mode == JOINTS and self.is_set():
-            found: Floats = world.compiled.view("joint_positions", state)
-            return found
-        return np.concatenate([np.ravel(now[name]) for name in world.compiled.actions])
+        if world.options.action_mode == JOINTS and self.is_set():
+            return world.row[JOINTS]
+        return world.row.actions
 
     def is_set(self) -> bool:
-        """Tell whether nothing was commanded since the joints were put where they are."""
-        world = self._world
-        if world.version != self._version:
-            self._version = world.version
-            base = world.snapshot().base
-            joints = world.model.targets("joint_positions")
-            set_now = base and (base.at_start or any(j in base.pending for j in joints))
-            self._fresh = world.index if set_now else -1
-        return self._fresh == world.index
+        """Return whether nothing was commanded since the joints were put where they are."""
+        base = self._world.base
+        if base is None:  # a step was taken since
+            return False
+        joints = self._world.model.targets("joint_positions")
+        return base.at_start or any(joint in base.pending for joint in joints)

@@ -2,68 +2,85 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+import inspect
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, final
 from weakref import WeakKeyDictionary
 
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of, whole_number
-from scm_world._types import Floats, Values
+from scm_world._types import Floats, Value, Values
+from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
 from scm_world.env.arguments import (
     RESETS,
     action_scale,
     asked,
-    begin,
     beginning_structure,
     doubles,
     finite,
-    known_options,
     limited,
-    made_task,
-    names_of,
     reset_options,
-    warn_of_changes,
 )
-from scm_world.env.copies import Copied
 from scm_world.env.delta import COMMAND, PREFIX, Delta, checked_mode
-from scm_world.env.observer import (
-    Goals,
-    Observation,
-    Observer,
-    Observing,
-    goal_reward,
-    observer,
-    reward_scale,
-)
-from scm_world.env.rendering import Looks, Window
+from scm_world.env.observer import Goals, Observation, Observer, Observing, observer
+from scm_world.env.pictures import Cameras, has_screen, height_and_width, read_camera
 from scm_world.env.vector import Vector, box
-from scm_world.errors import ActionError, ModelError, UnknownOption
+from scm_world.errors import (
+    ActionError,
+    EngineError,
+    ModelError,
+    NotReset,
+    SnapshotMismatch,
+    UnknownOption,
+)
 from scm_world.geometry.numbers import scaled_clip_kernel
 from scm_world.graph import flatten
 from scm_world.models.camera import Camera
+from scm_world.queries.plans import Plan
+from scm_world.queries.world import World
 from scm_world.tasks import Task
 from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.subsets import AnyRegion, as_region
-from scm_world.world import Audit, Simulation
+from scm_world.world import Audit, WorldSnapshot
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.interventions import merged
+from scm_world.world.mechanisms import Rows
+from scm_world.world.structures import StructureCache, as_task
+
+if TYPE_CHECKING:
+    from scm_world.backends.mujoco.viewer import Viewer
 
 RENDER_MODES = ("rgb_array", "human")
 SINGLE = np.dtype(np.float32)
 REWARD = "reward"
-_NOT_GIVEN = ("self", "__class__")
-_NO_REWARD = (
-    "the task {!r} has no reward, and an environment gives one at every step; give "
-    "reward=(function, 'hinge.position', …): a function and the names of what it is given"
-)
+_GENERATOR = ("_np_random", "_np_random_seed", "spec")
+"""What Gymnasium keeps in an environment."""
 
 
-class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]):
+@final
+@dataclass(frozen=True)
+class EnvSnapshot:
+    """An instant of an episode of an environment. It can be pickled.
+
+    Attributes:
+        world: Of its world.
+        interventions: What was done so far.
+        ended: Whether the episode is over and the next one begins with the next step of a batch.
+    """
+
+    world: WorldSnapshot
+    interventions: tuple[tuple[int, dict[str, Any]], ...]
+    ended: bool = False
+
+
+class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     """An environment whose every variable is a node of a causal graph.
 
     Made by ``gymnasium.make("scm_world/Pushing-v0")``; ``scm_world.env.IDS`` lists the ids. Any
@@ -95,8 +112,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         normalize_actions: Take actions in [-1, 1] instead of SI units.
         observation_mode: ``"structured"``: the published layout; ``"full"``: that and every other
             variable; ``"custom"``: the variables in ``observe``; ``"pixel"``: pictures.
-        observe: Names of variables, for ``"custom"``.
-        include: Names of variables to append to the vector.
+        observe: Names of variables, or one name, for ``"custom"``.
+        include: Likewise, to append to the vector.
         context: Where the parameters that can be intervened on are: ``"none"``,
             ``"observation"``: appended to the vector; ``"privileged"``: in a dictionary beside
             it. The noise of the sensors does not reach them.
@@ -106,14 +123,12 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             vector always has the places of these bodies then, with zeros where one is missing.
         cameras: Names (``"60"``, ``"120"``, ``"300"``, ``"overview"``) or cameras, for
             ``"pixel"``; the three of the robot if None.
-        image_size: Height and width of pictures, or both in one [pixels].
+        image_size: Height and width of pictures, or both in one [pixels]; 128 if None.
         normalize_observations: Give numbers in [-1, 1] instead of SI units.
-        goal_env: Give a dictionary with ``observation``, ``achieved_goal``, ``desired_goal``, and
-            have a method ``compute_reward``: see ``GoalReward``.
+        goal_env: Give a dictionary with ``observation``, ``achieved_goal``, ``desired_goal``, as
+            ``compute_reward`` takes them.
         start: An intervention at every reset; a value may be the name of a space to draw from.
         random_goal: Draw a new goal at every reset, from ``"A"``, ``"B"`` or ``"A|B"``.
-        attempts: How often a reset is tried if it draws bodies into one place; every attempt is
-            the beginning of the next episode.
         variables_space: The space in which every target of an intervention must lie: ``"A"``,
             ``"B"``, ``"A|B"``, a ``Subset``, or the patterns and regions of one.
         max_episode_length: In control steps; the task's own if None. Observations and
@@ -126,6 +141,9 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             in its file. ``"overview"``, or of a model ``"automatic"``, if None.
         render_size: Height and width of what ``render`` gives, or both in one [pixels]; if None
             480 and 640, or those of a camera that is given.
+
+    Attributes:
+        world: Its ``World``, which can be asked; what is asked leaves the environment as it is.
 
     Raises:
         UnknownOption: An option does not exist, or does not go with the others.
@@ -146,7 +164,6 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         "render_fps": 25,
     }
 
-    @known_options
     def __init__(
         self,
         task: Task | str = "pushing",
@@ -161,8 +178,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         delta_origin: str = COMMAND,
         normalize_actions: bool = True,
         observation_mode: str = "structured",
-        observe: Sequence[str] = (),
-        include: Sequence[str] = (),
+        observe: Iterable[str] = (),
+        include: Iterable[str] = (),
         context: str = "none",
         keypoints: bool | str = False,
         pad: Mapping[str, Any] | None = None,
@@ -172,7 +189,6 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         goal_env: bool = False,
         start: Mapping[str, Any] | None = None,
         random_goal: SpaceName | None = None,
-        attempts: int = 1,
         variables_space: AnyRegion | Mapping[str, Any] | None = None,
         max_episode_length: int | None = None,
         max_episode_steps: int | None = None,
@@ -180,23 +196,16 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         render_mode: str | None = None,
         render_camera: str | Camera | Mapping[str, Any] | None = None,
         render_size: int | tuple[int, int] | None = None,
+        **unknown: Any,
     ) -> None:
-        made_with = {name: value for name, value in locals().items() if name not in _NOT_GIVEN}
-        self._how = Observing(
-            mode=observation_mode,
-            names=names_of("observe", observe),
-            include=names_of("include", include),
-            context=context,
-            keypoints=keypoints,
-            cameras=cameras,
-            image_size=image_size,
-            normalize=normalize_observations,
-            goals=goal_env,
-            pad=pad,
-        )
-        made = made_task(task, task_options)
-        mode = checked_mode(action_mode, made)
-        self.world = Simulation(
+        for name in unknown:
+            raise UnknownOption("option of the environment", name, ENV_OPTIONS)
+        options = {name: value for name, value in locals().items() if name in ENV_OPTIONS}
+        self._how = Observing(**{name: options[name] for name in Observing.__dataclass_fields__})
+        made = task if isinstance(task, StructureCache) else as_task(task, task_options or {})
+        kind = made.task if isinstance(made, StructureCache) else made
+        mode = checked_mode(action_mode, kind.choices["action_mode"])
+        self.world = World(
             made,
             backend=backend,
             preset=preset,
@@ -207,70 +216,98 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             conventions=conventions,
             variables_space=as_region("variables_space", variables_space),
         )
-        used = {"preset": self.world.options.preset, "frame_skip": self.world.frame_skip}
-        used["backend"] = self.world.backend.name
-        Copied.__init__(self, **made_with | used | {"action_mode": mode})
+        used = {"preset": self.world.options.preset, "frame_skip": self.world.options.frame_skip}
+        used |= {"backend": self.world.backend.name, "action_mode": mode}
+        super().__init__(**options | used)
         if REWARD not in self.world.model:
             self.world.close()
-            raise ModelError([_NO_REWARD.format(self.world.task.name)])
-        self._modes = (observation_mode, mode)
+            raise ModelError(
+                [
+                    f"the task {self.world.task.name!r} has no reward, and an environment gives "
+                    "one at every step; give reward=(function, 'hinge.position', …): a function "
+                    "and the names of what it is given"
+                ]
+            )
         one_of("random_goal", random_goal, (None, *SPACES))
         self._start, self._random_goal = asked(start), random_goal
-        self._attempts = whole_number("attempts", attempts, least=1)
+        self.limit = self.world.max_episode_length + int(self.world.options.conventions.published)
+        if max_episode_steps not in (None, -1):
+            steps = whole_number("max_episode_steps", max_episode_steps, least=1)
+            self.limit = min(self.limit, steps)
+
         one_of("render_mode", render_mode, (None, *RENDER_MODES))
         self.render_mode = render_mode
-        self._choose_view(render_camera, render_size)
-        self._window = Window() if render_mode == "human" else None
-        modes = [one for one in RENDER_MODES if one != "human" or Window.is_possible()]
-        fps = round(1 / self.world.control_period)
+        if render_mode == "human" and not has_screen():
+            raise EngineError(
+                "render_mode='human' opens a window, and there is no screen: neither DISPLAY nor "
+                "WAYLAND_DISPLAY is set; use render_mode='rgb_array', which needs none",
+                "mujoco",
+            )
+        self._viewer: Viewer | None = None
+        self._cameras, self._view = Cameras(self.world), read_camera(render_camera)
+        self._size = height_and_width("render_size", render_size)
+        if self._view is not None:  # refuses one that there is not
+            scene_camera(self.world.structure.default_scene(), self._view)
+        modes = [one for one in RENDER_MODES if one != "human" or has_screen()]
+        fps = round(1 / self.world.options.control_period)
         self.metadata = {**type(self).metadata, "render_modes": modes, "render_fps": fps}
 
-        # What an action means; what has no two bounds keeps its unit.
+        # What an action means: middle + half * action [SI units].
         low, high = self.world.action_low, self.world.action_high
         self._middle, self._half = np.zeros(low.size), np.ones(low.size)
-        bounds = (low, high)
         if normalize_actions:
             self._middle, self._half = action_scale(self.world)
-            scaled = np.isfinite(low) & np.isfinite(high) & (low < high)
-            bounds = (np.where(scaled, -1.0, low), np.where(scaled, 1.0, high))
         self._delta = None
         if mode.startswith(PREFIX):
             self._delta = Delta(
                 self.world, self._middle, self._half, scale=delta_scale, origin=delta_origin
             )
-        else:
-            for option, value, usual in (
-                ("delta_scale", delta_scale, 1.0),
-                ("delta_origin", delta_origin, COMMAND),
-            ):
-                if value != usual:
-                    allowed = f"{usual!r}, or an action_mode that begins with {PREFIX!r}"
-                    raise UnknownOption(f"{option} of {mode}", value, (allowed,))
+        elif (delta_scale, delta_origin) != (1.0, COMMAND):
+            given = {"delta_scale": delta_scale, "delta_origin": delta_origin}
+            allowed = (f"none, or an action_mode that begins with {PREFIX!r}",)
+            raise UnknownOption(f"relative actions of {mode}", given, allowed)
+        ends = ((end - self._middle) / self._half for end in (low, high))
+        self.action_space = self._delta.space if self._delta else box(*ends)
         self._given = np.empty(low.size)
         self._range = (self._middle, self._half, low, high)
-        self.action_space = self._delta.space() if self._delta else box(*bounds)
 
-        self.limit = self.world.max_episode_length + int(self.world.conventions.published)
-        if max_episode_steps not in (None, -1):
-            self.limit = min(
-                self.limit, whole_number("max_episode_steps", max_episode_steps, least=1)
-            )
-        self._scale = reward_scale(self.world)
+        self._scale = (
+            self.world.options.control_period if self.world.options.conventions.published else 1.0
+        )
         self._terms = tuple(self.world.task.weights)
         self._version = -1
         self._done: list[tuple[int, dict[str, Any]]] = []
         self._observers: WeakKeyDictionary[
             CompiledTask, tuple[Observer, Goals | None, frozenset[str], tuple[str, ...]]
         ] = WeakKeyDictionary()
-        structure = beginning_structure(self.world, self._start)
         self._largest = None
         if pad is not None:
             self._largest = beginning_structure(self.world, {**self._start, **asked(pad)})
-        else:
-            warn_of_changes(structure, self._start, self._random_goal)
-        self._arrange(structure)
-        if goal_env:
-            self.compute_reward = goal_reward(self.world)
+        self._arrange(beginning_structure(self.world, self._start))
+        if goal_env:  # learners take every environment that has it for one with goals
+            self.compute_reward = self.goal_reward
+
+    # --- what it is -------------------------------------------------------------------------------
+
+    @property
+    def made_with(self) -> dict[str, Any]:
+        """The options that it was made with, by name."""
+        return dict(self._ezpickle_kwargs)
+
+    @property
+    def action_mode(self) -> str:
+        """What an action means."""
+        return str(self._ezpickle_kwargs["action_mode"])
+
+    @property
+    def layout(self) -> dict[str, slice]:
+        """Where each variable stands in the vector that is observed; empty for pictures."""
+        return dict(self._observer.layouts.get("observation", {}))
+
+    @property
+    def context_layout(self) -> dict[str, slice]:
+        """Where each variable stands in the privileged context; empty without one."""
+        return dict(self._observer.layouts.get("context", {}))
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -282,23 +319,18 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self.__dict__["spec"] = limited(spec, self.limit)
 
     def as_action(self, command: ArrayLike) -> NDArray[np.float64]:
-        """Return the (absolute) action that stands for a command in SI units, shape (n,).
+        """Return the action, now, that leads to a command in SI units, shape (n,).
+
+        A relative one leads as near to it as one can.
 
         Raises:
             ActionError: The command has another shape, or is no real numbers.
         """
-        found: NDArray[np.float64] = (self._read(command) - self._middle) / self._half
+        given = self._read(command)
+        if self._delta is not None:
+            return self._delta.toward(given)
+        found: NDArray[np.float64] = (given - self._middle) / self._half
         return found
-
-    def toward(self, command: ArrayLike) -> NDArray[np.float64]:
-        """Return the action, now, that leads to a command in SI units or near it, shape (n,).
-
-        Raises:
-            ActionError: The command has another shape, or is no real numbers.
-        """
-        if self._delta is None:
-            return self.as_action(command)
-        return self._delta.toward(self._read(command))
 
     def _read(self, action: ArrayLike) -> Any:
         """Read an action or a command, shape (n,); 32-bit numbers stay what they are."""
@@ -328,18 +360,31 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
     @property
     def observed(self) -> tuple[str, ...] | None:
         """The variables that the observation is made of; None of pictures, which show many."""
-        if self._how.mode == "pixel":
+        if self._how.observation_mode == "pixel":
             return None
-        goals = self._goals.names if self._how.goals and self._goals is not None else ()
+        goals = self._goals.names if self._how.goal_env and self._goals is not None else ()
         return (*self._observer.names, *goals)
 
-    def _look(self) -> Values:
+    def _look(self) -> Rows:
         """Compute what is needed of the present."""
+        self._follow()
+        return self.world.evaluate(self._needed)
+
+    def _follow(self) -> None:
+        """Observe the structure that there is, if it has changed."""
         if self._version != self.world.version:
             self._version = self.world.version
             if self.world.compiled is not self._declaration:
                 self._arrange(self.world.compiled)
-        return self.world.evaluate(self._needed)
+
+    def read(self, now: Rows) -> tuple[Any, dict[str, Any]]:
+        """Return observation and info of the values of its world, or of several like it.
+
+        Those of several have a leading axis; ``None`` where they cannot be read in one call.
+        """
+        self._follow()
+        together = now.numbers.ndim == 1 or self._observer.together
+        return self._observer.observe(now) if together else None, self._info(now)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -348,7 +393,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
 
         Args:
             seed: Of the noise.
-            options: ``{"do": {…}}``: an intervention that holds for the whole episode. Where it
+            options: ``{"do": {…}}``: an intervention that holds for the whole episode, or a plan
+                whose times lie within it. Where it
                 sets what ``start`` or a random goal sets too, it counts. ``{"episode": n}``: the
                 number of the episode within the noise; the next one if not given, 0 with a seed.
                 ``{"space": …}``: the space in which every target must lie.
@@ -362,13 +408,16 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         asked_for = reset_options(options, RESETS)
         request = self.beginning(asked_for.get("do"))
         number, space = asked_for.get("episode"), asked_for.get("space")
-        begin(self.world, seed, request, self._attempts, number, space)
+        if number is not None and seed is None:
+            seed = self.world.noise.seed
+        self.world.reset(seed=seed, episode=number or 0, do=request, space=space)
+        if self.world.is_planned:
+            request = Plan(request).at_start()
         self._done = [(0, request)] if request else []
         now = self._look()
         for name in self._terms:
             one_number(now, name, (name,))
-        if self._window is not None:
-            self._window.show(self.world.scene())
+        self._show()
         return self._observer.observe(now), self._info(now)
 
     def beginning(self, do: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -385,19 +434,39 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Advance one control step.
+        """Advance one control step, and do what the plan of the reset contains for where it leads.
+
+        Observation and info are those after it; it earns nothing.
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
+            InterventionError: The plan was refused there; the step is taken.
         """
         self.world.advance(self.command(action))
         now = self._look()
         reward = self._scale * one_number(now, REWARD, self._terms)
         terminated = TERMINATED in self._counted and bool(now[TERMINATED])
         truncated = self.world.index >= self.limit
-        if self._window is not None:
-            self._window.show(self.world.scene())
-        return self._observer.observe(now), reward, terminated, truncated, self._info(now)
+        info = self._info(now)
+        if self.world.is_planned and not (terminated or truncated) and self.act():
+            now = self._look()
+            info = {**self._info(now), "reward_terms": info["reward_terms"]}  # of the step
+        self._show()
+        return self._observer.observe(now), reward, terminated, truncated, info
+
+    def act(self) -> bool:
+        """Do what the plan of the reset contains for this instant; return whether it was anything.
+
+        Steps do so by themselves.
+
+        Raises:
+            InterventionError: It was refused.
+        """
+        audit = self.world.act()
+        if audit is not None:
+            did = {name: entry.requested for name, entry in audit.targets.items()}
+            self._done.append((self.world.index, did))
+        return audit is not None
 
     def command(self, action: ArrayLike) -> Floats:
         """Give what the world takes for an action of this environment, shape (n,) [SI units].
@@ -407,7 +476,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         """
         given = self._read(action)
         if self._delta is not None:
-            given = self._delta.absolute(np.array(given, dtype=np.float64))
+            given = self._delta.moved(np.array(given, np.float64), self._delta.offset())
         self._given[...] = given  # every 32-bit number is a 64-bit one
         command = np.empty(given.shape)  # the world keeps it
         if not scaled_clip_kernel(self._given, *self._range, command):
@@ -446,27 +515,26 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             UnknownOption: The observation is no vector, or a value is missing.
         """
         if not isinstance(self._observer, Vector):
-            raise UnknownOption("observation of values", self._how.mode, ("a vector",))
+            raise UnknownOption("observation of values", type(self._observer), ("a vector",))
         if not isinstance(values, Mapping) or not values.keys() >= {*self._observer.names}:
             raise UnknownOption("values of an observation", values, self._observer.names)
         return self._observer.observe_values(values)
 
     def present(self) -> tuple[Observation, dict[str, Any]]:
         """Give the observation and the info of the present, as after an intervention."""
-        now = self._look()
-        return self._observer.observe(now), self._info(now)
+        return self.read(self._look())
 
-    def _info(self, now: Values) -> dict[str, Any]:
+    def _info(self, now: Rows) -> dict[str, Any]:
+        """Return the info of one world, or of several as columns."""
+        truth, number = (bool, float) if now.numbers.ndim == 1 else (_truths, np.asarray)
         info: dict[str, Any] = {}
         if SUCCESS in self._counted:
-            info["is_success"] = info["success"] = bool(now[SUCCESS])
+            info["is_success"] = info["success"] = truth(now[SUCCESS])
         if FRACTION in self._counted:
-            info["fractional_success"] = float(now[FRACTION])
+            info["fractional_success"] = number(now[FRACTION])
         if self._goals is not None:
-            info["achieved_goal"], info["desired_goal"] = self._goals.read(self.world)
-        info["reward_terms"] = terms = {}
-        for name in self._terms:
-            terms[name] = float(now[name])
+            info["achieved_goal"], info["desired_goal"] = self._goals.read(now)
+        info["reward_terms"] = {name: number(now[name]) for name in self._terms}
         return info
 
     @property
@@ -479,6 +547,33 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             **{name: space.shape or () for name, space in goals},
         }
 
+    def goal_reward(self, achieved: ArrayLike, desired: ArrayLike, info: Any = None) -> Any:
+        """Compute the reward of having achieved one goal while another one was desired.
+
+        With ``goal_env`` it is called ``compute_reward``, too, the name that learners know.
+
+        With ``weights="sparse"``, or where only ``fractional_success`` and ``success`` have
+        weights, it is the reward of the step. Else the first call warns: goals do not decide dense
+        terms.
+
+        Args:
+            achieved: As in ``info``, shape (..., n).
+            desired: Shape (..., n).
+            info: Not needed; learners give it.
+
+        Returns:
+            The weighted sum of the terms that goals alone decide, shape (...); times the control
+            period under the conventions that say so.
+
+        Raises:
+            UnknownOption: The task has no goals, or these have another shape.
+        """
+        if self._goals is None:
+            raise UnknownOption("task with goals", self.world.task.name, ("one that has goals",))
+        return self._scale * self._goals.reward(achieved, desired)
+
+    # --- pictures ---------------------------------------------------------------------------------
+
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene, shape (h, w, 3); None without ``render_mode="rgb_array"``.
 
@@ -488,17 +583,80 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         Raises:
             ModelError: There is nothing to draw: a step function has no shapes.
         """
-        if self._window is not None:
-            self._window.show(self.world.scene())
+        self._show()
         if self.render_mode != "rgb_array":
             return None
-        from scm_world.backends.renderer import picture
-
         scene = self.world.scene()
-        return picture(scene, self._camera_of(scene), self._size)
+        return picture(scene, self._cameras.now(scene, self._view, self._size))
+
+    def image(self, camera: Camera | str | None = None) -> RenderedImage:
+        """Measure what a camera sees: how far away everything is, and which body a pixel shows.
+
+        Args:
+            camera: Any, or the name of one: of the robot's tasks ``"60"``, ``"120"``, ``"300"``,
+                ``"overview"``, of a model one in its file, or ``"automatic"``. The last one if
+                None.
+        """
+        scene = self.world.scene()
+        return render(scene, self._cameras.now(scene, camera))
+
+    def _show(self) -> None:
+        if self.render_mode != "human":
+            return
+        if self._viewer is None:
+            from scm_world.backends.mujoco.viewer import Viewer  # an engine, only where it is used
+
+            self._viewer = Viewer()
+        self._viewer.show(self.world.scene())
+
+    # --- copies -----------------------------------------------------------------------------------
+
+    def snapshot(self) -> EnvSnapshot:
+        """Save everything that decides the future of the episode.
+
+        Raises:
+            NotReset: There is no episode yet.
+        """
+        return EnvSnapshot(self.world.snapshot(), tuple(self._done))
+
+    def restore(self, snapshot: EnvSnapshot) -> None:
+        """Go back to a snapshot, bit for bit.
+
+        Raises:
+            SnapshotMismatch: It is none of an environment, or one of another task or engine.
+        """
+        if not isinstance(snapshot, EnvSnapshot):
+            raise SnapshotMismatch(f"{snapshot!r} is no snapshot; give what snapshot() returned")
+        self.world.restore(snapshot.world)
+        self._done = list(snapshot.interventions)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the arguments, a snapshot, and Gymnasium's generator."""
+        try:
+            snapshot = self.snapshot()
+        except NotReset:
+            snapshot = None
+        generator = {name: self.__dict__[name] for name in _GENERATOR if name in self.__dict__}
+        return {**super().__getstate__(), "snapshot": snapshot, "generator": generator}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Begin where the other environment is; a closed one, or one without episode, is new."""
+        super().__setstate__(state)
+        self.__dict__.update(state["generator"])
+        if state["snapshot"] is not None:
+            self.restore(state["snapshot"])
 
     def close(self) -> None:
         """Free the backend and the window."""
-        if self._window is not None:
-            self._window.close()
+        if self._viewer is not None:
+            self._viewer.close()
         self.world.close()
+
+
+def _truths(values: Value) -> NDArray[np.bool_]:
+    found: NDArray[np.bool_] = values != 0
+    return found
+
+
+ENV_OPTIONS = tuple(inspect.signature(ScmWorldEnv).parameters)[:-1]
+"""Names of the options of an environment."""

@@ -6,37 +6,37 @@ import operator
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
-from typing import Any, final
+from dataclasses import replace
+from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array
-from numpy.typing import NDArray
 
-from scm_world._arguments import whole_number
 from scm_world._types import Floats
-from scm_world.env.arguments import RESETS, doubles, finite, limited, reset_options
-from scm_world.env.copies import EnvSnapshot
+from scm_world.env.arguments import RESETS, limited, reset_options
+from scm_world.env.environment import EnvSnapshot
 from scm_world.errors import (
     ActionError,
     InterventionError,
     NotReset,
-    ScmWorldError,
     SnapshotMismatch,
     UnknownOption,
 )
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
+from scm_world.world.batch import Mask, located, read_actions, read_mask, read_seeds
 
 MASK = "reset_mask"
+
+SPACE = ""
+"""The key of the space among the shapes of a member."""
 
 SHOWN = ("reset", "present")
 """Methods whose answer is an observation and an info."""
 
-Mask = NDArray[np.bool_]
 Stepped = tuple[Any, Floats, Mask, Mask, dict[str, Any]]
 
 
@@ -140,7 +140,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
             InterventionError: The intervention was refused.
         """
         given = reset_options(options, (*RESETS, MASK))
-        which = read_mask(given.pop(MASK, None), self.num_envs)
+        which = read_mask(MASK, given.pop(MASK, None), self.num_envs)
         seeds = read_seeds(seed, self.num_envs)
         asked: dict[int, dict[str, Any]] = {
             int(index): {"seed": seeds[index], "options": {}} for index in np.flatnonzero(which)
@@ -170,7 +170,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
             NotReset: One of them has no episode yet.
         """
         stepping = self._stepping(actions)
-        given = read_actions(actions, stepping, self._action_size)
+        given = read_actions(actions, stepping, self._action_size, "environment")
         begun = ~stepping  # the next episode takes the place of a step
         if begun.any():
             self._reset({int(index): {} for index in np.flatnonzero(begun)})
@@ -192,7 +192,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
     def _stepping(self, actions: Any) -> Mask:
         """Return which environments take a step."""
         if not self._begun.all():
-            raise located(NotReset(), int(np.argmin(self._begun)))
+            raise located(NotReset(), int(np.argmin(self._begun)), "environment")
         if not self._ended.any():
             return self._everyone
         if self.autoreset_mode is AutoresetMode.DISABLED:
@@ -291,7 +291,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
             NotReset: One of them has no episode yet.
         """
         if not self._begun.all():
-            raise located(NotReset(), int(np.argmin(self._begun)))
+            raise located(NotReset(), int(np.argmin(self._begun)), "environment")
         return self._observations(), self._infos(self._everyone)
 
     def snapshot(self) -> tuple[EnvSnapshot, ...]:
@@ -305,7 +305,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
     def _snapshots(self, indices: Iterable[int]) -> list[EnvSnapshot]:
         for index in indices:
             if not self._begun[index]:
-                raise located(NotReset(), index)
+                raise located(NotReset(), index, "environment")
         found = zip(indices, self.call_in(indices, "snapshot"), strict=True)
         return [replace(one, ended=bool(self._ended[index])) for index, one in found]
 
@@ -349,7 +349,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         number = index_of(source, self.num_envs)
         chosen = np.asarray(self._everyone if into is None else into)
         if chosen.dtype == np.bool_:
-            chosen = np.flatnonzero(read_mask(chosen, self.num_envs))
+            chosen = np.flatnonzero(read_mask(MASK, chosen, self.num_envs))
         others = {index_of(one, self.num_envs) for one in np.atleast_1d(chosen).tolist()}
         (snapshot,) = self._snapshots([number])
         self.restore(dict.fromkeys(sorted(others - {number}), snapshot))
@@ -358,49 +358,37 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
 # --- what all kinds do to one environment ---------------------------------------------------------
 
 
-@final
-@dataclass(frozen=True)
-class MemberShapes:
-    """What the environments of a batch have in common.
+def act(
+    env: gymnasium.Env[Any, Any],
+    shapes: Mapping[str, Any],
+    method: str,
+    given: Mapping[str, Any],
+) -> tuple[Any, tuple[Any, dict[str, Any]]]:
+    """Call a method that changes one environment of several.
 
-    Attributes:
-        space: Of the observations.
-        infos: The shape of each entry of ``info``.
+    Args:
+        env: The environment.
+        shapes: Of all of them; see ``member_shapes``.
+        method: Its name.
+        given: Its arguments.
+
+    Returns:
+        The answer; and the observation and the info afterwards.
+
+    Raises:
+        InterventionError: It would be observed unlike the others then.
     """
-
-    space: gymnasium.Space[Any]
-    infos: dict[str, tuple[int, ...]]
-
-    @classmethod
-    def of(cls, env: gymnasium.Env[Any, Any]) -> MemberShapes:
-        """Read it from one of them."""
-        return cls(env.observation_space, env.get_wrapper_attr("info_shapes"))
-
-    def act(
-        self, env: gymnasium.Env[Any, Any], method: str, given: Mapping[str, Any]
-    ) -> tuple[Any, tuple[Any, dict[str, Any]]]:
-        """Call a method that changes an environment.
-
-        Returns:
-            Its answer; and the observation and the info afterwards.
-        """
-        answer = env.get_wrapper_attr(method)(**given)
-        inner: Any = env.unwrapped
-        shown = answer if method in SHOWN else inner.present()
-        if env.observation_space is not self.space:
-            request = given.get("request") or (given.get("options") or {}).get("do") or {}
-            self._check(env, next(iter(request), f"the {next(iter(given), method)}"))
-        return (None if method in SHOWN else answer), shown
-
-    def _check(self, env: gymnasium.Env[Any, Any], variable: str) -> None:
-        here = MemberShapes.of(env)
-        if here == self:
-            return
-        before, after = self._shapes(), here._shapes()
+    answer = env.get_wrapper_attr(method)(**given)
+    inner: Any = env.unwrapped
+    shown = answer if method in SHOWN else inner.present()
+    here = shapes if env.observation_space is shapes[SPACE] else member_shapes(env)
+    if here != shapes:
+        request = given.get("request") or (given.get("options") or {}).get("do") or {}
+        variable = next(iter(request), f"the {next(iter(given), method)}")
         changes = [
-            f"{name} from shape {before[name]} to shape {after[name]}"
-            for name in before
-            if before[name] != after[name]
+            f"{name} from shape {shape} to shape {here[name]}"
+            for name, shape in shapes.items()
+            if name != SPACE and shape != here[name]
         ]
         raise InterventionError(
             f"{variable} changes which bodies exist, and with them what is observed: "
@@ -409,22 +397,15 @@ class MemberShapes:
             "it out of a curriculum (besides=…), or use single environments",
             variable=variable,
         )
-
-    def _shapes(self) -> dict[str, Any]:
-        parts: Any = self.space
-        parts = dict(parts) if isinstance(parts, gymnasium.spaces.Dict) else {"observation": parts}
-        return {**self.infos, **{name: part.shape for name, part in parts.items()}}
+    return (None if method in SHOWN else answer), shown
 
 
-def located(error: ScmWorldError, index: int) -> ScmWorldError:
-    """Say in an error in which environment it happened.
-
-    Example:
-        >>> print(located(ScmWorldError("the block is in the table"), 3))
-        environment 3: the block is in the table
-    """
-    error.args = (f"environment {index}: {error}",)
-    return error
+def member_shapes(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    """Return the space and the shapes of what is observed, and those of the infos."""
+    space: Any = env.observation_space
+    parts = dict(space) if isinstance(space, gymnasium.spaces.Dict) else {"observation": space}
+    shapes = {name: part.shape for name, part in parts.items()}
+    return {**env.get_wrapper_attr("info_shapes"), **shapes, SPACE: space}
 
 
 # --- rows -----------------------------------------------------------------------------------------
@@ -494,33 +475,6 @@ def read_mode(given: AutoresetMode | str) -> AutoresetMode:
         raise UnknownOption("autoreset_mode", given, modes) from None
 
 
-def read_seeds(seed: Any, size: int) -> list[Any]:
-    """Return the seed of each environment.
-
-    Example:
-        >>> read_seeds(7, 3)
-        [7, 8, 9]
-    """
-    if seed is None:
-        return [None] * size
-    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
-        return [whole_number("seed", seed, least=0) + index for index in range(size)]
-    if len(seed) != size:
-        raise UnknownOption("seed", seed, ("a whole number", f"a list of {size} of them or None"))
-    return [*seed]
-
-
-def read_mask(mask: Any, size: int) -> Mask:
-    """Read which environments are meant; all if None."""
-    if mask is None:
-        return np.ones(size, bool)
-    read = isinstance(mask, np.ndarray) and mask.shape == (size,) and mask.dtype == np.bool_
-    if not (read and mask.any()):
-        allowed = (f"an array of {size} truth values, at least one of them true",)
-        raise UnknownOption(MASK, mask, allowed)
-    return np.array(mask)
-
-
 def spread(what: str, given: Any, size: int, among: Iterable[int] | None = None) -> dict[int, Any]:
     """Return what is asked of each environment.
 
@@ -552,25 +506,3 @@ def index_of(index: Any, size: int) -> int:
     if isinstance(index, bool) or not 0 <= number < size:
         raise UnknownOption("environment", index, (f"any whole number from 0 to {size - 1}",))
     return number
-
-
-def read_actions(actions: Any, which: Mask, size: int) -> Floats:
-    """Read the actions of all environments.
-
-    Args:
-        actions: One for each.
-        which: The environments that are stepped, shape (n,).
-        size: How many numbers an action has.
-
-    Returns:
-        Shape (n, size).
-    """
-    given = doubles(actions, size)
-    if given.shape != (which.size, size):
-        shape = f"actions of {which.size} environments have shape ({which.size}, {size})"
-        raise ActionError(f"{shape}, got {given.shape}", actions)
-    wrong = np.flatnonzero(which & ~np.isfinite(given).all(axis=1))
-    if wrong.size:
-        text = f"environment {wrong[0]}: an action is {finite(size)}"
-        raise ActionError(f"{text}, got {given[wrong[0]]!r}", actions)
-    return given

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, final
-from weakref import WeakKeyDictionary
 
 import gymnasium
 import numpy as np
@@ -15,14 +14,12 @@ from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.env.delta import JOINTS
 from scm_world.env.environment import REWARD, ScmWorldEnv
-from scm_world.env.many import Mask, MemberShapes, ScmWorldVectorEnv, located
-from scm_world.env.observer import DictObserver
-from scm_world.env.vector import KEYPOINTS, Vector
+from scm_world.env.many import ScmWorldVectorEnv, act, member_shapes
 from scm_world.errors import EngineFailure, FunctionFailure, ScmWorldError
-from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED, one_number
+from scm_world.tasks.rewards import TERMINATED, one_number
 from scm_world.variables.reserved import CONTROL_INDEX, SENSOR_NOISE
-from scm_world.world.batch import Batch, StateTable
-from scm_world.world.mechanisms import places
+from scm_world.world.batch import Batch, Mask, located
+from scm_world.world.mechanisms import Rows
 
 
 @final
@@ -71,7 +68,7 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         # They share what is declared, and each can be made again by itself.
         shared = {**options, "task": lead.world.structures, "task_options": None}
         self.envs = [first, *(member(**shared) for _ in range(count - 1))]
-        self._alike = [MemberShapes.of(env) for env in self.envs]
+        self._shapes = member_shapes(first)
         self._inner: list[Any] = [env.unwrapped for env in self.envs]
         for inner in self._inner:
             inner._ezpickle_kwargs = lead._ezpickle_kwargs
@@ -80,43 +77,31 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         names = (*lead._needed, *(() if self._reads is None else (self._reads,)))
         worlds = [inner.world for inner in self._inner]
         self._batch = Batch(worlds, threads=threads, names=names)
-        self._readers: WeakKeyDictionary[StateTable, ObservationReader] = WeakKeyDictionary()
         self._commands = np.empty((count, self._action_size))
-        # Where joints were put since the last command: relative actions are relative to them.
-        self._are_set = np.zeros(count, dtype=np.bool_)
-        self._sensed: set[int] = set()
-        self._alone: set[int] = set()  # they were used by themselves since they were stepped
         self._acting: Any = self.envs if hasattr(first, "stepped") else ()
 
     # --- one of them by itself --------------------------------------------------------------------
-
-    def _bring(self, index: int) -> gymnasium.Env[Any, Any]:
-        """Return an environment as it is now, to be used by itself."""
-        self._batch.world(index)
-        self._alone.add(index)
-        return self.envs[index]
 
     def _act(self, method: str, given: Mapping[int, Mapping[str, Any]]) -> dict[int, Any]:
         answers, before, index = {}, {}, 0
         try:
             for index, arguments in given.items():
-                env = self._bring(index)
                 if self._inner[index].world.has_begun:  # else there is nothing to lose
                     before[index] = self._inner[index].snapshot()
-                answers[index], shown = self._alike[index].act(env, method, arguments)
+                answers[index], shown = act(self.envs[index], self._shapes, method, arguments)
                 self._write(index, *shown)
         except BaseException as error:
             for row, snapshot in before.items():
                 self._inner[row].restore(snapshot)
                 self._write(row, *self._inner[row].present())
             if isinstance(error, ScmWorldError):
-                located(error, index)
+                located(error, index, "environment")
             raise
         return answers
 
     def call_in(self, indices: Iterable[int], name: str, *args: Any, **kwargs: Any) -> list[Any]:
         """Call a method of some environments; return what cannot be called as it is."""
-        found = [self._bring(index).get_wrapper_attr(name) for index in indices]
+        found = [self.envs[index].get_wrapper_attr(name) for index in indices]
         return [one(*args, **kwargs) if callable(one) else one for one in found]
 
     def _assign(self, name: str, values: Sequence[Any]) -> None:
@@ -125,20 +110,20 @@ class NativeVectorEnv(ScmWorldVectorEnv):
 
     def present(self) -> tuple[Any, dict[str, Any]]:
         """Return observations and infos of the present, as after an intervention."""
-        for index in self._alone:
-            self._read(index)
+        if self._begun.all():
+            self._read_alone(self._everyone)
         return super().present()
 
-    def _read(self, index: int) -> None:
-        """Read an environment by itself; the row of one that cannot be read stays as it is."""
-        self._bring(index)
-        with suppress(ScmWorldError):
-            self._write(index, *self._inner[index].present())
+    def _read_alone(self, which: Mask) -> None:
+        """Read environments one by one; the row of one that cannot be read stays as it is."""
+        for row in np.flatnonzero(which).tolist():
+            with suppress(ScmWorldError):
+                self._write(row, *self._inner[row].present())
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the backends."""
-        for index in range(self.num_envs):
-            self._bring(index).close()
+        for env in self.envs:
+            env.close()
 
     # --- a control step ---------------------------------------------------------------------------
 
@@ -146,54 +131,43 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         rows = np.flatnonzero(which)
         if not len(rows):
             return
-        self._look()
         commands = self._commanded(rows, actions)
         try:
             self._batch.advance(commands, which)
         except (FunctionFailure, EngineFailure) as error:  # the others are a step further
-            self._are_set[rows] = False
-            for row in rows.tolist():
-                self._read(row)
+            self._read_alone(which)
             if isinstance(error, FunctionFailure):
-                raise located(error, error.row or 0) from error.__cause__
+                raise located(error, error.row or 0, "environment") from error.__cause__
             raise
-        self._are_set[rows] = False
         for table, members in self._batch.tables(rows):
-            reader = self._readers.get(table)
-            if reader is None:
-                reader = ObservationReader(self._inner[int(members[0])], table)
-                self._readers[table] = reader
-            numbers = table.matrix
-            rewards = reader.scale * numbers[members, reader.reward]
-            for row in members[~np.isfinite(rewards)].tolist():
-                self._explain(row)
-            ends = reader.terminated
-            self._rewards[members] = rewards
-            self._terminations[members] = False if ends is None else numbers[members, ends] != 0.0
-            self._truncations[members] = numbers[members, reader.clock] >= reader.limit
-            if not reader.is_partial:
-                reader.write(numbers, members, self._seen, self._known)
-            again: Iterable[int] = members.tolist() if reader.is_partial else self._sensed
-            for row in again:
-                if which[row]:
-                    self._bring(row)
-                    self._write(row, *self._inner[row].present())
-            for row in members.tolist() if self._acting else ():
-                self._intervene(row, int(numbers[row, reader.clock]))
+            whole = len(members) == self.num_envs
+            now = table if whole else Rows(table.mechanisms, table.numbers[members])
+            self._take(self._inner[int(members[0])], now, members)
+        for row in rows.tolist():
+            if self._acting or self._inner[row].world.is_planned:
+                self._intervene(row)
 
-    def _look(self) -> None:
-        """Note what was changed in environments that were used by themselves."""
-        for index in self._alone:
-            env = self._inner[index]
-            if not env.world.has_begun:
-                continue
-            if env._delta is not None and env.world.action_mode == JOINTS:
-                self._are_set[index] = env._delta.is_set()
-            if env.world.current()[0].get(SENSOR_NOISE):
-                self._sensed.add(index)
-            else:
-                self._sensed.discard(index)
-        self._alone.clear()
+    def _take(self, lead: ScmWorldEnv, now: Rows, rows: Integers) -> None:
+        """Write what a step led to in environments of one structure.
+
+        Args:
+            lead: One of them.
+            now: Their values.
+            rows: Which ones they are, shape (m,).
+        """
+        rewards = lead._scale * now[REWARD]
+        for row in rows[~np.isfinite(rewards)].tolist():
+            self._explain(row)
+        self._rewards[rows] = rewards
+        self._terminations[rows] = now[TERMINATED] != 0.0 if TERMINATED in now else False
+        self._truncations[rows] = now[CONTROL_INDEX] >= lead.limit
+        observation, info = lead.read(now)
+        self._write(rows, observation, info)
+        alone = np.full(len(rows), observation is None)
+        if SENSOR_NOISE in now:
+            alone |= now[SENSOR_NOISE] != 0.0
+        for row in rows[alone].tolist():
+            self._write(row, *self._inner[row].present())
 
     def _commanded(self, rows: Integers, actions: Floats) -> Floats:
         """Return the commands of some environments, shape (n, n_actions); it holds until the next.
@@ -202,110 +176,45 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         """
         lead = self._lead
         if self._delta is not None:
-            self._batch.fill(rows)
             actions = np.array(actions)
             for table, members in self._batch.tables(rows):
-                if self._reads is not None:
-                    offset = table.column(self._reads)[members]
-                else:
-                    offset = table.actions()[members]
-                    if lead.world.action_mode == JOINTS:
-                        put = self._are_set[members, None]
-                        offset = np.where(put, table.column(JOINTS)[members], offset)
+                offset = table.actions if self._reads is None else table[self._reads]
+                offset = offset[members]
+                if self._reads is None and lead.world.options.action_mode == JOINTS:
+                    # Where joints were put since the last command, actions are relative to them.
+                    deltas: Any = (self._inner[row]._delta for row in members.tolist())
+                    put = np.array([delta.is_set() for delta in deltas])
+                    offset = np.where(put[:, None], table[JOINTS][members], offset)
                 actions[members] = self._delta.moved(actions[members], offset)
         scaled, world = lead._middle + lead._half * actions[rows], lead.world
         self._commands[rows] = np.minimum(np.maximum(scaled, world.action_low), world.action_high)
         return self._commands
 
-    def _intervene(self, row: int, step: int) -> None:
-        """Do what the curriculum of one environment asks for after a control step."""
+    def _intervene(self, row: int) -> None:
+        """Do what a plan or the curriculum of one environment contains after a control step."""
+        step = self._inner[row].world.index
         over = bool(self._terminations[row] or self._truncations[row])
-        success: Any = self._known.get("is_success")
-        if not self._acting[row].stepped(
-            step, over=over, success=success is not None and bool(success[row])
-        ):
+        acts = not over and self._inner[row].world.may_act(step)
+        if self._acting:
+            success: Any = self._known.get("is_success")
+            succeeded = success is not None and bool(success[row])
+            acts |= self._acting[row].stepped(step, over=over, success=succeeded)
+        if not acts:
             return
         terms = self._known["reward_terms"]
         earned = {name: column[row] for name, column in terms.items()}
-        self._bring(row)
         try:
-            _, shown = self._alike[row].act(self.envs[row], "act", {})
+            _, shown = act(self.envs[row], self._shapes, "act", {})
         except ScmWorldError as error:
-            raise located(error, row) from error.__cause__
+            raise located(error, row, "environment") from error.__cause__
         self._write(row, *shown)
         for name, value in earned.items():
             terms[name][row] = value  # of the step: an intervention earns nothing
 
     def _explain(self, row: int) -> None:
         """Raise the error that an environment whose reward is not finite would raise alone."""
-        self._bring(row)
         env = self._inner[row]
         try:
             one_number(env.world.evaluate((REWARD, *env._terms)), REWARD, env._terms)
         except ScmWorldError as error:
-            raise located(error, row) from error.__cause__
-
-
-@final
-class ObservationReader:
-    """Reads observations and infos of one structure.
-
-    Args:
-        env: Of this structure.
-        table: In which its world is.
-
-    Attributes:
-        is_partial: Whether observation and info have to be read in each environment by itself.
-        clock: Column of the number of control steps.
-        limit: When episodes are truncated.
-        reward: Column of the reward.
-        scale: What rewards are multiplied by.
-        terminated: Column of the variable that ends episodes, if there is one.
-    """
-
-    def __init__(self, env: ScmWorldEnv, table: StateTable) -> None:
-        seen: Any = env._observer
-        goals = env._goals
-        together = isinstance(seen, DictObserver)
-        parts: dict[str | None, Any] = dict(seen._parts) if together else {None: seen}
-        self._vectors: dict[str | None, Vector] = {
-            name: part
-            for name, part in parts.items()
-            if isinstance(part, Vector) and KEYPOINTS not in part._slices
-        }
-        self.is_partial = len(self._vectors) < len(parts)
-        where = {name: place.start for name, place in table.where.items()}
-        self.reward, self.terminated = where[REWARD], where.get(TERMINATED)
-        self.clock, self.scale, self.limit = where[CONTROL_INDEX], env._scale, env.limit
-        self._success, self._fraction = where.get(SUCCESS), where.get(FRACTION)
-        self._terms = {name: where[name] for name in env._terms}
-        self._shows_goals = together and seen._goals is not None
-        goal, self._bound = env.world.task.goal, 0.0 if goals is None else goals.bound
-        sides = {"achieved_goal": goal.achieved, "desired_goal": goal.desired}
-        self._goals = {
-            name: places(table.where[one] for one in side)
-            for name, side in (sides.items() if goals is not None else ())
-        }
-
-    def write(self, numbers: Floats, rows: Integers, seen: Any, infos: dict[str, Any]) -> None:
-        """Write the observations and infos of some environments into their rows.
-
-        Args:
-            numbers: The table of all of them.
-            rows: Which ones, shape (m,).
-            seen: Their observations.
-            infos: Their infos.
-        """
-        for part, vector in self._vectors.items():
-            vector.write(numbers, rows, seen if part is None else seen[part])
-        if self._success is not None:
-            infos["is_success"][rows] = numbers[rows, self._success] != 0.0
-            infos["success"][rows] = infos["is_success"][rows]
-        if self._fraction is not None:
-            infos["fractional_success"][rows] = numbers[rows, self._fraction]
-        for name, column in self._terms.items():
-            infos["reward_terms"][name][rows] = numbers[rows, column]
-        for name, columns in self._goals.items():
-            found = infos[name][rows] = numbers[rows[:, None], columns]
-            if self._shows_goals:
-                seen[name][rows] = np.clip(found, -self._bound, self._bound)
+            raise located(error, row, "environment") from error.__cause__

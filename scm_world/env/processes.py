@@ -17,9 +17,10 @@ from gymnasium.vector.utils import create_empty_array
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.env.environment import ScmWorldEnv
-from scm_world.env.many import Mask, MemberShapes, ScmWorldVectorEnv, located, read_mode, row_of
+from scm_world.env.many import ScmWorldVectorEnv, act, member_shapes, read_mode, row_of
 from scm_world.errors import EngineFailure, ScmWorldError
 from scm_world.work.processes import PROCESS, children_single_threaded, pickled
+from scm_world.world.batch import Mask, located
 
 ANEW = "make the environments again"
 
@@ -190,7 +191,7 @@ class Member(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, make: Callable[[], gymnasium.Env[Any, Any]], index: int) -> None:
         super().__init__(make())
-        self._index, self._alike = index, MemberShapes.of(self.env)
+        self._index, self._shapes = index, member_shapes(self.env)
         self._seen = row_of(create_empty_array(self.env.observation_space, 1, np.zeros), 0)
         self._before: Any = None
 
@@ -212,7 +213,7 @@ class Member(gymnasium.Wrapper[Any, Any, Any, Any]):
             return self._seen, {}
         self._before = inner.snapshot() if inner.world.has_begun else None
         try:
-            answer, (self._seen, info) = self._alike.act(self.env, method, given)
+            answer, (self._seen, info) = act(self.env, self._shapes, method, given)
         except Exception as error:
             self._undo()
             return self._seen, {"error": portable(error)}
@@ -267,7 +268,7 @@ def _first(infos: Mapping[str, Any]) -> Exception:
     """Return the first error of some environments, with its place."""
     index = int(np.argmax(infos["_error"]))
     error: Exception = infos["error"][index]
-    return located(error, index) if isinstance(error, ScmWorldError) else error
+    return located(error, index, "environment") if isinstance(error, ScmWorldError) else error
 
 
 def _rows(infos: Mapping[str, Any], rows: Integers) -> dict[str, Any]:

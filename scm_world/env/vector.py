@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._types import Floats, Integers, Value, Values
+from scm_world._types import Floats, Integers, Values
 from scm_world.geometry.numbers import scale_rows
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.graph import SCM
@@ -22,7 +22,7 @@ from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.variables.spaces import Affine, Switch
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
-from scm_world.world.mechanisms import places
+from scm_world.world.mechanisms import Rows, places
 
 # --- bounds ---------------------------------------------------------------------------------------
 
@@ -142,9 +142,6 @@ def keypoints(bodies: tuple[str, ...]) -> View:
 Layouts = Mapping[str, Mapping[str, slice]]
 """Where each variable stands, for every vector by its name."""
 
-FIRST = np.zeros(1, dtype=np.int64)
-"""The only row of a world by itself."""
-
 STREAM = "observation"
 """The stream of the noise of the sensors; draws of ``sensor_noise`` itself have another one."""
 
@@ -219,7 +216,7 @@ class Vector:
                 if part.name != KEYPOINTS
             ]
         )
-        self._published = world.conventions.published
+        self._published = world.options.conventions.published
         self._turns = [
             place
             for name, place in self._slices.items()
@@ -256,43 +253,35 @@ class Vector:
         self.space = box(*ends)
         world = self._world
         self._shift, self._shifts = 0.0, np.zeros(self._read.size)
-        if self._published and TIME in self._slices and world.given_length is not None:
+        if self._published and TIME in self._slices and world.options.given_length is not None:
             # The predecessor subtracts seconds from a number of steps.
-            self._shift = world.given_length * (1.0 - world.control_period)
+            self._shift = world.options.given_length * (1.0 - world.options.control_period)
             self._shifts[self._slices[TIME]] = self._shift
 
-    def write(self, numbers: Floats, rows: Integers, out: NDArray[np.float32]) -> None:
-        """Write what is observed of some worlds, without the corners of blocks.
+    @property
+    def together(self) -> bool:
+        """Whether several worlds can be observed in one call; not with corners of blocks."""
+        return self._keypoints is None
 
-        Args:
-            numbers: A row of values for each world; see ``Mechanisms``.
-            rows: Numbers of the worlds, shape (m,).
-            out: Their rows are written, shape (n_worlds, n).
+    def observe(self, now: Rows) -> NDArray[np.float32]:
+        """Return the observation of one world, shape (n,), or of several, shape (m, n).
+
+        The noise of the sensors is that of one world.
         """
-        scale_rows(numbers, rows, self._read, self._shifts, self._scales, out)
-        for place in self._turns:
-            out[rows, place] *= _signs(out[rows, place])
-
-    def observe(self, now: Mapping[str, Value]) -> NDArray[np.float32]:
-        """Give the observation, shape (n,)."""
+        numbers = now.numbers
+        if numbers.ndim > 1:
+            return self._scaled(numbers, self._read, self._shifts)
         if self._version != self._world.version:
             self._version = self._world.version
             self._noise = float(now[SENSOR_NOISE]) if self._senses else 0.0
-        numbers = self._world.numbers
-        found: NDArray[np.float32] = np.empty((1, self._size), dtype=np.float32)
-        shown: NDArray[np.float32] = found[0]
         if self._keypoints is None and not self._noise:
-            self.write(numbers, FIRST, found)
-            return shown
-        raw = numbers[0].take(self._read)
+            return self._scaled(numbers, self._read, self._shifts)
+        raw = numbers.take(self._read)
         raw[self._shifts != 0.0] += self._shift
         if self._keypoints is not None:
             raw = np.insert(raw, self._slices[KEYPOINTS].start, self._keypoints[2](now))
         raw = self._sensed(raw) if self._noise else raw
-        scale_rows(raw[None], FIRST, np.arange(raw.size), np.zeros(raw.size), self._scales, found)
-        for place in self._turns:
-            found[:, place] *= _signs(found[:, place])
-        return shown
+        return self._scaled(raw, np.arange(raw.size), np.zeros(raw.size))
 
     def observe_values(self, values: Values) -> NDArray[np.float32]:
         """Give the observation of other values of what is observed, without noise, shape (n,)."""
@@ -300,9 +289,16 @@ class Vector:
         given = {**values, **seen}
         absent = {n: np.zeros(s.stop - s.start) for n, s in self._slices.items() if n not in given}
         raw = np.concatenate([np.ravel({**given, **absent}[name]) for name in self._slices])
-        found: NDArray[np.float32] = np.empty((1, self._size), dtype=np.float32)
-        scale_rows(raw[None], FIRST, np.arange(raw.size), np.zeros(raw.size), self._scales, found)
-        shown: NDArray[np.float32] = found[0]
+        return self._scaled(raw, np.arange(raw.size), np.zeros(raw.size))
+
+    def _scaled(self, numbers: Floats, columns: Integers, shifts: Floats) -> NDArray[np.float32]:
+        """Observe columns of the values of one world, shape (width,), or of several."""
+        matrix = numbers if numbers.ndim > 1 else numbers[None]
+        found: NDArray[np.float32] = np.empty((len(matrix), self._size), dtype=np.float32)
+        scale_rows(matrix, np.arange(len(matrix)), columns, shifts, self._scales, found)
+        for place in self._turns:
+            found[:, place] *= _signs(found[:, place])
+        shown: NDArray[np.float32] = found if numbers.ndim > 1 else found[0]
         return shown
 
     def _sensed(self, raw: Floats) -> Floats:

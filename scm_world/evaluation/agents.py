@@ -104,7 +104,7 @@ def what_it_is(about: Mapping[str, Any]) -> dict[str, Any]:
     """Leave out of what a policy is where its file lies.
 
     Example:
-        >>> what_it_is({"kind": "file", "path": "runs/a.onnx", "sha256": "5f52"})
+        >>> what_it_is({"kind": "file", "path": "runs/a.zip", "sha256": "5f52"})
         {'kind': 'file', 'sha256': '5f52'}
     """
     return {name: value for name, value in about.items() if name != "path"}
@@ -146,8 +146,8 @@ def listed(policy: Any) -> Iterator[tuple[str | None, int, Any]]:
         UnknownOption: The list of an agent is empty, or two agents have one name.
 
     Example:
-        >>> list(listed({"mine": ["a.onnx", "b.onnx"], "other": "still"}))
-        [('mine', 0, 'a.onnx'), ('mine', 1, 'b.onnx'), ('other', 0, 'still')]
+        >>> list(listed({"mine": ["a.zip", "b.zip"], "other": "still"}))
+        [('mine', 0, 'a.zip'), ('mine', 1, 'b.zip'), ('other', 0, 'still')]
     """
     agents = policy if isinstance(policy, Mapping) else {None: policy}
     for agent, given in agents.items():

@@ -85,13 +85,12 @@ class Fingerprint:
     def look(self) -> None:
         """Take in the state, and the parameters after an intervention."""
         world = self._world
-        now, present = world.current()
         if world.version != self._version:
             self._version = world.version
             for name in world.static_names:
                 self._sum.update(name.encode())
-                self._sum.update(np.asarray(now[name]).tobytes())
-        self._sum.update(present.vector.tobytes())
+                self._sum.update(np.asarray(world.row[name]).tobytes())
+        self._sum.update(world.vector.tobytes())
 
     def act(self, action: Any) -> None:
         """Take in an action."""

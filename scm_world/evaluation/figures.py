@@ -126,7 +126,7 @@ def scores_of(evaluation: Evaluation, metric: str) -> Scores:
 
 @final
 @dataclass(frozen=True)
-class Comparison:
+class MetricComparison:
     """Agents on a backend compared as rliable defines it.
 
     Attributes:
@@ -140,7 +140,7 @@ class Comparison:
     better: Mapping[tuple[str, str], Interval]
 
 
-def comparisons_of(evaluation: Evaluation, metric: str) -> dict[str, Comparison]:
+def comparisons_of(evaluation: Evaluation, metric: str) -> dict[str, MetricComparison]:
     """Compare the agents on each backend over all protocols.
 
     Raises:
@@ -151,7 +151,7 @@ def comparisons_of(evaluation: Evaluation, metric: str) -> dict[str, Comparison]
     }
 
 
-def _compared(here: Evaluation, metric: str) -> Comparison:
+def _compared(here: Evaluation, metric: str) -> MetricComparison:
     for agent in here.agents:
         if missing := set(here.protocols) - set(here.only(agent=agent).protocols):
             played = (f"agents that have all played {', '.join(sorted(missing))}",)
@@ -164,7 +164,7 @@ def _compared(here: Evaluation, metric: str) -> Comparison:
     if is_fraction(metric):
         low, high, room = 0.0, 1.0, 0.0
     at = np.linspace(low - room, high + room, 101)
-    return Comparison(
+    return MetricComparison(
         over,
         {agent: performance_profile(one, at, over=over) for agent, one in scores.items()},
         {
@@ -331,7 +331,7 @@ def _number(value: float) -> str:
 def profile_figure(
     evaluation: Evaluation,
     metric: str | None = None,
-    found: Mapping[str, Comparison] | None = None,
+    found: Mapping[str, MetricComparison] | None = None,
 ) -> Figure:
     """Draw the share of scores above each threshold, and who is better with what probability.
 

@@ -23,7 +23,7 @@ from scm_world.env.delta import PREFIX as RELATIVE_MODE
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile, blamed
 from scm_world.evaluation.recording_files import Recorded, from_parquet
 from scm_world.output.reading import LARGEST_TABLE, read_bytes
-from scm_world.policies import MlpPolicy, OnnxPolicy, PolicyAbout, file_of, load_policy, load_sb2
+from scm_world.policies import MlpPolicy, PolicyAbout, file_of, load_policy, load_sb2
 from scm_world.policies.cards import FORM
 from scm_world.policies.scripted import NAMED, OpenLoopPolicy, Policy
 from scm_world.policies.zoo import PREFIX as ZOO
@@ -41,7 +41,7 @@ Actor = Callable[[Any], Any]
 """Gives an action for an observation, within one episode."""
 
 PACKAGE, SB3 = "scm_world", "stable_baselines3"
-SUFFIXES = (".safetensors", ".onnx", ".zip", ".npz", ".parquet")
+SUFFIXES = (".safetensors", ".zip", ".npz", ".parquet")
 _ADVICE = "give the path of a policy"
 _FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 
@@ -65,13 +65,13 @@ OWN_POLICIES = frozenset(
 
 FORMS = (
     *NAMES,
-    "a function of the observation",
+    "a function of the observation, such as one that runs an ONNX network",
     "a WorldPolicy",
     "an object with the method predict",
     "an array of actions",
     "an episode",
-    "a file (.safetensors, .onnx, .zip of Stable-Baselines 2 or 3, .npz of an episode, .parquet of "
-    "a recording)",
+    "a file (.safetensors, .zip of Stable-Baselines 2 or 3, .npz of an episode, .parquet of a "
+    "recording)",
     "the folder of a training run",
     "'zoo:name'",
     "'module:function'",
@@ -264,7 +264,7 @@ def _shapes(space: Any) -> Any:
     return tuple(sorted(shape)) if shape is not None and len(shape) == 3 else shape
 
 
-def _network(policy: MlpPolicy | OnnxPolicy, name: str, env: ScmWorldEnv) -> Actor:
+def _network(policy: MlpPolicy, name: str, env: ScmWorldEnv) -> Actor:
     if policy.made_for is not None:
         policy.made_for.check(env, name)
     policy.check(env.observe(), env.world.compiled.n_actions)
@@ -274,7 +274,7 @@ def _network(policy: MlpPolicy | OnnxPolicy, name: str, env: ScmWorldEnv) -> Act
 def _of_world(make: Any, name: str, env: ScmWorldEnv) -> Actor:
     """Give actions that lead as near to the command of a world policy as one action can."""
     policy = _function(make(), env)
-    return lambda _: env.toward(checked(policy(env.world), env, name))
+    return lambda _: env.as_action(checked(policy(env.world), env, name))
 
 
 def _named(name: str) -> Policy:
@@ -391,10 +391,10 @@ def in_world(policy: Any, world: Simulation) -> Policy:
         world.structures.task,
         backend=world.backend.name,
         preset=world.options.preset,
-        resolution=world.resolution,
-        frame_skip=world.frame_skip,
-        max_episode_length=world.given_length,
-        conventions=world.conventions.name,
+        resolution=world.options.resolution,
+        frame_skip=world.options.frame_skip,
+        max_episode_length=world.options.given_length,
+        conventions=world.options.conventions.name,
         **options,
     )
     remembers = player.made_for is not None and player.made_for.memory > 0
@@ -467,9 +467,6 @@ def _of_text(text: str, trusted: Sequence[str] | None) -> Player:
     match path.suffix:
         case ".safetensors":
             return _of_network(load_policy(path), about)
-        case ".onnx":
-            network = OnnxPolicy(path)
-            return _of_network(network, {**about, "library": network.library})
         case ".zip":
             found = _archived(path, trusted or ())
             if isinstance(found, MlpPolicy):
@@ -551,7 +548,7 @@ def _of_actions(actions: Any, about: About, given: Mapping[str, Any] | None = No
     return Player(about, start)
 
 
-def _of_network(policy: MlpPolicy | OnnxPolicy, about: About) -> Player:
+def _of_network(policy: MlpPolicy, about: About) -> Player:
     start = partial(_network, policy, about["name"])
     return Player(about, start, made_for=policy.made_for)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, final
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 from scm_world._arguments import one_of, whole_number
 from scm_world._fingerprint import differing, fingerprint
 from scm_world._types import Floats
-from scm_world.env import ScmWorldEnv
-from scm_world.env.arguments import doubles, names_of
+from scm_world.env import ENV_OPTIONS, ScmWorldEnv
+from scm_world.env.arguments import doubles
 from scm_world.env.observer import Observation
 from scm_world.env.wrappers import unwrapped_env
 from scm_world.errors import (
@@ -42,6 +41,7 @@ from scm_world.output.reading import LARGEST_TABLE, read_bytes
 from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
+from scm_world.queries.rollouts import as_names
 from scm_world.tasks import Task
 from scm_world.tasks.factories import refuse_untrusted
 
@@ -56,7 +56,6 @@ TEACHER = "teacher"
 _UNUSED: Mapping[str, Any] = {
     "start": None,
     "random_goal": None,
-    "attempts": 1,
     "variables_space": None,
     "render_mode": None,
     "render_camera": None,
@@ -151,7 +150,7 @@ class Recording:
             refuse_untrusted(_name(self.environment), self.trusted)
         kept = {name: v for name, v in self.environment.items() if name not in _GONE}
         arguments = {**kept, **_UNUSED}
-        unknown = arguments.keys() - inspect.signature(ScmWorldEnv.__init__).parameters.keys()
+        unknown = arguments.keys() - {*ENV_OPTIONS}
         if unknown:
             raise SnapshotMismatch(
                 "the recording is one of another version: environments have no option "
@@ -266,7 +265,7 @@ def _differences(env: ScmWorldEnv, episode: Recorded) -> Iterator[str]:
                     env.do(plan.at_start())
             except InterventionError as error:
                 yield f"control step {step}: an intervention is refused ({error})"
-        if _digest(env.world.current()[1].vector) != episode.states[step]:
+        if _digest(env.world.vector) != episode.states[step]:
             yield f"control step {step}: the true state"
         now, then = parts(env.observe()), parts(episode.observations[step])
         for name in sorted({*now, *then}):
@@ -343,7 +342,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         _refuse_changes(env, self._inner)
         model = self._inner.world.model
         chosen = tuple(name for name in INFOS if name in model) if infos is None else infos
-        self._wanted = chosen if chosen == ALL else names_of("infos", chosen)
+        self._wanted = chosen if chosen == ALL else as_names(chosen)
         self._made: list[Recorded] = []
         self._now: _Episode | None = None
         self._version = -1
@@ -426,7 +425,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         else:
             copied = np.array(observation)
         episode.observations.append(copied)
-        episode.states.append(world.current()[1].vector.copy())
+        episode.states.append(world.vector.copy())
         episode.interventions = self._inner.interventions
 
     def _update(self, episode: _Episode) -> None:
@@ -543,7 +542,7 @@ def record(
     start: dict[str, Any] = {"seed": seed, "options": {"episode": first, "do": do}}
     for _ in range(n):
         observation, _info = recorder.reset(**start)
-        start = {"options": {"do": do}}  # the next episode, also after attempts that failed
+        start = {"options": {"do": do}}  # the next episode
         player.begin(inner)
         if teacher is not player:
             teacher.begin(inner)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ import numpy as np
 from scm_world._arguments import one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world.backends import backends
-from scm_world.env import ScmWorldEnv
+from scm_world.env import ENV_OPTIONS, ScmWorldEnv
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.agents import (
     AgentRun,
@@ -241,7 +240,7 @@ def prepare(
     loaded = load_agents(policy, trusted)
     for agent in loaded:
         about, path = agent.about, str(agent.about.get("path", ""))
-        learned = path.endswith(".onnx") or (path.endswith(".zip") and "library" in about)
+        learned = path.endswith(".zip") and "library" in about
         learned = learned or (hasattr(agent.player.policy, "predict") and "sha256" not in about)
         if learned and agent.player.made_for is None and not {*FORM} & {*(env or {})}:
             gymnasium.logger.warn(
@@ -255,7 +254,7 @@ def prepare(
         raise UnknownOption("task", task, tasks())
     if not isinstance(env, Mapping | None):
         raise UnknownOption("env", env, ("options of the environment, by name",))
-    allowed = [name for name in inspect.signature(ScmWorldEnv).parameters if name not in _MINE]
+    allowed = [name for name in ENV_OPTIONS if name not in _MINE]
     for name in env or {}:
         one_of("option of the environment", name, allowed)
     place = EvaluationPlace(task, shared_options(env, trained))

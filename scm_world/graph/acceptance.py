@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,19 +10,18 @@ import numpy as np
 from scm_world.errors import InterventionError, UnknownVariable
 from scm_world.graph.evaluate import AppliedIntervention, source_of
 from scm_world.variables import (
+    SOFT,
     Derived,
     Draw,
     Function,
     Hard,
     Intervention,
     Mechanism,
-    Natural,
     Null,
-    Scale,
-    Shift,
     Variable,
 )
 from scm_world.variables.checks import check_bounds, check_draw, coerce
+from scm_world.variables.interventions import ACTS
 
 
 def refuse_time(name: str, act: Any) -> None:
@@ -48,56 +47,38 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
     Raises:
         InterventionError: What is wrong with it.
     """
-    refuse_time(variable.name, value)
-    match value:
-        case Draw():
-            check_draw(variable, value)
-            _known(declared, source_of(AppliedIntervention(value, variable)).parents())
-            return value
-        case Mechanism():
-            act = _complete(variable, value)
-            _known(declared, (parent.name for parent in act.parents))
-            own = (variable.name, *variable.parts)
-            if any(parent.name in own and not parent.lag for parent in act.parents):
-                raise InterventionError(
-                    f"do({variable.name}): a variable cannot follow itself within an instant; "
-                    "use Shift or Scale",
-                    variable=variable.name,
-                    value=value,
-                )
-            return act
-        case Natural():
-            return value
-        case Null():
-            raise InterventionError(
-                f"do({variable.name}): a variable cannot be taken away; a body of a world can be",
-                variable=variable.name,
-                value=value,
-            )
-        case Shift() | Scale() if variable.dtype == "categorical":
-            raise InterventionError(
-                f"do({variable.name}): categories have no order, so there is no {value!r}; set a "
-                "category, Draw one, or give a Mechanism",
-                variable=variable.name,
-                value=value,
-            )
-        case Shift() | Scale():
-            by = value.by if np.ndim(value.by) else np.full(variable.shape, value.by)
-            coerce(variable, by)
-            return value
-    number = coerce(variable, _plain(variable, value) if isinstance(value, Hard) else value)
-    bounds = variable.bounds
-    if bounds is not None and not bounds.parents() and not bounds.contains(number, {}):
-        check_bounds(variable, number, {})
-    return Hard(number.tolist())
+    name, said = variable.name, ""
+    refuse_time(name, value)
+    kind = type(value)  # the classes of interventions are final
+    if kind is Hard or kind not in ACTS:
+        number = coerce(variable, _plain(variable, value) if kind is Hard else value)
+        bounds = variable.bounds
+        if bounds is not None and not bounds.parents() and not bounds.contains(number, {}):
+            check_bounds(variable, number, {})
+        return Hard(number.tolist())
+    if kind is Draw:
+        check_draw(variable, value)
+        _known(declared, source_of(AppliedIntervention(value, variable)).parents())
+    elif kind is Mechanism:
+        value = _complete(variable, value)
+        _known(declared, (parent.name for parent in value.parents))
+        own = (name, *variable.parts)
+        if any(parent.name in own and not parent.lag for parent in value.parents):
+            said = "a variable cannot follow itself within an instant; use Shift or Scale"
+    elif kind is Null:
+        said = "a variable cannot be taken away; a body of a world can be"
+    elif kind in SOFT and variable.dtype == "categorical":
+        said = f"categories have no order, so there is no {value!r}; set a category, Draw one, or "
+        said += "give a Mechanism"
+    elif kind in SOFT:
+        coerce(variable, value.by if np.ndim(value.by) else np.full(variable.shape, value.by))
+    if said:
+        raise InterventionError(f"do({name}): {said}", variable=name, value=value)
+    return value  # type: ignore[no-any-return]
 
 
 def _complete(variable: Variable, value: Mechanism) -> Mechanism:
-    """Put what a mechanism leaves out in its place: the variable's own function and noise.
-
-    Raises:
-        InterventionError: The variable has none, or the function takes no noise.
-    """
+    """Fill in what a mechanism leaves out: function and noise of the variable."""
     own = variable if isinstance(variable, Derived) else None
     if value.function is None and (own is None or own.noise is None):
         said = "it has no noise that could be another one"
@@ -107,16 +88,18 @@ def _complete(variable: Variable, value: Mechanism) -> Mechanism:
         return value.model_copy(update=kept)
     elif value.noise is not None and not value.equation.takes_noise:
         said = "its function does not take noise; give it an argument `noise`"
-    elif isinstance(value.function, Function) and value.equation.takes_noise:
-        if value.noise is not None or (own is not None and own.noise is not None):
-            return value
-        said = "its function takes noise, of which there is none; give Mechanism(…, noise=…)"
-    else:
+    elif (
+        not (isinstance(value.function, Function) and value.equation.takes_noise)
+        or value.noise is not None
+        or (own is not None and own.noise is not None)
+    ):
         return value
+    else:
+        said = "its function takes noise, of which there is none; give Mechanism(…, noise=…)"
     raise InterventionError(f"do({variable.name}): {said}", variable=variable.name, value=value)
 
 
-def _known(declared: Mapping[str, Variable], names: Any) -> None:
+def _known(declared: Mapping[str, Variable], names: Iterable[str]) -> None:
     for name in sorted(names):
         if name not in declared:
             raise UnknownVariable(name, declared)
@@ -141,10 +124,3 @@ def settable_causes(declared: Mapping[str, Variable], name: str) -> list[str]:
             else:
                 stack.append(parent.name)
     return list(found)
-
-
-def adds_edges(act: AppliedIntervention) -> bool:
-    """Return whether an intervention gives its target causes: then the order is computed again."""
-    if isinstance(act.intervention, Draw):
-        return bool(source_of(act).parents())
-    return isinstance(act.intervention, Mechanism)

@@ -1,4 +1,4 @@
-"""Which acyclic graphs data cannot tell apart.
+"""Equivalence classes of acyclic graphs: those with the same conditional independences.
 
 A graph is a boolean matrix of shape (p, p): ``graph[i, j]`` says that i acts on j. Where both
 ``graph[i, j]`` and ``graph[j, i]`` hold, the edge has no direction. Nothing is on the diagonal.
@@ -16,15 +16,8 @@ from scm_world.errors import ModelError
 Bools = NDArray[np.bool_]
 
 
-# --- acyclic graphs ---------------------------------------------------------------------------
-
-
 def as_graph(matrix: NDArray[np.generic]) -> Bools:
-    """Return a new graph with an edge wherever a matrix is not zero.
-
-    Raises:
-        ModelError: It is not square, or something acts on itself.
-    """
+    """Return a new graph with an edge wherever a square matrix, without a diagonal, is not zero."""
     graph: Bools = np.asarray(matrix) != 0
     if graph.ndim != 2 or graph.shape[0] != graph.shape[1]:
         raise ModelError([f"a graph is a square matrix; this one has shape {graph.shape}"])
@@ -40,11 +33,7 @@ def is_acyclic(graph: Bools) -> bool:
 
 
 def topological_order(dag: Bools) -> tuple[int, ...]:
-    """Return all nodes, causes before their effects: an effect has more ancestors.
-
-    Raises:
-        ModelError: The graph has a cycle.
-    """
+    """Return all nodes of an acyclic graph, causes before effects: an effect has more ancestors."""
     above = reaches(dag)
     knots = np.flatnonzero(meets(above, dag).diagonal()).tolist()
     if knots:
@@ -58,7 +47,10 @@ def skeleton(graph: Bools) -> Bools:
 
 
 def reaches(graph: Bools) -> Bools:
-    """Return from where one can come where: [i, j] if i is j or one of its ancestors."""
+    """Return the reflexive, transitive closure: [i, j] if i is j or one of its ancestors.
+
+    A few products of matrices are some ten times faster than ``nx.transitive_closure``.
+    """
     closure: Bools = graph | np.eye(len(graph), dtype=bool)
     for _ in range(max(len(graph) - 1, 1).bit_length()):
         closure = meets(closure, closure)
@@ -71,15 +63,8 @@ def meets(left: Bools, right: Bools) -> Bools:
     return result
 
 
-# --- essential graphs -------------------------------------------------------------------------
-
-
 def cpdag(dag: Bools) -> Bools:
-    """Return the essential graph: an edge keeps its direction if all equivalent graphs agree on it.
-
-    Raises:
-        ModelError: The graph has a cycle.
-    """
+    """Return the essential graph: edges keep a direction on which all equivalent graphs agree."""
     return essential_graph(dag, ())
 
 
@@ -103,13 +88,11 @@ def essential_graph(dag: Bools, targets: Iterable[Iterable[int]]) -> Bools:
         >>> essential_graph(chain, [(1,)]).astype(int).tolist()
         [[0, 1, 0], [0, 0, 1], [0, 0, 0]]
     """
-    dag = as_graph(dag)
+    dag, listed = as_graph(dag), [list(target) for target in targets]
     topological_order(dag)
-    inside = np.zeros((0, len(dag)), dtype=bool)
-    for target in targets:
-        row = np.zeros(len(dag), dtype=bool)
-        row[list(target)] = True
-        inside = np.vstack([inside, row])
+    inside = np.zeros((len(listed), len(dag)), dtype=bool)
+    for row, target in zip(inside, listed, strict=True):
+        row[target] = True
     cut = meets(inside.T, ~inside)
     known = dag & (cut | cut.T | meets(_apart(dag), dag))  # the last: part of a v-structure
     return meek(skeleton(dag) & ~known.T)
@@ -165,9 +148,6 @@ def _by_three_edges(graph: Bools) -> Bools:
 
 def _apart(graph: Bools) -> Bools:
     return ~(graph | graph.T | np.eye(len(graph), dtype=bool))
-
-
-# --- members of a class -----------------------------------------------------------------------
 
 
 def extension(graph: Bools) -> Bools | None:

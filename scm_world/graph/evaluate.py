@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.errors import FunctionFailure, ModelError, ScmWorldError, WrongValue
+from scm_world.errors import FunctionFailure, ModelError, ScmWorldError, WrongValue, in_one_line
 from scm_world.variables import (
     SOFT,
     Categories,
@@ -325,7 +325,8 @@ class Evaluator:
         except ScmWorldError:
             raise
         except Exception as error:
-            raise FunctionFailure.of(f"the function of {variable.name!r}", error) from error
+            problem = f"the function of {variable.name!r} raised {in_one_line(error)}"
+            raise FunctionFailure(problem) from error
 
     def _arguments(
         self, parents: Iterable[Parent], values: Values, previous: Values

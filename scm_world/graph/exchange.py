@@ -12,7 +12,7 @@ import networkx as nx
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph.scm import SCM
 from scm_world.variables import Affine, Box, Either, Space, Switch
-from scm_world.variables.spaces import Bound, Bounds
+from scm_world.variables.spaces import Bound, listed
 
 DIGITS = 6  # of a number in the text of a space
 
@@ -28,8 +28,8 @@ def to_digraph(source: SCM | nx.DiGraph) -> nx.MultiDiGraph:
         source: A model, or any directed networkx graph; its edges without a lag have lag 0.
 
     Raises:
-        UnknownOption: The source is no graph.
-        ModelError: The edges have no direction, or a lag is no whole number from 0.
+        UnknownOption: The source is not a graph.
+        ModelError: The edges have no direction, or a lag is not a whole number from 0.
 
     Example:
         >>> from scm_world.variables import Derived, Exogenous, Linear
@@ -69,8 +69,7 @@ def _of_model(model: SCM) -> nx.MultiDiGraph:
 
 def _of_networkx(source: nx.DiGraph) -> nx.MultiDiGraph:
     if not isinstance(source, nx.Graph):
-        allowed = ("a model (SCM)", "a directed graph of networkx")
-        raise UnknownOption("graph", source, allowed)
+        raise UnknownOption("graph", source, ("a model (SCM)", "a directed graph of networkx"))
     if not source.is_directed():
         raise ModelError(["the edges of the graph have no direction"])
     graph = nx.MultiDiGraph()
@@ -78,7 +77,7 @@ def _of_networkx(source: nx.DiGraph) -> nx.MultiDiGraph:
     for cause, effect, data in source.edges(data=True):
         lag = data.get("lag", 0)
         if not isinstance(lag, int) or lag < 0:
-            raise ModelError([f"the lag {lag!r} of {cause!r} → {effect!r} is no whole number"])
+            raise ModelError([f"the lag {lag!r} of {cause!r} → {effect!r} is not a whole number"])
         graph.add_edge(cause, effect, lag, **{**data, "lag": lag})
     return graph
 
@@ -92,7 +91,8 @@ def space_lines(space: Space | None, *, digits: int = 4) -> list[str]:
         case None:
             return []
         case Box(low=low, high=high):
-            return _box_lines(_ends(low, digits), _ends(high, digits))
+            lines = ([_end(part, digits) for part in listed(end)] for end in (low, high))
+            return _box_lines(*lines)
         case Either(first=first, second=second):
             parts = (", ".join(space_lines(part, digits=digits)) for part in (first, second))
             return [" or ".join(parts)]
@@ -101,18 +101,12 @@ def space_lines(space: Space | None, *, digits: int = 4) -> list[str]:
 
 def _box_lines(lows: list[str], highs: list[str]) -> list[str]:
     size = max(len(lows), len(highs))
-    lows, highs = (ends * size if len(ends) == 1 else ends for ends in (lows, highs))
-    ends = zip(lows, highs, strict=True)
+    ends = zip(*(end * size if len(end) == 1 else end for end in (lows, highs)), strict=True)
     pairs = [low if low == high else f"{low} to {high}" for low, high in ends]
     if len(set(pairs)) == 1:
         return pairs[:1]
     finger = pairs[:3]
     return finger if pairs == finger * (size // 3) else pairs
-
-
-def _ends(end: Bounds, digits: int) -> list[str]:
-    parts = end if isinstance(end, tuple) else (end,)
-    return [_end(part, digits) for part in parts]
 
 
 def _end(end: Bound, digits: int) -> str:

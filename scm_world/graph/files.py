@@ -45,7 +45,7 @@ def _functions(
 
 
 def _hashes(model: SCM) -> dict[str, str]:
-    """Return a hash of each function, by name; all else is in the file."""
+    """Return a hash of each function, by name; the file has everything else."""
     plain = ("declaration of ", "intervention on ")
     found = fingerprint(model, libraries=False)
     return {name: part for name, part in found.items() if not name.startswith(plain)}
@@ -56,7 +56,7 @@ def to_dict(model: SCM) -> dict[str, Any]:
 
     Raises:
         ModelError: A mechanism is a lambda or another function without a name.
-        UnknownOption: It is no model.
+        UnknownOption: It is not a model.
     """
     if not isinstance(model, SCM):
         raise UnknownOption("model", model, ("an SCM, such as world.model",))
@@ -78,8 +78,8 @@ def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
             package that compute numbers.
 
     Raises:
-        ModelError: The data is no model, names a function outside the trusted packages, or one that
-            was changed since.
+        ModelError: The data is not a model, names a function outside the trusted packages, or one
+            that was changed since.
     """
     found = data.get("format") if isinstance(data, dict) else data
     if found != FORMAT:
@@ -98,7 +98,7 @@ def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
         raise ModelError([f"an intervention of the file does not fit: {error}"]) from None
     other = differing(data.get("functions", {}), _hashes(model))
     if other:
-        problem = f"what the file refers to is not the same here: {', '.join(other)} differ"
+        problem = f"functions of the file are not the same here: {', '.join(other)} differ"
         advice = "bring back these functions, or write the model again with to_json"
         raise ModelError([f"{problem}; {advice}"])
     return model

@@ -1,4 +1,4 @@
-"""Structural causal models: build, check, mutilate, solve."""
+"""Structural causal models: build, check, intervene, solve."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from copy import deepcopy
 from dataclasses import replace
 from typing import Any, Self
 
+import networkx as nx
 import numpy as np
 
 from scm_world._arguments import whole_number
@@ -22,7 +23,7 @@ from scm_world.errors import (
     UnknownVariable,
     raise_all,
 )
-from scm_world.graph.acceptance import accepted, adds_edges, settable_causes
+from scm_world.graph.acceptance import accepted, settable_causes
 from scm_world.graph.evaluate import AppliedIntervention, Evaluator, NoiseKey, earlier, source_of
 from scm_world.graph.structure import Edge, EdgeIndex, checked
 from scm_world.variables import (
@@ -56,13 +57,8 @@ def flatten(
 
     Args:
         request: Dotted or nested.
-        twice: A list for the errors about names that are given twice, nested and dotted; the
-            first value of such a name is kept. They are raised if None.
-
-    Raises:
-        ConflictingTargets: A name is given twice.
-        InterventionError: A nested dictionary is empty.
-        UnknownOption: It is no mapping.
+        twice: A list for the errors about names that are given twice, nested and dotted, and about
+            empty dictionaries; the first value of such a name is kept. They are raised if None.
 
     Example:
         >>> flatten({"tool_block": {"mass": 0.05}, "floor_friction": 0.4})
@@ -71,29 +67,25 @@ def flatten(
     if not isinstance(request, Mapping):
         raise UnknownOption("request", request, ("a dictionary of variables and values",))
     flat: dict[str, Any] = {}
-    problems: list[InterventionError] = []
+    problems: list[InterventionError] = [] if twice is None else twice
     for name, value in request.items():
-        if isinstance(value, Frozen | float):  # an intervention
-            parts = {name: value}
+        parts = {name: value}
+        if isinstance(value, Frozen | float):
+            pass
         elif isinstance(value, Mapping):
             if not value:
                 said = f"do({name}): an empty dictionary sets nothing; leave {name!r} out"
                 problems.append(InterventionError(said, variable=name, value=value))
-            inner = flatten(value, problems)
-            parts = {f"{name}.{key}": part for key, part in inner.items()}
-        else:
-            one = value
-            if isinstance(value, tuple) and len(value) == 1 and isinstance(value[0], Frozen):
-                one = value[0]  # the only act of a plan
-            held = isinstance(one, list | tuple) or hasattr(one, "__array__")
-            parts = {name: deepcopy(one) if held else one}
+            parts = {f"{name}.{key}": part for key, part in flatten(value, problems).items()}
+        elif isinstance(value, tuple) and len(value) == 1 and isinstance(value[0], Frozen):
+            parts[name] = value[0]  # the only intervention of a plan
+        elif isinstance(value, list | tuple) or hasattr(value, "__array__"):
+            parts[name] = deepcopy(value)
         problems += [ConflictingTargets((key, key), key) for key in parts if key in flat]
         for key, part in parts.items():
             flat.setdefault(key, part)
     if twice is None:
         raise_all(problems)
-    else:
-        twice += problems
     return flat
 
 
@@ -168,8 +160,6 @@ class SCM:
             found |= {f"function that sets {name!r}": function for _ in named}
         return found
 
-    # --- looking ------------------------------------------------------------------------------
-
     def __iter__(self) -> Iterator[str]:
         return iter(self._declared)
 
@@ -180,46 +170,26 @@ class SCM:
         return isinstance(name, str) and name in self._declared
 
     def __getitem__(self, name: str) -> Variable:
-        """Return the variable as it is in this model: ``Fixed`` where ``do`` has set it.
-
-        Raises:
-            UnknownVariable: No variable has this name.
-        """
-        variable = self.declared(name)
-        act = self._acts.get(name)
-        if act is None or isinstance(act.intervention, SOFT):
+        """Return the variable as it is in this model: ``Fixed`` where ``do`` has set it."""
+        variable, act = self.declared(name), self._acts.get(name)
+        done = None if act is None else act.intervention
+        if act is None or isinstance(done, SOFT):
             return variable
-        common = variable.model_dump(
-            include=set(Variable.model_fields) - {"name", "bounds", "a", "b"}
+        kept = {field: getattr(variable, field) for field in Variable.model_fields}
+        if isinstance(done, Hard):
+            value = self._evaluator.forced(name, act, {}, None)
+            return Fixed(value=value, intervenable=True, **kept)
+        if not isinstance(done, Mechanism):
+            return Exogenous(default=np.zeros(variable.shape), distribution=source_of(act), **kept)
+        own = variable.noise if isinstance(variable, Derived) else None
+        noise = done.noise or (own if done.equation.takes_noise else None)
+        return Derived(
+            parents=done.parents,
+            mechanism=done.equation,
+            noise=noise,
+            inverse_noise=None if noise is None else done.inverse_noise,
+            **kept,
         )
-        spaces = {"bounds": variable.bounds, "a": variable.a, "b": variable.b}
-        if isinstance(act.intervention, Hard):
-            value = np.ravel(self._evaluator.forced(name, act, {}, None)).tolist()
-            return Fixed(
-                name=name,
-                value=value if variable.shape else value[0],
-                intervenable=True,
-                **common,
-                **spaces,
-            )
-        default = tuple([0.0] * int(np.prod(variable.shape))) if variable.shape else 0.0
-        if isinstance(act.intervention, Mechanism):
-            given = act.intervention
-            noise = given.noise
-            if isinstance(variable, Derived) and given.equation.takes_noise:
-                noise = noise or variable.noise
-            back = None if noise is None else given.inverse_noise
-            return Derived(
-                name=name,
-                parents=given.parents,
-                mechanism=given.equation,
-                noise=noise,
-                inverse_noise=back,
-                **common,
-                **spaces,
-            )
-        source = source_of(act)
-        return Exogenous(name=name, default=default, distribution=source, **common, **spaces)
 
     def declared(self, name: str) -> Variable:
         """Return the variable as it was declared, before any intervention.
@@ -248,7 +218,7 @@ class SCM:
 
     @property
     def interventions(self) -> Mapping[str, Intervention]:
-        """What ``do`` has set, by requested name; of a bundle, by the names of its parts."""
+        """The interventions, by requested name; those on a bundle by the names of its parts."""
         return dict(self._interventions)
 
     @property
@@ -259,13 +229,16 @@ class SCM:
         return self._structure
 
     def _parents(self, name: str) -> tuple[Parent, ...]:
-        """Give the edges into a variable, as ``self[name].all_parents`` does."""
+        """Return the edges into a variable, as ``self[name].all_parents`` does."""
         act = self._acts.get(name)
-        if act is None or isinstance(act.intervention, SOFT):
-            return self._declared[name].all_parents
-        if isinstance(act.intervention, Draw):
-            return tuple(map(Parent, sorted(source_of(act).parents())))
-        return () if isinstance(act.intervention, Hard) else self[name].all_parents
+        match act and act.intervention:
+            case Hard():
+                return ()
+            case Mechanism(parents=parents):
+                return parents
+            case Draw() if act is not None:
+                return tuple(map(Parent, sorted(source_of(act).parents())))
+        return self._declared[name].all_parents
 
     @property
     def edges(self) -> tuple[Edge, ...]:
@@ -274,19 +247,23 @@ class SCM:
 
     def parents(self, name: str) -> tuple[str, ...]:
         """Return the direct causes, of any lag."""
-        return self.structure.parents(self.declared(name).name)
+        return tuple(dict.fromkeys(p.name for p in self._parents(self.declared(name).name)))
 
     def children(self, name: str) -> tuple[str, ...]:
         """Return the direct effects, of any lag."""
-        return self.structure.children(self.declared(name).name)
+        return tuple(self.structure.graph.successors(self.declared(name).name))
 
     def ancestors(self, name: str) -> frozenset[str]:
-        """Return the direct and indirect causes."""
-        return self.structure.ancestors(self.declared(name).name)
+        """Return the direct and indirect causes; a variable that drives itself is one of them."""
+        graph = self.structure.graph
+        found = nx.ancestors(graph, self.declared(name).name)
+        return frozenset(found | {name} if {name, *found} & {*graph.succ[name]} else found)
 
     def descendants(self, name: str) -> frozenset[str]:
         """Return the direct and indirect effects."""
-        return self.structure.descendants(self.declared(name).name)
+        graph = self.structure.graph
+        found = nx.descendants(graph, self.declared(name).name)
+        return frozenset(found | {name} if {name, *found} & {*graph.pred[name]} else found)
 
     def __eq__(self, other: object) -> bool:
         return (
@@ -300,8 +277,6 @@ class SCM:
     def __repr__(self) -> str:
         held = f", do({', '.join(self._interventions)})" if self._interventions else ""
         return f"SCM({len(self)} variables{held})"
-
-    # --- intervening --------------------------------------------------------------------------
 
     def targets(self, name: str) -> tuple[str, ...]:
         """Return the variables that an intervention acts on: the quantity itself, or all parts."""
@@ -359,12 +334,7 @@ class SCM:
         return model
 
     def with_interventions(self, acts: Mapping[str, Intervention]) -> Self:
-        """Apply interventions that have been checked already; on a bundle, to its parts.
-
-        Raises:
-            CyclicModel: Draws from spaces that follow other variables, or mechanisms, close a
-            cycle.
-        """
+        """Apply checked interventions, or raise ``CyclicModel``; on a bundle, to its parts."""
         model = object.__new__(type(self))
         model._copy(self)
         parts: list[tuple[str, Intervention]] = []
@@ -377,18 +347,17 @@ class SCM:
             if replaced is not None:
                 asked = replaced.requested
                 model._interventions.pop(target if asked.parts else asked.name, None)
-            if isinstance(intervention, Natural):
+            if type(intervention) is Natural:
                 continue
-            drawn = isinstance(intervention, Draw | Mechanism)
-            requested = self._declared[whole_of(intervention, name) if drawn else name]
+            requested = self._declared[whole_of(intervention, name)]
             model._acts[target] = AppliedIntervention(intervention, requested)
             model._interventions[name] = intervention
         model._structure = None if acts else self._structure
         # Cutting edges keeps every causal order valid.
-        adds = any(
-            isinstance(act.intervention, Draw | Mechanism) and adds_edges(act)
-            for act in model._acts.values()
-        )
+        adds = False
+        for held in model._acts.values():
+            kind = type(held.intervention)
+            adds |= kind is Mechanism or (kind is Draw and bool(source_of(held).parents()))
         model._order = model.structure.order if adds else self._order
         return model
 
@@ -413,31 +382,25 @@ class SCM:
         self._structure = other._structure
 
     def accept(self, name: str, value: Any, *, any_variable: bool = False) -> Intervention:
-        """Check one intervention: name, type, shape, finite, fixed bounds.
-
-        Raises:
-            InterventionError: What is wrong with it.
-        """
+        """Return one checked intervention: name, type, shape, finite, fixed bounds."""
         if not isinstance(name, str) or name not in self._declared:
             settable = (n for n, v in self._declared.items() if v.settable or any_variable)
             raise UnknownVariable(name, settable)
         target = self._declared[self.targets(name)[0]]
-        whole = whole_of(value, name) if isinstance(value, Frozen) else name
+        whole = whole_of(value, name)
         if whole != name and name not in self.declared(whole).parts:
             raise InterventionError(
-                f"do({name}): it is no part of the bundle {whole!r}", variable=name, value=value
+                f"do({name}): it is not a part of the bundle {whole!r}", variable=name, value=value
             )
         if not any_variable and not target.settable:
             reason = "is a constant" if isinstance(target, Fixed) else "is measured, not set"
             raise NotIntervenable(name, reason, settable_causes(self._declared, target.name))
-        if not (isinstance(value, Draw) and isinstance(value.source, str)):
+        if type(value) is not Draw or not isinstance(value.source, str):
             return accepted(self._declared, self._declared[whole], value)
         if (whole, value.source) not in self._drawable:
             accepted(self._declared, self._declared[whole], value)
             self._drawable.add((whole, value.source))
         return value
-
-    # --- solving ------------------------------------------------------------------------------
 
     def solve(
         self,
@@ -454,48 +417,35 @@ class SCM:
         Args:
             known: Values of exogenous and measured variables and of actions; batch axes may lead.
             previous: Values of one control step ago, for parents of lag 1, and those of longer lags
-                as ``remembered`` names them. Where one is not given, it is the declared ``start``
-                or default of the parent; ``begin`` gives what they are under interventions.
-            key: Where to draw noise. Without it exogenous variables take their default and
-                noise terms are zero.
+                as ``remembered`` names them. A missing one is the declared ``start`` or default of
+                the parent; ``begin`` computes them under interventions.
+            key: The key of the noise. Without it exogenous variables take their default and noise
+                terms are zero.
             only: Compute these, in the order of the model, and take the rest from ``known``.
 
         Raises:
-            ModelError: A measured variable or an action has no value, or a value is known of
-                what is computed, and ``only`` does not leave that out.
-            UnknownOption: What is known is no mapping.
+            ModelError: A measured variable or an action has no value, or a computed variable has a
+                known one, and ``only`` is not given.
+            UnknownOption: ``known`` is not a mapping.
         """
         if not isinstance(known, Mapping | None):
             raise UnknownOption("known", known, ("a dictionary of variables and values",))
         values: dict[str, Value] = dict(known or {})
         evaluate = self._evaluator.evaluate
-        if only is None:
-            self._refuse_computed(values)
+        free = () if only is not None else (n for n in values if n in self and n not in self._acts)
+        computed = [n for n in free if getattr(self._declared[n], "mechanism", None) is not None]
+        if computed:  # an observed value would be ignored
+            said = f"{', '.join(map(repr, computed))} is computed, so a value that was observed "
+            said += "would be ignored; ask counterfactual(observed, do=…), or set it with do"
+            raise ModelError([said])
         lead = self._lead(values, key, whole=only is None)
         for name in self._order if only is None else only:
             found = evaluate(name, self._acts.get(name), values, previous or {}, key)
             values[name] = self._spread(name, found, lead) if lead else found
         return values
 
-    def _refuse_computed(self, known: Values) -> None:
-        """Refuse values that would be ignored."""
-        computed = [
-            name
-            for name in known
-            if name in self
-            and name not in self._acts
-            and getattr(self._declared[name], "mechanism", None) is not None
-        ]
-        if computed:
-            raise ModelError(
-                [
-                    f"{', '.join(map(repr, computed))} is computed, so a value that was observed "
-                    "would be ignored; ask counterfactual(observed, do=…), or set it with do"
-                ]
-            )
-
     def _lead(self, known: Values, key: NoiseKey | None, *, whole: bool) -> tuple[int, ...]:
-        """Give the batch axes of what is computed; without a key, those of what is known."""
+        """Return the batch axes of computed values; without a key, those of known ones."""
         if key is not None and key.count is not None:
             return (key.count,)
         if not whole or not known:
@@ -514,12 +464,11 @@ class SCM:
         key: NoiseKey | None = None,
         only: Iterable[str] | None = None,
     ) -> dict[str, Value]:
-        """Compute the instant before the first step, which lagged children look back at.
+        """Compute the instant before the first step, which lagged children refer to.
 
-        What has lagged causes or effects has its ``start`` or default there, unless an intervention
-        replaces its mechanism. The rest follows from that. Nothing has been drawn yet but what
-        an intervention draws, and what is drawn once per episode. Arguments and result are those of
-        ``solve``.
+        Variables with lagged causes or effects have their ``start`` or default there, unless an
+        intervention replaces their mechanism. The rest follows from them. Only interventions, and
+        variables of an episode, draw noise there. Arguments and result are those of ``solve``.
         """
         values: dict[str, Value] = dict(known or {})
         lead = self._lead(values, key, whole=only is None)
@@ -546,14 +495,9 @@ class SCM:
         return values
 
     def remembered(self, values: Values, previous: Values) -> dict[str, Value]:
-        """Give what the next control step looks back at: the present, and what is older.
+        """Return the earlier values for the next control step, from those of the present.
 
-        Args:
-            values: Of the present.
-            previous: What the present looked back at.
-
-        Returns:
-            Values by name; those of ``lag`` control steps before the next one as ``name@-lag``.
+        Values of ``lag`` control steps before the next one are named ``name@-lag``.
         """
         parents = [p for v in self._declared.values() for p in v.all_parents if p.lag > 1]
         for act in self._acts.values():
@@ -568,11 +512,7 @@ class SCM:
         return kept
 
     def evaluate(self, name: str, values: Values, key: NoiseKey | None = None) -> Value:
-        """Compute one variable from the values of all its parents.
-
-        Raises:
-            ModelError: It is measured, and has no value.
-        """
+        """Compute one variable from the values of all its parents."""
         known = self.declared(name).name
         return self._evaluator.evaluate(known, self._acts.get(known), values, {}, key)
 
@@ -583,7 +523,7 @@ class SCM:
 
         Args:
             n: How many episodes, at least 1.
-            seed: Of the noise, a whole number that is not negative.
+            seed: Seed of the noise, a whole number that is not negative.
             first: Number of the first episode: ``draw(1, first=i)`` is row i of a larger draw.
             steps: For a model with lagged edges, how many control steps.
 
@@ -609,6 +549,6 @@ class SCM:
         return {name: np.stack([s[name] for s in slices], axis=1) for name in self}
 
     def _spread(self, name: str, value: Value, lead: tuple[int, ...]) -> Value:
-        """Give a value its batch axes, where it has none."""
+        """Return a value with batch axes, which it may lack."""
         shape = self._declared[name].shape
         return value if np.ndim(value) > len(shape) else np.broadcast_to(value, (*lead, *shape))

@@ -26,8 +26,7 @@ def unrolled(model: SCM, steps: int) -> nx.DiGraph:
     return slices_of(to_digraph(model), whole_number("steps", steps, least=1))
 
 
-def _past_of(graph: nx.MultiDiGraph) -> int:
-    """Return the longest lag [control steps]."""
+def _longest_lag(graph: nx.MultiDiGraph) -> int:
     return max((lag for *_, lag in graph.edges(keys=True)), default=0)
 
 
@@ -48,7 +47,7 @@ def slices_of(graph: nx.MultiDiGraph, steps: int) -> nx.DiGraph:
 
 
 def _held(graph: nx.MultiDiGraph) -> list[str]:
-    """List the parameters without causes: they keep their value from one step to the next."""
+    """List the parameters without causes, which keep their value from one step to the next."""
     return [
         name
         for name, data in graph.nodes(data=True)
@@ -68,7 +67,7 @@ def window_of(graph: nx.MultiDiGraph) -> nx.DiGraph:
         Verma and Pearl, *Equivalence and synthesis of causal models*, UAI 1990, for projections;
         a clique of bidirected edges separates as one common cause does.
     """
-    past, place = _past_of(graph), {name: number for number, name in enumerate(graph)}
+    past, place = _longest_lag(graph), {name: number for number, name in enumerate(graph)}
     edges = np.zeros((past + 1, len(place), len(place)), dtype=bool)  # lag, cause, effect
     for cause, effect, lag in graph.edges(keys=True):
         edges[lag, place[cause], place[effect]] = True
@@ -90,18 +89,18 @@ def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
     Without lags it has the names of the variables. With lags there are as many slices as the
     longest lag reaches: ``name`` is now, ``name@-1`` one step ago. A parameter keeps its value, so
     its past is called ``name@=-1`` and has an edge to ``name``. Causes before the first slice that
-    several nodes have in common are nodes ``past_1@-2``, … with ``observed="no"``, as DoWhy marks
-    what is not observed.
+    several nodes have in common are nodes ``past_1@-2``, … with ``observed="no"``, DoWhy's mark of
+    unobserved nodes.
 
     Args:
         source: A model, or any directed networkx graph; the attribute ``lag`` of an edge counts.
 
     Raises:
         ModelError: Edges of lag 0 form a cycle.
-        UnknownOption: The source is no graph.
+        UnknownOption: The source is not a graph.
     """
     graph, made = to_digraph(source), nx.DiGraph()
-    held, past, slices = _held(graph), _past_of(graph), window_of(graph)
+    held, past, slices = _held(graph), _longest_lag(graph), window_of(graph)
 
     def named(node: tuple[str, int]) -> str:
         name, slice_ = node
@@ -123,10 +122,10 @@ def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
 def episode_outcome(
     model: SCM, outcomes: Iterable[str], *, starts: Iterable[str] = (), contact: bool = True
 ) -> nx.DiGraph:
-    """Return the static graph of one episode: parameters, starting states, and what it ends with.
+    """Return the static graph of one episode: parameters, starting states and outcomes.
 
-    Time is folded up: a parameter is a cause of an outcome where a path leads from one to the
-    other that passes no further parameter.
+    A parameter is a cause of an outcome where a path through time leads from one to the other that
+    passes no further parameter.
 
     Args:
         model: With or without interventions.

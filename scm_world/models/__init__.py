@@ -1,6 +1,6 @@
 """A backend-free description of any system: what moves, what can be set, what can be commanded."""
 
-from scm_world.models.model import Model, Parameter, Readout, Row
+from scm_world.models.model import Model, ModelRow, Parameter, Readout
 from scm_world.models.scene import (
     Difference,
     GoalRegion,
@@ -17,11 +17,11 @@ __all__ = [
     "GoalRegion",
     "Light",
     "Model",
+    "ModelRow",
     "Parameter",
     "ParameterKey",
     "Parameters",
     "Readout",
-    "Row",
     "Scene",
     "State",
     "Structure",

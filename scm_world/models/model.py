@@ -26,7 +26,7 @@ REPORTED = "qfrc_actuator"
 
 
 @dataclass(frozen=True)
-class Row:
+class ModelRow:
     """A named quantity.
 
     Attributes:
@@ -54,7 +54,7 @@ class Row:
 
 @final
 @dataclass(frozen=True)
-class Parameter(Row):
+class Parameter(ModelRow):
     """A property of an element that holds until it is set again.
 
     Attributes:
@@ -84,7 +84,7 @@ class Parameter(Row):
 
 @final
 @dataclass(frozen=True)
-class StateRow(Row):
+class StateRow(ModelRow):
     """Something that physics moves, or that it reports. Its own trees are in ``always``.
 
     Attributes:
@@ -182,7 +182,7 @@ class Model:
     timestep: float
     parameters: tuple[Parameter, ...]
     states: tuple[StateRow, ...]
-    inputs: tuple[Row, ...]
+    inputs: tuple[ModelRow, ...]
     readouts: tuple[Readout, ...] = ()
     trees: tuple[str, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()

@@ -8,13 +8,11 @@ from scm_world.policies.networks import (
     load_sb2,
     save_policy,
 )
-from scm_world.policies.onnx import OnnxPolicy
 from scm_world.policies.zoo import file_of
 
 __all__ = [
     "Layer",
     "MlpPolicy",
-    "OnnxPolicy",
     "PolicyAbout",
     "file_of",
     "load_policy",

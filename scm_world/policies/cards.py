@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal, Self, final
 
 from pydantic import Field, JsonValue, ValidationError, field_validator
 
-from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.tasks import tasks
 from scm_world.variables.spaces import Frozen, problems_of
@@ -20,28 +18,32 @@ KEY = "scm_world"
 RELATIVE = ("delta_scale", "delta_origin")
 """Options of an environment that define relative actions."""
 
-FORM = (
-    "action_mode",
-    *RELATIVE,
-    "normalize_actions",
-    "observation_mode",
-    "observe",
-    "include",
-    "context",
-    "keypoints",
-    "pad",
-    "normalize_observations",
-    "goal_env",
-)
-"""Options of an environment that define observations and actions."""
+FORM: Mapping[str, Any] = {
+    "action_mode": None,
+    "delta_scale": 1.0,
+    "delta_origin": "command",
+    "normalize_actions": True,
+    "observation_mode": "structured",
+    "observe": [],
+    "include": [],
+    "context": "none",
+    "keypoints": False,
+    "pad": None,
+    "normalize_observations": True,
+    "goal_env": False,
+}
+"""Options of an environment that define observations and actions, with the defaults of files."""
 
-COMMON = ("frame_skip", "conventions")
+COMMON: Mapping[str, Any] = {"frame_skip": None, "conventions": "scm_world"}
 """Options that must be equal for all compared policies, and equal to those of the training."""
 
-FREE = ("preset", "max_episode_length")
+FREE: Mapping[str, Any] = {"preset": None, "max_episode_length": None}
 """Options of the training that may differ in an evaluation."""
 
-OPTIONS = (*FORM, *COMMON, *FREE)
+USUAL: Mapping[str, Any] = {**FORM, **COMMON, **FREE}
+"""Defaults of all these options, which are those of the environment; None is the task's own."""
+
+OPTIONS = tuple(USUAL)
 
 
 def plain(value: Any) -> Any:
@@ -52,12 +54,6 @@ def plain(value: Any) -> Any:
         ['a', 'b']
     """
     return [plain(one) for one in value] if isinstance(value, tuple | list) else value
-
-
-USUAL: Mapping[str, Any] = {
-    name: plain(inspect.signature(ScmWorldEnv).parameters[name].default) for name in OPTIONS
-}
-"""Defaults of these options; None is the task's own."""
 
 
 def usual(option: str, task: str) -> Any:
@@ -157,7 +153,7 @@ class PolicyAbout(Frozen):
         """Return an option of the environment, as JSON has it; None is the task's own."""
         return self.env.get(name, usual(name, self.task))
 
-    def unusual(self, names: tuple[str, ...]) -> dict[str, Any]:
+    def unusual(self, names: Iterable[str]) -> dict[str, Any]:
         """Return those of some options that differ from their defaults."""
         found = {name: self.option(name) for name in names}
         return {name: v for name, v in found.items() if v != usual(name, self.task)}
@@ -187,11 +183,11 @@ class PolicyAbout(Frozen):
         except ValidationError as error:
             raise ModelError(problems_of(error)) from None
 
-    def check(self, env: ScmWorldEnv, name: str) -> None:
+    def check(self, env: Any, name: str) -> None:
         """Check that an environment has the observations and actions of the training.
 
         Args:
-            env: Where the policy should act.
+            env: The ``ScmWorldEnv`` in which the policy should act.
             name: Of the policy, for the message.
 
         Raises:

@@ -15,7 +15,7 @@ Source:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -28,16 +28,16 @@ from scm_world.errors import ImpossibleObservation, InterventionError, ModelErro
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier, first_value
 from scm_world.queries.equations import Layout
-from scm_world.queries.inversion import Found, density_of, noise_given, proposed
-from scm_world.queries.observations import Observations, observations
+from scm_world.queries.inversion import Found, density_of, noise_given, noise_shape, proposed
+from scm_world.queries.observations import Observations, observations, per
 from scm_world.queries.plans import Plan, at_once, numbered
 from scm_world.variables import (
-    Action,
+    SOFT,
     Box,
     Categories,
     Draw,
     Exogenous,
-    Measured,
+    Fixed,
     Mechanism,
     Noise,
     Scale,
@@ -183,19 +183,13 @@ class Counterfactuals(Mapping[str, Floats]):
 
 
 def counterfactuals(
-    model: SCM,
-    observed: Any,
-    do: Mapping[str, Any],
-    *,
-    n: int | None = None,
-    seed: int = 0,
-    tolerance: float = 1e-6,
+    model: SCM, observed: Any, do: Mapping[str, Any], n: int | None, seed: int, tolerance: float
 ) -> Counterfactuals:
-    """Say what observed units would have been under an intervention; see ``SCM.counterfactual``."""
+    """Return what observed units would have been; see ``SCM.counterfactual``."""
     tolerance = real_number("tolerance", tolerance, least=0.0)
     seen = observations(model, observed)
     if n is None:
-        sure = _Abduction(model, seen, 1, seed, tolerance, certain=True)
+        sure = _Abduction(model, seen, None, seed, tolerance)
         answer = None if sure.sampled else sure.answer(do)
         if answer is not None and answer.exact:
             return answer
@@ -205,95 +199,112 @@ def counterfactuals(
 
 @final
 class _Abduction:
-    """The noise of observed units, in ``n`` draws each; with ``certain`` up to the first draw."""
+    """The noise of observed units, in ``n`` draws each; up to the first draw if None."""
 
     def __init__(
-        self,
-        model: SCM,
-        seen: Observations,
-        n: int,
-        seed: int,
-        tolerance: float,
-        *,
-        certain: bool = False,
+        self, model: SCM, seen: Observations, n: int | None, seed: int, tolerance: float
     ) -> None:
-        self.model, self.n, self._tolerance = model, n, tolerance
+        self._certain, self.n = n is None, n or 1
+        self.model, self._tolerance = model, tolerance
         own = np.random.SeedSequence((whole_number("seed", seed, least=0), 1))  # not that of data
         self._noise = Noise(int(own.generate_state(1)[0]))
         self._together = Layout(model).is_vectorised
-        self._seen, self._rows, self._size = seen, seen.rows, seen.rows * n
+        self._seen, self._rows, self._size = seen, seen.rows, seen.rows * self.n
         if self._size * seen.steps > MOST:
-            said = f"{seen.rows} units with {n} draws each of {seen.steps} instants are too many"
+            said = f"{seen.rows} units of {seen.steps} instants with {self.n} draws are too many"
             raise ModelError([f"{said}: give fewer rows at once, or a smaller n"])
         self._log_weights = np.zeros(self._size)
-        self._ancestors = np.tile(np.arange(n), self._rows)
+        self._ancestors = np.tile(np.arange(self.n), self._rows)
         self.sampled = False
-        self._given: list[dict[str, Value]] = []  # noise, by instant
+        self._given: list[dict[str, Value]] = []  # noise, and roots without intervention, by step
         self._values: list[dict[str, Value]] = []
-        self._before: Values = self._start(model)
-        constants = {name for name in model if _per(model.declared(name)) == "episode"}
+        self._first: dict[str, Value] = {}  # the instant before the first step
+        self._before: Values = {}
+        order = model.structure.order
         for step in range(seen.steps):
-            kept = self._given[0].items() if step else ()
-            self._given.append({name: noise for name, noise in kept if name in constants})
+            self._given.append(self._constants() if step else {})
             self._values.append({})
-            for name in model.structure.order:
-                self._find(model[name], step)
-                if certain and self.sampled:
+            if model.is_temporal and not step:  # the instant before has the constants, too
+                for name in order:
+                    if per(model[name]) == "episode" and not model[name].all_parents:
+                        self._find(model[name], 0)
+                self._first = self._before = self._start(model, {})
+                self.sampled |= self._draws_before(model, model)
+            for name in order:
+                if name not in self._values[-1]:
+                    self._find(model[name], step)
+                if self._certain and self.sampled:
                     return
             self._before = model.remembered(self._values[-1], self._before)
             if step < seen.steps - 1:
                 self._draw_again(step)
 
-    # --- abduction ------------------------------------------------------------------------------
+    def _constants(self) -> dict[str, Value]:
+        """Return the noise of the first step that is that of the whole episode."""
+        known = self._given[0].items()
+        return {name: value for name, value in known if per(self.model.declared(name)) == "episode"}
 
-    def _observed(self, name: str, step: int) -> tuple[Value, Value]:
-        """Return values of a variable, 0 where it was not observed, and where it was."""
-        declared = self.model.declared(name)
-        if name not in self._seen.values:
-            return np.zeros((self._size, *declared.shape)), np.zeros(self._size, dtype=bool)
-        found = self._seen.values[name]
-        if _per(declared) == "episode":  # known once it is seen
-            first = np.isfinite(found).argmax(axis=1)[:, None]
-            found = np.where(np.isnan(found), np.take_along_axis(found, first, axis=1), found)
-        wanted = np.repeat(found[:, step], self.n, axis=0)
-        return np.nan_to_num(wanted), ~np.isnan(wanted).reshape(self._size, -1).any(axis=1)
+    # --- abduction ------------------------------------------------------------------------------
 
     def _find(self, variable: Any, step: int) -> None:
         """Find value and noise of a variable, from what was observed of it and of its causes."""
-        name, values, given = variable.name, self._values[-1], self._given[-1]
-        wanted, there = self._observed(name, step)
+        name, given = variable.name, self._given[-1]
+        wanted = np.repeat(self._seen.values[name][:, step], self.n, axis=0)
+        there = ~np.isnan(wanted).reshape(self._size, -1).any(axis=1)
+        wanted = np.nan_to_num(wanted)
+        natural = self._without_intervention(name, wanted) if there.any() else wanted
         source = _source(variable)
-        if source is None and _is_free(variable):
-            exogenous = isinstance(variable, Exogenous)
-            default = variable.array(variable.default) if exogenous else np.zeros(variable.shape)
-            values[name] = _either(there, wanted, default)
-            return
         unsure = self.sampled and bool(variable.all_parents)
-        if source is not None and name not in given:
+        if source is None and _is_free(variable):
+            given[name] = _either(there, natural, first_value(variable))
+        elif source is not None and name not in given:
             given[name] = self._drawn(variable, source, step, there)
-            found = self._inverted(variable, source, wanted, step) if there.any() else None
+            found = self._inverted(variable, source, natural, step) if there.any() else None
             self.sampled |= found is None or found.drawn or not there.all()
             unsure |= found is None
             if found is not None:
-                log = found.log_density.reshape(self._size, -1).sum(axis=1)
+                log = found.log_weight
                 possible = there & np.isfinite(log)
                 self._weigh(name, there & ~possible, unsure=unsure)
                 self._log_weights[possible] += log[possible]
                 given[name] = _either(possible, found.noise, given[name])
-        value = self._computed(self.model, name, values, self._before, step)
-        self._weigh(name, there & ~self._near(value, wanted), unsure=unsure)
+        if self._certain and self.sampled:
+            return
+        value = self._computed(self.model, name, self._values[-1], self._before, step)
+        apart = np.abs(np.asarray(value, dtype=float) - wanted).reshape(self._size, -1)
+        most = self._tolerance * (1.0 + np.abs(wanted)).reshape(self._size, -1)
+        self._weigh(name, there & ~(apart <= most).all(axis=1), unsure=unsure)
         value = _either(there, wanted, value)
-        values[name] = value if variable.dtype == "real" else np.rint(value).astype(np.int64)
+        whole = variable.dtype != "real"
+        self._values[-1][name] = np.rint(value).astype(np.int64) if whole else value
+
+    def _without_intervention(self, name: str, value: Value) -> Value:
+        """Return what a variable would have been that was observed under a shift or scale."""
+        act = self.model.act_on(name)
+        if act is None or not isinstance(act.intervention, SOFT):
+            return value
+        asked: Any = act.requested
+        done, by = act.intervention, np.asarray(act.intervention.by)
+        if isinstance(done, Scale) and not by.all():
+            said = f"{name!r} was observed under Scale(0), which tells nothing of it"
+            raise ModelError([f"{said}: leave it out, or give NaN"])
+
+        def natural(_: NoiseKey, known: Values) -> Value:
+            there = known[name] if asked.name == name else asked.mechanism.bind()(known[name])
+            there = there - by if isinstance(done, Shift) else there / by
+            return np.asarray(there if asked.name == name else asked.inverse.bind()(there))
+
+        return self._each(natural, 0, {}, {name: value})
 
     def _drawn(self, variable: Any, source: Any, step: int, there: Value) -> Value:
         """Draw the noise of a variable; weigh it where the variable was not observed."""
-        key, shape = self._key(step), getattr(variable, "noise_shape", None) or variable.shape
-        found = proposed(source, shape, self._shares(f"{variable.name}|hidden", shape, step))
+        name, shape = variable.name, noise_shape(variable)
+        found = proposed(source, shape, self._shares(f"{name}|hidden", shape, step))
         if found is not None:
-            log = found.log_density.reshape(self._size, -1).sum(axis=1)
-            self._log_weights += np.where(there, 0.0, log)
+            self._log_weights += np.where(there, 0.0, found.log_weight)
             return found.noise
-        return key.natural(source, variable.name, shape, self._values[-1])
+        key = NoiseKey(self._noise, 0, step, self._size)
+        return key.natural(source, name, shape, self._values[-1])
 
     def _shares(self, name: str, shape: tuple[int, ...], step: int) -> Floats:
         size = int(np.prod(shape))
@@ -302,49 +313,37 @@ class _Abduction:
 
     def _inverted(self, variable: Any, source: Any, value: Value, step: int) -> Found | None:
         """Find the noise of a variable for an observed value; None where only draws can tell."""
-        name, act, values = variable.name, self.model.act_on(variable.name), self._values[-1]
+        name, shape, values = variable.name, variable.shape, self._values[-1]
         if isinstance(variable, Exogenous):
             try:
-                log = density_of(source, variable.shape, values).log_density(value)
+                log = density_of(source, shape, values).log_density(value)
             except ModelError:
                 if source.parents():
                     raise
                 log = np.zeros(self._size)
             # without causes the density is the same for all draws
             return Found(value, log if source.parents() else np.where(np.isfinite(log), 0.0, log))
-        match None if act is None else act.intervention:
-            case Shift(by=by):
-                value = value - np.asarray(by)
-            case Scale(by=by):
-                if not np.all(by):
-                    said = f"{name!r} was observed under Scale(0), which tells nothing of it"
-                    raise ModelError([f"{said}: leave it out, or give NaN"])
-                value = value / np.asarray(by)
         parents: list[Value] = []
         for parent in variable.all_parents:
             known = self._before if parent.lag else values
             where = earlier(parent.name, parent.lag) if parent.lag else parent.name
             first = first_value(self.model.declared(parent.name))
             parents.append(known.get(where, np.broadcast_to(first, (self._size, *first.shape))))
-        shares = self._shares(f"{name}|abduction", variable.shape, step)
-        return noise_given(variable, source, value, parents, self._apply, shares)
 
-    def _apply(
-        self, function: Any, parents: list[Value], noise: Values, shape: tuple[int, ...]
-    ) -> Value:
-        """Call a function for all units; NaN where it is not defined, as the logarithm of 0."""
+        def apply(
+            function: Any, parents: list[Value], noise: Values, shape: tuple[int, ...]
+        ) -> Value:
+            def called(key: NoiseKey, parents: Mapping[Any, Value], noise: Values) -> Value:
+                try:
+                    with np.errstate(all="ignore"):
+                        return np.asarray(function(*parents.values(), **noise), dtype=float)
+                except (ArithmeticError, ValueError):  # not defined there, as the logarithm of 0
+                    return np.full(shape if key.count is None else (key.count, *shape), np.nan)
 
-        def called(parents: list[Value], noise: Values, shape: tuple[int, ...]) -> Value:
-            try:
-                with np.errstate(all="ignore"):
-                    return np.asarray(function(*parents, **noise), dtype=float)
-            except (ArithmeticError, ValueError):
-                return np.full(shape, np.nan)
+            return self._each(called, step, {}, dict(enumerate(parents)), noise)
 
-        if self._together:
-            return called(parents, noise, (self._size, *shape))
-        rows = range(self._size)
-        return np.array([called([p[i] for p in parents], _row(noise, i), shape) for i in rows])
+        shares = self._shares(f"{name}|abduction", shape, step)
+        return noise_given(variable, source, value, parents, apply, shares)
 
     def _weigh(self, name: str, wrong: Value, *, unsure: bool) -> None:
         """Leave out draws that contradict an observation; refuse what no draw gives."""
@@ -355,9 +354,7 @@ class _Abduction:
         said = f"in row {lost.argmax()}, " if self._rows > 1 else ""
         if unsure:  # the model may give it: it was not met
             said = f"{name!r}: {said}none of {self.n} draws gives what was observed"
-            advice = (
-                "observe its causes, declare inverse_noise, draw more (n), or allow a tolerance"
-            )
+            advice = "observe its causes, declare inverse_noise, draw more (n) or allow a tolerance"
             raise ModelError([f"{said}: {advice}"])
         variable = self.model[name]
         if _source(variable) is None:
@@ -389,7 +386,7 @@ class _Abduction:
         where = (chosen + self.n * np.arange(self._rows)[:, None]).ravel()
         self._ancestors = self._ancestors[where]
         self._before = {name: np.asarray(value)[where] for name, value in self._before.items()}
-        for instant in (*self._given, *self._values):
+        for instant in (self._first, *self._given, *self._values):
             instant.update({name: np.asarray(value)[where] for name, value in instant.items()})
 
     # --- action and prediction ------------------------------------------------------------------
@@ -397,23 +394,25 @@ class _Abduction:
     def answer(self, do: Mapping[str, Any]) -> Counterfactuals:
         """Solve the model again under an intervention, with the same noise."""
         models = self._models(do)
-        changes = [self._changed(model) for model in models]
+        was = self.model.act_on
+        changes = [{name for name in model if model.act_on(name) != was(name)} for model in models]
         follow = set[str]().union(*changes)
         follow |= {n for m in models for name in follow for n in m.descendants(name)}
-        before, found = self._start(models[0]), list[dict[str, Value]]()
-        for step, was in enumerate(self._values):
+        kept = {name: value for name, value in self._first.items() if name not in follow}
+        before, found = self._start(models[0], kept), list[dict[str, Value]]()
+        self.sampled |= self._draws_before(models[0], changes[0])
+        for step, factual in enumerate(self._values):
             model, targets, values = models[step], changes[step], dict[str, Value]()
             for name in model.structure.order:
                 variable: Any = self.model[name]
-                source = getattr(variable, "distribution", None)
-                moves = source is not None and source.parents()
+                moves = isinstance(variable, Exogenous) and variable.all_parents
                 if name not in follow or (name not in targets and _is_free(variable) and not moves):
-                    values[name] = was[name]
+                    values[name] = factual[name]
                     continue
                 if name in targets:
                     self._renew(model, name, values, step)
                 elif moves:
-                    self._given[step][name] = _moved(variable, was, values)
+                    self._given[step][name] = _moved(variable, factual, values)
                 values[name] = self._computed(model, name, values, before, step)
             found.append(values)
             before = model.remembered(values, before)
@@ -451,12 +450,6 @@ class _Abduction:
             found.append(model.with_interventions(new) if new else model)
         return found
 
-    def _changed(self, model: SCM) -> set[str]:
-        """Return the variables on which is done something else than when they were observed."""
-        was, now = self.model.interventions, model.interventions
-        other = {name for name in {**was, **now} if was.get(name) != now.get(name)}
-        return {target for name in other for target in self.model.targets(name)}
-
     def _renew(self, model: SCM, name: str, values: Values, step: int) -> None:
         """Draw what an intervention draws anew: a value, another noise, or one that was cut off."""
         variable, act = model[name], model.act_on(name)
@@ -467,10 +460,9 @@ class _Abduction:
         if isinstance(done, Draw) or source is None or (name in held and not other):
             return
         self.sampled = True
-        shape = getattr(self.model.declared(name), "noise_shape", None)
-        held[name] = self._key(0 if _per(variable) == "episode" else step).draw(
-            source, name, variable.shape if shape is None else shape, values, "counterfactual"
-        )
+        key = NoiseKey(self._noise, 0, 0 if per(variable) == "episode" else step, self._size)
+        shape = noise_shape(self.model.declared(name))
+        held[name] = key.draw(source, name, shape, values, "counterfactual")
 
     def _stacked(self, instants: list[dict[str, Value]]) -> dict[str, Floats]:
         """Return all values by variable, shape (rows, n, *shape), or with steps in between."""
@@ -483,39 +475,65 @@ class _Abduction:
 
     # --- evaluation -----------------------------------------------------------------------------
 
-    def _key(self, step: int, given: Values | None = None) -> NoiseKey:
-        return NoiseKey(self._noise, 0, step, self._size, given=given)
-
-    def _near(self, found: Value, wanted: Value) -> Value:
-        """Return which units are as observed, shape (units,)."""
-        apart = np.abs(np.asarray(found, dtype=float) - wanted)
-        close = apart <= self._tolerance * (1.0 + np.abs(wanted))
-        return np.asarray(close.reshape(len(close), -1).all(axis=1))
-
     def _computed(self, model: SCM, name: str, values: Values, before: Values, step: int) -> Value:
         """Compute one variable with the noise that was found."""
-        more = {"previous": before, "only": (name,)}
-        return self._solved(model.solve, (name,), values, step, more)[name]
+        given = self._given[step]
+        known = {**values, name: given[name]} if name in given else values
 
-    def _start(self, model: SCM) -> dict[str, Value]:
+        def solved(key: NoiseKey, known: Values, before: Values) -> Value:
+            return model.solve(known, previous=before, key=key, only=(name,))[name]
+
+        return self._each(solved, step, given, known, before)
+
+    def _draws_before(self, model: SCM, names: Iterable[str]) -> bool:
+        """Return whether the first step looks back at what an intervention on a variable draws."""
+        back = {edge.cause for edge in model.edges if edge.lag}
+        for name in names:
+            act, declared = model.act_on(name), model.declared(name)
+            done = None if act is None else act.intervention
+            draws = isinstance(done, Draw) and per(declared) == "step"
+            if isinstance(done, Mechanism):
+                own = done.function is getattr(declared, "mechanism", None)
+                draws = not own and _source(model[name]) is not None
+            if draws and not back.isdisjoint({name, *model.descendants(name)}):
+                return True
+        return False
+
+    def _start(self, model: SCM, kept: Values) -> dict[str, Value]:
         """Compute what the first step of a model with lagged edges looks back at."""
-        free = [n for n in model if _is_free(model[n]) and not isinstance(model[n], Exogenous)]
-        known = {name: np.zeros((self._size, *model.declared(name).shape)) for name in free}
-        return self._solved(model.begin, model, known, 0, {}) if model.is_temporal else {}
+        values: dict[str, Value] = {}
+        given = self._constants()
+        for name in model.structure.order if model.is_temporal else ():
+            variable = model[name]
+            if name in kept:
+                values[name] = kept[name]
+                continue
+            if name in given:
+                values[name] = given[name]
+            elif _is_free(variable) and not isinstance(variable, Exogenous):
+                values[name] = np.zeros((self._size, *variable.shape))
 
-    def _solved(
-        self, solve: Any, names: Iterable[str], values: Values, step: int, more: dict[str, Any]
-    ) -> dict[str, Value]:
-        """Solve all units together, or one after another where functions take one only."""
-        given: Values = self._given[step] if step < len(self._given) else {}
+            def begun(key: NoiseKey, known: Values, name: str = name) -> Value:
+                return model.begin(known, key=key, only=(name,))[name]
+
+            values[name] = self._each(begun, 0, given, values)
+        return values
+
+    def _each(
+        self, function: Callable[..., Value], step: int, given: Values, *known: Mapping[Any, Value]
+    ) -> Value:
+        """Call a function of values for all units together, or for one after another."""
         if self._together:
-            return dict(solve(values, key=self._key(step, given), **more))
-        before, rows = more.get("previous", {}), []
-        for row in range(self._size):
-            key = NoiseKey(self._noise, row, step, given=_row(given, row))
-            more = {**more, "previous": _row(before, row)} if before else more
-            rows.append(solve(_row(values, row), key=key, **more))
-        return {name: np.array([row[name] for row in rows]) for name in names}
+            key = NoiseKey(self._noise, 0, step, self._size, given=given)
+            return np.asarray(function(key, *known))
+        rows = [
+            function(
+                NoiseKey(self._noise, row, step, given=_row(given, row)),
+                *(_row(values, row) for values in known),
+            )
+            for row in range(self._size)
+        ]
+        return np.array(rows)
 
 
 def _moved(variable: Any, was: Values, values: Values) -> Value:
@@ -534,12 +552,8 @@ def _either(there: Value, one: Value, other: Value) -> Value:
     return np.where(there.reshape(-1, *(1,) * (np.ndim(one) - 1)), one, other)
 
 
-def _row(values: Values, row: int) -> dict[str, Value]:
+def _row(values: Mapping[Any, Value], row: int) -> dict[Any, Value]:
     return {name: value[row] for name, value in values.items()}
-
-
-def _per(variable: Any) -> str:
-    return getattr(variable, "per", "step")
 
 
 def _source(variable: Any) -> Any:
@@ -549,6 +563,4 @@ def _source(variable: Any) -> Any:
 
 def _is_free(variable: Any) -> bool:
     """Return whether nothing but an observation says what a variable is."""
-    return isinstance(variable, Exogenous | Action) or (
-        isinstance(variable, Measured) and variable.mechanism is None
-    )
+    return not isinstance(variable, Fixed) and getattr(variable, "mechanism", None) is None

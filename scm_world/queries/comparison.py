@@ -63,13 +63,13 @@ class Comparison(Report):
     """How the effects of parameters on two backends agree.
 
     Attributes:
-        format: Of the file.
+        format: Format of the file.
         task: Name of the task.
         backends: Their names.
-        seed: Of states and values.
+        seed: Seed of states and values.
         probes: In how many states effects were compared.
         skipped: How many states one of the backends cannot be in.
-        effects: Of each parameter with a clear effect.
+        effects: Each parameter with a clear effect.
         seconds: Wall time.
     """
 
@@ -126,12 +126,11 @@ def compare_backends(
     found: dict[str, list[tuple[float, float]]] = {}
     done = 0
     with twins.twin() as one:
-        pair = one, other
         for number, probe in enumerate(probe_states(one, probes, seed)):
             one.restore(probe.snapshot)
             values = {name: one[name] for name in settable(one.model)}
             try:
-                for name, answers in _answers(pair, values, probe.action, number, seed):
+                for name, answers in _answers((one, other), values, probe.action, number, seed):
                     found.setdefault(name, []).extend(answers)
                 done += 1
             except (InterventionError, EngineFailure):  # a state that one of them cannot be in
@@ -182,9 +181,8 @@ def _answers(
     least = np.maximum(FACTOR * np.abs(base[0] - base[1]), RESOLUTION)
     starts = np.cumsum([0, *(np.size(pair[0][name]) for name in states)])
     for name in values:
-        if model.declared(name).role != "parameter":
-            continue
-        value = another(model.declared(name), values, rng, SCALE)
+        parameter = model.declared(name).role == "parameter"
+        value = another(model.declared(name), values, rng, SCALE) if parameter else None
         if value is None:
             continue
         try:

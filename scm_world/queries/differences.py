@@ -13,12 +13,9 @@ from scm_world._arguments import real_number, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode
-from scm_world.queries.outcomes import as_outcome, is_category, read
+from scm_world.queries.outcomes import Outcome, as_outcome, is_category, read
 from scm_world.queries.rollouts import as_names
-from scm_world.variables import Draw, Natural
-
-NOISY = ("sensor_noise", "actuator_noise")
-"""Parameters that add noise to an episode while they are not zero."""
+from scm_world.variables import Natural
 
 
 @final
@@ -48,12 +45,10 @@ class EpisodeDifference:
         variables: Those that do, by name, the earliest first.
         contacts: Pairs of bodies that touch in one of the two only: instant, pair, and 0 or 1 for
             the episode in which they do.
-        noise: Draws that exist in one of the two only: name, and 0 or 1 for the episode.
     """
 
     variables: Mapping[str, Divergence]
     contacts: tuple[tuple[int, tuple[str, str], int], ...]
-    noise: tuple[tuple[str, int], ...]
 
     @property
     def first(self) -> int | None:
@@ -67,7 +62,6 @@ class EpisodeDifference:
             f"{name}: from {d.first} on, at most {d.largest:.4g} (at {d.at})"
             for name, d in self.variables.items()
         ]
-        lines += [f"only in {'ab'[one]}: noise of {name}" for name, one in self.noise]
         if self.contacts:
             at, pair, one = self.contacts[0]
             lines.append(
@@ -98,19 +92,16 @@ def compare(
         raise UnknownOption("episode", other, (f"one of {one.steps} steps",))
     both = [name for name in one.names if name in set(other.names)]
     wanted = both if names is None else as_names(names)
-    first, second = one.replay(), other.replay()
+    touching = zip(one.replay().touching, other.replay().touching, strict=True)
     found = {name: _divergence(one, other, name, tolerance) for name in wanted}
-    apart = {name: d for name, d in found.items() if d is not None}
+    apart = [(name, d) for name, d in found.items() if d is not None]
     contacts = tuple(
         (step, pair, which)
-        for step, sets in enumerate(zip(first.touching, second.touching, strict=True))
+        for step, sets in enumerate(touching)
         for which in (0, 1)
         for pair in sorted(sets[which] - sets[1 - which])
     )
-    noise = _noise(one), _noise(other)
-    alone = [(name, which) for which in (0, 1) for name in sorted(noise[which] - noise[1 - which])]
-    ordered = dict(sorted(apart.items(), key=lambda item: item[1].first))
-    return EpisodeDifference(ordered, contacts, tuple(alone))
+    return EpisodeDifference(dict(sorted(apart, key=lambda item: item[1].first)), contacts)
 
 
 def _check_episode(given: Any) -> None:
@@ -122,25 +113,14 @@ def _divergence(first: Episode, second: Episode, name: str, tolerance: float) ->
     one, other = np.asarray(first[name], float), np.asarray(second[name], float)
     if one.shape != other.shape:
         return Divergence(0, float("inf"), 0, np.asarray(np.inf))
-    if any(is_category(world, name) for _, world in first.trace.declarations):
+    if any(is_category(world, Outcome(name)) for _, world in first.trace.declarations):
         one, other = (one != other).astype(float), np.zeros_like(one)
-    apart = np.abs(one - other).reshape(len(one), -1)
-    sizes = apart.max(axis=1, initial=0.0)
-    if not (sizes > tolerance).any():
+    sizes = np.abs(one - other).reshape(len(one), -1).max(axis=1, initial=0.0)
+    differs, at = sizes > tolerance, int(np.argmax(sizes))
+    if not differs.any():
         return None
-    at = int(np.argmax(sizes))
-    return Divergence(
-        int(np.argmax(sizes > tolerance)), float(sizes[at]), at, np.asarray(one[-1] - other[-1])
-    )
-
-
-def _noise(episode: Episode) -> set[str]:
-    """Name the draws of an episode: those of interventions, and of noise that is not zero."""
-    drawn = {
-        name for _, plan in episode.layers for name, act in plan.acts() if isinstance(act, Draw)
-    }
-    there = set(episode.names)
-    return drawn | {name for name in NOISY if name in there and np.any(episode[name])}
+    final = np.asarray(one[-1] - other[-1])
+    return Divergence(int(np.argmax(differs)), float(sizes[at]), at, final)
 
 
 @final
@@ -203,7 +183,15 @@ def but_for(
     """
     _check_episode(episode)
     most, at = whole_number("most", most, least=1), whole_number("at", at, least=0)
-    contrasts = _contrasts(episode, over, at)
+    if isinstance(over, Mapping):
+        contrasts = dict(over)
+    else:
+        done = dict.fromkeys(name for start, plan in episode.layers if start <= at for name in plan)
+        contrasts = dict.fromkeys(done if over is None else as_names(over), Natural())
+        for name in contrasts:
+            if name not in done:
+                allowed = (*done, f"{{{name!r}: the value that it would have had instead}}")
+                raise UnknownOption("cause", name, allowed)
     wanted = as_outcome(outcome)
     actual = read(wanted, episode)
     found: list[ButFor] = []
@@ -221,17 +209,3 @@ def but_for(
             for group, other in zip(groups, others, strict=True)
         ]
     return tuple(sorted(found, key=lambda entry: (-entry.size, len(entry.causes))))
-
-
-def _contrasts(
-    episode: Episode, over: Iterable[str] | Mapping[str, Any] | None, at: int
-) -> dict[str, Any]:
-    if isinstance(over, Mapping):
-        return dict(over)
-    done = dict.fromkeys(name for start, plan in episode.layers if start <= at for name in plan)
-    names = tuple(done) if over is None else as_names(over)
-    for name in names:
-        if name not in done:
-            allowed = (*done, f"{{{name!r}: the value that it would have had instead}}")
-            raise UnknownOption("cause", name, allowed)
-    return dict.fromkeys(names, Natural())

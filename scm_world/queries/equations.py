@@ -222,7 +222,7 @@ class Equations:
             self._models[group] = model
         self._changed()
         if not self._is_one:
-            return Audit({}, {}, {})
+            return Audit(lambda: ({}, {}, {}, (), (), ()))
         flat, now = flatten(request), self._now()
         waiting = self._action if self.model.is_temporal else {}
         targets = {
@@ -234,7 +234,7 @@ class Equations:
             for name in self.model
             if name not in targets and not same(earlier[name], now[name])
         }
-        return Audit(targets, moved, {})
+        return Audit(lambda: (targets, moved, {}, (), (), ()))
 
     def step(self, action: ArrayLike) -> None:
         """Take a step.

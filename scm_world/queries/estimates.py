@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, final
 
 import numpy as np
@@ -67,73 +67,59 @@ class Effect:
         return bool(np.any((self.low > 0.0) | (self.high < 0.0) | constant))
 
     def as_dict(self) -> dict[str, Any]:
-        """Write the result as plain data; functions in plans are an error, see ``Plan``."""
-        numbers = ("mean", "low", "high", "variance_ratio", "treated", "control")
-        found = {name: np.asarray(getattr(self, name)).tolist() for name in numbers}
-        found |= {name: _finite(found[name]) for name in ("low", "high", "variance_ratio")}
-        return {
-            "format": "scm_world/effect/1",
-            "outcome": self.outcome,
-            **found,
-            "confidence": CONFIDENCE,
-            "caution": self.caution,
-            "n": self.n,
-            "paired": self.paired,
-            "rollouts": self.rollouts,
-            "seed": self.seed,
-            "engine": self.engine,
-            "do": self.do.as_dict(),
-            "versus": self.versus.as_dict(),
-        }
+        """Return the result as plain data; functions in plans are an error, see ``Plan``."""
+        found: dict[str, Any] = {"format": "scm_world/effect/1", "confidence": CONFIDENCE}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Plan):
+                value = value.as_dict()
+            elif not isinstance(value, str | int):  # numbers; None where there is no interval
+                value = np.asarray(np.where(np.isfinite(value), value, None)).tolist()
+            found[field.name] = value
+        return found
 
     def to_json(self) -> str:
         """Write the result as JSON."""
         return json.dumps(self.as_dict(), indent=1, allow_nan=False)
 
     def __str__(self) -> str:
+        names = ("mean", "low", "high", "variance_ratio")
+        mean, low, high, ratio = (
+            np.array2string(np.asarray(getattr(self, name)), precision=4, separator=", ")
+            for name in names
+        )
+        ends = "" if np.isnan(self.low).all() else f" [{low}, {high}]"
         how = "paired" if self.paired else "unpaired"
-        ratio = _show(self.variance_ratio)
-        varies = not bool(np.isnan(self.low).all())
-        ends = f" [{_show(self.low)}, {_show(self.high)}]" if varies else ""
         return (
-            f"{self.outcome}: {_show(self.mean)}{ends} under {self.do} versus {self.versus}, "
+            f"{self.outcome}: {mean}{ends} under {self.do} versus {self.versus}, "
             f"n = {self.n} {how}, variance unpaired : paired {ratio}"
             + (f"; {self.caution}" if self.caution else "")
         )
 
 
-def _finite(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_finite(part) for part in value]
-    return value if math.isfinite(value) else None
-
-
-def _show(value: Floats) -> str:
-    return np.array2string(np.asarray(value), precision=4, separator=", ")
-
-
 def difference(
     treated: Floats, control: Floats, *, paired: bool
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Estimate the mean difference of two samples, with its interval.
+    """Return the mean difference of two samples, shape (n, ...), with its interval.
 
-    Args:
-        treated: Shape (n, ...).
-        control: Shape (n, ...); row i is the same unit where they are paired.
-        paired: Whether they are.
+    The four results are the mean, the ends of the interval of Student's t (NaN where nothing
+    varies but by rounding), and the ratio of the variances unpaired : paired. Unpaired samples may
+    have different variances.
 
-    Returns:
-        Mean, lower and upper end of the interval of Student's t, and the ratio of the variances
-        unpaired : paired. The ends are NaN where nothing varies but by rounding.
+    Source:
+        Welch, *The generalization of "Student's" problem when several different population
+        variances are involved*, Biometrika 1947, for the degrees of freedom.
     """
     from scipy.special import stdtrit
 
     n = len(treated)
-    apart = treated.var(axis=0, ddof=1) + control.var(axis=0, ddof=1)
+    first, second = treated.var(axis=0, ddof=1), control.var(axis=0, ddof=1)
+    apart = first + second
     together = (treated - control).var(axis=0, ddof=1)
     mean = treated.mean(axis=0) - control.mean(axis=0)
     spread = together if paired else apart
-    degrees = n - 1 if paired else 2 * n - 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        degrees = (n - 1) * (1.0 if paired else apart**2 / (first**2 + second**2))
     reach = stdtrit(degrees, 0.5 + 0.5 * CONFIDENCE) * np.sqrt(spread / n)
     rounding = 1e-14 * np.maximum(np.abs(treated).max(axis=0), np.abs(control).max(axis=0))
     reach = np.where(np.sqrt(spread) > rounding, reach, np.nan)
@@ -143,15 +129,10 @@ def difference(
 
 
 def caution(treated: Floats, control: Floats, *, paired: bool) -> str:
-    """Say when the interval of ``difference`` is too short, as far as the samples can show.
+    """Return when the interval of ``difference`` is too short, as far as the samples can show.
 
     An interval of Student's t needs about 25 g² units, where g is the skewness. Few units do not
     show how skewed their distribution is, so below 20 of them there is always a word of caution.
-
-    Args:
-        treated: As for ``difference``.
-        control: As for ``difference``.
-        paired: As for ``difference``.
 
     Source:
         Cochran, *Sampling Techniques*, 3rd edition, 1977, 2.15.
@@ -186,16 +167,7 @@ def effect_of(
     paired: bool = True,
     rows: Any = slice(None),
 ) -> Effect:
-    """Compare an outcome in two samples.
-
-    Args:
-        system: Where they come from.
-        outcome: As in ``World.effect``; the first one of the samples.
-        treated: Under what is done.
-        control: Under what that is compared with.
-        paired: Whether row i of both is the same unit.
-        rows: The units that count.
-    """
+    """Compare the first outcome of two samples, in the units that count."""
     one, other = (next(iter(samples.values()))[rows] for samples in (treated, control))
     mean, low, high, ratio = difference(one, other, paired=paired)
     return Effect(

@@ -79,32 +79,23 @@ def nature_graph(
         raise UnknownOption("model", model, ("an SCM, such as world.model",))
     plan = Plan(nature)
     acts = plan.at_start()
-    late = sorted(
-        {name for name in plan if name not in acts} | {n for n in plan if len(plan[n]) > 1}
-    )
+    late = sorted(name for name in plan if name not in acts or len(plan[name]) > 1)
     if late:
-        raise ModelError(
-            [f"what nature does to {name!r} has to happen at the beginning" for name in late]
-        )
+        said = "what nature does to {!r} has to happen at the beginning"
+        raise ModelError([said.format(name) for name in late])
     moved = [name for name in acts if model.declared(model.target(name)).role == "state"]
     states = [target for name in moved for target in model.targets(name)]
     held = model.do({name: act for name, act in acts.items() if name not in moved})
     graph = episode_outcome(held, as_names(outcomes), starts=states, contact=contact)
     for name in moved:
-        followed = sorted(_followed(model, name, acts[name]))
-        causes = [n if n in graph else f"{n}@0" for n in followed]
-        for target in model.targets(name):
-            graph.add_edges_from((cause, f"{target}@0") for cause in causes)
+        act, followed = acts[name], frozenset[str]()
+        if isinstance(act, Mechanism):
+            followed = frozenset(parent.name for parent in act.parents)
+        elif isinstance(act, Draw):
+            followed = source_of(AppliedIntervention(act, model.declared(name))).parents()
+        causes = [n if n in graph else f"{n}@0" for n in sorted(followed)]
+        graph.add_edges_from((n, f"{target}@0") for target in model.targets(name) for n in causes)
     return graph
-
-
-def _followed(model: SCM, name: str, act: Any) -> frozenset[str]:
-    """Name what a state follows at the beginning: parents of a mechanism or of a space."""
-    if isinstance(act, Mechanism):
-        return frozenset(parent.name for parent in act.parents)
-    if isinstance(act, Draw):
-        return source_of(AppliedIntervention(act, model.declared(name))).parents()
-    return frozenset()
 
 
 def identify(
@@ -150,8 +141,7 @@ def identify(
         raise UnknownOption("outcome", outcome, ("another node than the treatment",))
     watched = seen - {treatment, outcome}
     allowed = watched - nx.descendants(graph, treatment)
-    behind = graph.copy()
-    behind.remove_edges_from(list(graph.out_edges(treatment)))
+    behind = _without_edges_from(graph, [treatment])
     backdoor = _smallest_separator(behind, treatment, outcome, allowed)
     doors = tuple(_front_doors(graph, treatment, outcome, watched)) if frontdoor else ()
     instruments = tuple(
@@ -203,7 +193,7 @@ def estimate(
         ends = f"{found.treatment!r} on {found.outcome!r}"
         advice = "observe more variables, look for front doors, or intervene (effect)"
         raise ModelError([f"the effect of {ends} is not identified: {advice}"])
-    way = next(iter(found.variables)) if method is None else method.partition(".")[0]
+    way = next(iter(found.variables)) if method is None else str(method).partition(".")[0]
     one_of("method", way, tuple(found.variables))
     columns = [found.treatment, found.outcome, *found.variables[way]]
     for name in columns:
@@ -220,22 +210,24 @@ def estimate(
         )
 
 
+def _without_edges_from(graph: nx.DiGraph, nodes: Iterable[str]) -> nx.DiGraph:
+    found = graph.copy()
+    found.remove_edges_from(list(graph.out_edges(nodes)))
+    return found
+
+
 def _smallest_separator(
     graph: nx.DiGraph, x: str, y: str, allowed: set[str]
 ) -> tuple[str, ...] | None:
     """Return the fewest allowed nodes that d-separate two nodes; None if none do."""
     moral = nx.moral_graph(graph.subgraph({x, y} | nx.ancestors(graph, x) | nx.ancestors(graph, y)))
-    flow = nx.DiGraph()  # each node is an edge; without a capacity it cannot be cut
-    for node in moral:
-        flow.add_edge((node, "in"), (node, "out"), **({"capacity": 1} if node in allowed else {}))
-    for one, other in moral.edges:
-        flow.add_edges_from([((one, "out"), (other, "in")), ((other, "out"), (one, "in"))])
-    try:
-        _, (_, behind) = nx.minimum_cut(flow, (x, "out"), (y, "in"))
-    except nx.NetworkXUnbounded:
+    for node in {*moral} - allowed - {x, y}:  # paths through it cannot be cut there
+        around = [*moral[node]]
+        moral.remove_node(node)
+        moral.add_edges_from(combinations(around, 2))
+    if moral.has_edge(x, y):
         return None
-    cut = (node for node, end in behind if end == "out" and (node, "in") not in behind)
-    return tuple(sorted(cut, key=str))
+    return tuple(sorted(nx.minimum_node_cut(moral, x, y), key=str))
 
 
 def _front_doors(
@@ -243,14 +235,12 @@ def _front_doors(
 ) -> Iterator[tuple[str, ...]]:
     """List the smallest sets of mediators that meet Pearl's front-door criterion."""
     between = nx.descendants(graph, treatment) & nx.ancestors(graph, outcome) & observed
-    behind = graph.copy()
-    behind.remove_edges_from(list(graph.out_edges(treatment)))
+    behind = _without_edges_from(graph, [treatment])
     for size in (1, 2, 3):
         found = False
-        for mediators in combinations(sorted(between), size):
-            without, after = graph.copy(), graph.copy()
+        for mediators in combinations(sorted(between, key=str), size):
+            without, after = graph.copy(), _without_edges_from(graph, mediators)
             without.remove_nodes_from(mediators)
-            after.remove_edges_from(list(graph.out_edges(mediators)))
             intercepts = not nx.has_path(without, treatment, outcome)
             unconfounded = nx.is_d_separator(behind, {treatment}, set(mediators), set())
             blocked = nx.is_d_separator(after, set(mediators), {outcome}, {treatment})

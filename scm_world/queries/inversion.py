@@ -48,6 +48,18 @@ class Found(NamedTuple):
     log_density: Floats
     drawn: bool = False
 
+    @property
+    def log_weight(self) -> Floats:
+        """By which a draw is weighed, shape (units,)."""
+        return np.asarray(self.log_density.reshape(len(self.log_density), -1).sum(axis=1))
+
+
+def noise_shape(variable: Any) -> tuple[int, ...]:
+    """Return the shape of the noise of a variable: its own where none is declared."""
+    own = getattr(variable, "noise_shape", None)
+    shape: tuple[int, ...] = variable.shape if own is None else own
+    return shape
+
 
 def noise_given(
     variable: Any,
@@ -57,18 +69,9 @@ def noise_given(
     apply: Callable[..., Value],
     shares: Floats,
 ) -> Found | None:
-    """Return the noise of a variable; None where only draws can tell.
-
-    Args:
-        variable: One with noise.
-        source: Distribution of its noise.
-        value: Shape (units, *shape).
-        parents: Values of its causes.
-        apply: Calls a function for all units.
-        shares: Uniform numbers to draw among several solutions with, shape (units, *shape).
-    """
+    """Return the noise of a variable for a value and its causes; None where only draws can tell."""
     how, function, shape = variable.inverse_noise, variable.mechanism.bind(), variable.shape
-    own = shape if variable.noise_shape is None else variable.noise_shape
+    own = noise_shape(variable)
 
     def gives(noise: Value) -> Value:
         return apply(function, parents, {"noise": noise}, shape)
@@ -127,21 +130,20 @@ def _monotone(
     ladder = [*(centre + below * OUTER[::-1]), centre, *(centre + above * OUTER)]
     points = np.stack([np.broadcast_to(np.clip(p, *support), np.shape(value)) for p in ladder])
     given = np.stack([gives(point) for point in points])
-    ends = (
+    first, last = (
         g[(~np.isnan(g)).argmax(axis=0), *np.indices(g.shape[1:])] for g in (given, given[::-1])
     )
-    rising = np.where(np.less(*ends), 1.0, -1.0)
+    rising = np.where(first < last, 1.0, -1.0)
 
-    def over(noise: Value) -> Floats:
+    def over(noise: Value, found: Value) -> Floats:
         """Return -1 where noise gives too little, 0 where it gives the value, and 1 elsewhere."""
-        found = gives(noise)
         found = np.sign((np.rint(found) if whole else found) - value) * rising
         outside = np.where(noise < centre, -1.0, 1.0)  # a function may end before the noise does
         return np.asarray(np.where(np.isnan(found), outside, found))
 
-    def edge(*, lower: bool) -> Floats:
-        """Return the first noise that gives the value, or the last one."""
-        limit = -0.5 if lower else 0.5
+    signs = np.stack([over(point, found) for point, found in zip(points, given, strict=True)])
+    ends: list[Value] = []
+    for limit in (-0.5, 0.5):  # of the first noise that gives the value, and of the last one
         at = (signs < limit).sum(axis=0)
         low, high = (
             points[np.clip(place, 0, len(points) - 1), *np.indices(place.shape)]
@@ -149,12 +151,10 @@ def _monotone(
         )
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)
-            short = over(middle) < limit
+            short = over(middle, gives(middle)) < limit
             low, high = np.where(short, middle, low), np.where(short, high, middle)
-        return np.asarray(high if lower else low)
-
-    signs = np.stack([over(point) for point in points])
-    low, high = edge(lower=True), edge(lower=False)
+        ends.append(high if limit < 0.0 else low)
+    low, high = ends
     root, wide = 0.5 * (low + high), high - low > 1e-9 * (1.0 + np.abs(low))
     log: Floats = density.log_density(root) - density.log_slope(gives, root)
     if not wide.any():
@@ -205,11 +205,7 @@ class Density:
 
 
 def density_of(source: Any, shape: tuple[int, ...], values: Values) -> Density:
-    """Return a distribution with its density.
-
-    Raises:
-        ModelError: The density is not known.
-    """
+    """Return a distribution with its density; refuse one whose density is not known."""
     from scipy import stats
 
     match source:

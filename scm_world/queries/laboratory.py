@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from typing import Any, final
+
+import numpy as np
 
 from scm_world._arguments import one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
 from scm_world.errors import Forbidden, UnknownOption
-from scm_world.queries.outcomes import Outcome, column
+from scm_world.queries.outcomes import Outcome, as_outcomes, column
 from scm_world.queries.plans import Plan
-from scm_world.queries.samples import Samples, Setting, sample
+from scm_world.queries.rollouts import as_names, length
+from scm_world.queries.samples import Samples, Setting, refuse_late, sample
 from scm_world.queries.tables import read_protocol
-from scm_world.queries.twins import Twins, twins_of
+from scm_world.queries.twins import twins_of
 from scm_world.variables import Contact, Fixed, Reaches
 from scm_world.world import Simulation
 from scm_world.world.interventions import merged
@@ -66,7 +70,7 @@ class Laboratory:
         records: All experiments, in their order.
 
     Raises:
-        UnknownOption: A pattern matches nothing, or a question does not exist.
+        UnknownOption: A pattern matches nothing, or a question or a setting does not exist.
         Forbidden: An outcome is not visible.
 
     Example:
@@ -89,22 +93,25 @@ class Laboratory:
         outcomes: Iterable[Any] | None = None,
         **setting: Any,
     ) -> None:
-        self.allow = tuple(allow)
+        self._world, self._twins = world, twins_of(world)
+        self._setting = Setting.of(world, setting)
+        self._given: Plan = getattr(world, "plan", Plan())
+        self._steps = length(world, self._setting.steps)
+        self.allow = as_names(allow)
         for question in self.allow:
             one_of("question", question, QUESTIONS)
-        self._world, self._setting = world, Setting(**setting)
-        self._twins: Twins = twins_of(world)
-        self._given: Plan = getattr(world, "plan", Plan())
         model = world.model
         everything = tuple(n for n in model if not isinstance(model.declared(n), Fixed))
         can_be_set = tuple(n for n in model if model.declared(model.target(n)).settable)
         self.visible = _matching("visible", visible, everything)
         self.settable = _matching("settable", settable, can_be_set)
         self.budget = None if budget is None else whole_number("budget", budget, least=0)
-        wanted = self.visible if outcomes is None else tuple(outcomes)
-        found = (o if isinstance(o, Outcome) else Outcome(o) for o in wanted)
-        self.outcomes = tuple(dict.fromkeys(found))
+        wanted = as_outcomes(self.visible if outcomes is None else outcomes)
+        self.outcomes: tuple[Outcome, ...] = tuple(dict.fromkeys(wanted))
         for outcome in self.outcomes:
+            if not isinstance(outcome, Outcome):
+                allowed = ("the name of a variable", "Outcome(name, how)")
+                raise UnknownOption("outcome of a laboratory", outcome, allowed)
             if outcome.name not in self.visible:
                 raise Forbidden(f"see {outcome.name}", self.visible)
         self._lock = threading.Lock()
@@ -113,18 +120,14 @@ class Laboratory:
     def terms(self) -> dict[str, Any]:
         """Return what decides the results of an experiment, as plain data."""
         setting = self._setting
-        nature = Plan(setting.nature)
-        system = {**self._world.__fingerprint__(), "policy": setting.policy}
-        plans = {"given": list(self._given.acts()), "nature": list(nature.acts())}
+        plans = {"given": [*self._given.acts()], "nature": [*Plan(setting.nature).acts()]}
+        system = self._world.__fingerprint__() | {"policy": setting.policy, **plans}
         return {
             "task": self._world.task.name,
-            "fingerprint": fingerprint(system | plans),
+            "fingerprint": fingerprint(system),
             "options": self._twins.options,
-            "given": repr(self._given),
             "seed": setting.seed,
             "steps": setting.steps,
-            "policy": setting.policy if isinstance(setting.policy, str) else "given",
-            "nature": nature.as_dict()["do"],
             "outcomes": [outcome.model_dump() for outcome in self.outcomes],
         }
 
@@ -179,27 +182,24 @@ class Laboratory:
         Raises:
             Forbidden: As in ``do``, or the unit was never seen.
         """
+        unit, at = whole_number("unit", unit, least=0), whole_number("at", at, least=0)
         with self._lock:
             self._permit("counterfactual", request, 1)
-            units = {u: r.samples.plan for r in self._new() for u in r.samples.numbers}
+            if at >= self._steps:
+                raise UnknownOption("at", at, (f"a control step from 0 to {self._steps - 1}",))
+            units = self._units()
             if unit not in units:
                 there = f"units 0 to {len(units) - 1}" if units else "none yet: see or do first"
                 raise Forbidden(f"imagine unit {unit}, which was never seen", (there,))
-            names = tuple(dict.fromkeys(outcome.name for outcome in self.outcomes))
-            held = Samples({}, (unit,), self._setting.seed, Plan(request))
-            plan = self._with(units[unit])
+            plan, names = self._with(units[unit]), [outcome.name for outcome in self.outcomes]
             episode = self._setting.episode(self._twins, self._world, plan, unit, ())
-            try:
-                other = episode.counterfactual(request, at=at, record=names)
-            except Exception:
-                self.records.append(Experiment("refused counterfactual", held, at))
-                raise
-            found = {column(outcome): outcome.of(other) for outcome in self.outcomes}
-            held = replace(
-                held, columns={name: value[None].copy() for name, value in found.items()}
-            )
-            self.records.append(Experiment("counterfactual", held, at))
-        return found
+
+            def run() -> dict[str, Floats]:
+                other = episode.counterfactual(request, at=at, record=dict.fromkeys(names))
+                return {column(outcome): outcome.of(other)[None] for outcome in self.outcomes}
+
+            found = self._record("counterfactual", request, (unit,), run, at)
+        return {name: np.asarray(value[0]) for name, value in found.items()}
 
     def run(self, protocol: Iterable[Mapping[str, Any]]) -> tuple[Samples, ...]:
         """Run a protocol: a table of settings in, a data set out.
@@ -209,7 +209,7 @@ class Laboratory:
                 component) and, if wanted, ``n``; an empty cell leaves a variable alone.
 
         Raises:
-            UnknownOption: A cell is no number.
+            UnknownOption: A cell is not a number.
             Forbidden: As in ``do``, for the whole table, before anything is carried out.
         """
         rows = [
@@ -221,35 +221,42 @@ class Laboratory:
         self._afford(sum(n for *_, n in rows))
         return tuple(self._experiment(*row) for row in rows)
 
-    def _new(self) -> list[Experiment]:
-        """Return the experiments with episodes of their own, refused ones included."""
-        return [r for r in self.records if not r.kind.endswith("counterfactual")]
+    def _units(self) -> dict[int, Plan]:
+        """Return what was done in each new episode, refused ones included."""
+        new = (r.samples for r in self.records if not r.kind.endswith("counterfactual"))
+        return {unit: samples.plan for samples in new for unit in samples.numbers}
 
     def _with(self, request: Mapping[str, Any]) -> Plan:
         return Plan(merged(self._world.model, self._given, Plan(request)))
 
     def _experiment(self, kind: str, request: Mapping[str, Any], n: int) -> Samples:
-        count, plan = whole_number("n", n, least=1), Plan(request)
+        count = whole_number("n", n, least=1)
         with self._lock:
             self._permit(kind, request, count)
-            first = sum(record.episodes for record in self._new())
-            try:
-                found = sample(
-                    self._twins,
-                    self._world,
-                    self._with(request),
-                    count,
-                    outcomes=self.outcomes,
-                    setting=self._setting,
-                    first=first,
-                )
-            except Exception:
-                held = Samples({}, tuple(range(first, first + count)), self._setting.seed, plan)
-                self.records.append(Experiment(f"refused {kind}", held))
-                raise
-            found = replace(found, plan=plan)
-            self.records.append(Experiment(kind, found))
-            return found.copy()
+            first = len(self._units())
+            asked = self._twins, self._world, self._with(request), count, self.outcomes
+            numbers = tuple(range(first, first + count))
+            run = partial(sample, *asked, self._setting, first=first)
+            return self._record(kind, request, numbers, run)
+
+    def _record(
+        self,
+        kind: str,
+        request: Mapping[str, Any],
+        numbers: tuple[int, ...],
+        run: Callable[[], Mapping[str, Floats]],
+        at: int = 0,
+    ) -> Samples:
+        """Carry out an experiment, and keep a copy of its outcomes; one that fails is paid."""
+        held = Samples({}, numbers, self._setting.seed, Plan(request))
+        try:
+            found = dict(run())
+        except Exception:
+            self.records.append(Experiment(f"refused {kind}", held, at))
+            raise
+        copies = {name: values.copy() for name, values in found.items()}
+        self.records.append(Experiment(kind, replace(held, columns=copies), at))
+        return replace(held, columns=found)
 
     # --- permissions --------------------------------------------------------------------------
 
@@ -258,6 +265,7 @@ class Laboratory:
         if kind not in self.allow:
             raise Forbidden(kind, self.allow)
         plan = Plan(request)
+        refuse_late(plan, self._steps)
         for name in plan:
             if name not in self.settable:
                 raise Forbidden(f"set {name}", self.settable)
@@ -285,8 +293,8 @@ class Laboratory:
 
 
 def _matching(option: str, patterns: Iterable[str], names: Sequence[str]) -> tuple[str, ...]:
-    given = (patterns,) if isinstance(patterns, str) else tuple(patterns)
+    given = as_names(patterns)
     for pattern in given:
-        if not any(fnmatchcase(name, pattern) for name in names):
+        if not isinstance(pattern, str) or not any(fnmatchcase(name, pattern) for name in names):
             raise UnknownOption(option, pattern, names)
     return tuple(n for n in names if any(fnmatchcase(n, pattern) for pattern in given))

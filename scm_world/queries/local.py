@@ -7,7 +7,7 @@ that move, are an *island*; what stands still for good (floor, stage, obstacles)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, final
 from weakref import WeakKeyDictionary
 
@@ -53,7 +53,7 @@ def local_graph(world: Simulation, action: ArrayLike | None = None) -> nx.MultiD
 
 
 def contact_terms(world: Simulation) -> dict[str, Any]:
-    """Say between which bodies the edges hold that are declared ``when="contact"``.
+    """Return between which bodies the edges hold that are declared ``when="contact"``.
 
     A variable stands for the bodies of the states that it acts on in every step, or follows from;
     a parameter of a body or shape also for that body; one of which nothing is known for any.
@@ -62,18 +62,26 @@ def contact_terms(world: Simulation) -> dict[str, Any]:
         Plain data. ``"together"``: groups of bodies that are coupled in every step. ``"still"``:
         bodies that never move. ``"of"``: the bodies of each variable, one of each group.
     """
-    model, touched, shaped = world.model, world.composition.touched(), world.composition.shaped()
+    model, touched, shaped = (
+        world.model,
+        world.composition.touched(),
+        world.composition.shaped(),
+    )
     states = {v.name for v in model.variables if v.role == "state"}
-    after, before = dict[str, list[str]](), dict[str, list[str]]()
-    coupled = nx.Graph()
+    coupled, ahead, back = nx.Graph(), nx.DiGraph(), nx.DiGraph()  # until the next states
     coupled.add_nodes_from((name, "state") for name in states)
-    coupled.add_edges_from(((body, "body"), (n, "state")) for body, n in _pairs(touched))
+    coupled.add_edges_from(
+        ((body, "body"), (name, "state")) for body, moved in touched.items() for name in moved
+    )
+    for way in (ahead, back):
+        way.add_nodes_from(model)
     for edge in model.edges:
         if edge.when != "contact":
-            after.setdefault(edge.cause, []).append(edge.effect)
-            before.setdefault(edge.effect, []).append(edge.cause)
-            if edge.cause in states and edge.effect in states:
-                coupled.add_edge((edge.cause, "state"), (edge.effect, "state"))
+            ends = edge.cause, edge.effect
+            if states.issuperset(ends):
+                coupled.add_edge(*((name, "state") for name in ends))
+            ahead.add_edges_from([ends] if edge.cause not in states else [])
+            back.add_edges_from([ends[::-1]] if edge.effect not in states else [])
     together, groups = list[list[str]](), dict[str, list[str]]()  # by state: the first of them
     for part in nx.connected_components(coupled):
         bodies = sorted(name for name, kind in part if kind == "body")
@@ -82,43 +90,28 @@ def contact_terms(world: Simulation) -> dict[str, Any]:
     of = {}
     for name in model:
         found = {shaped[name]} if name in shaped else set()
-        for way in (after, before):
-            ahead, seen = [name], {name}
-            while ahead:
-                here = ahead.pop()
-                found.update(groups.get(here, ()))
-                new = set(way.get(here, ())) - seen if here not in states else set()
-                seen |= new
-                ahead += new
+        for other in {name} | nx.descendants(ahead, name) | nx.descendants(back, name):
+            found.update(groups.get(other, ()))
         of[name] = sorted(found)
     still = sorted(body for body, moved in touched.items() if not moved)
     return {"of": of, "together": sorted(together), "still": still}
 
 
-def _pairs(touched: Mapping[str, Iterable[str]]) -> Iterator[tuple[str, str]]:
-    return ((body, state) for body, moved in touched.items() for state in moved)
-
-
 def holds(
     terms: Mapping[str, Any], touching: Iterable[Iterable[str]]
 ) -> Callable[[str, str], bool]:
-    """Return what tells of cause and effect whether an edge by contact holds.
+    """Return a function of cause and effect: whether an edge by contact holds.
 
-    It does if a chain of contacts between bodies that move joins one of the cause to one of the
-    effect. A body that ``terms`` do not know joins all.
-
-    Args:
-        terms: Of ``contact_terms``.
-        touching: Pairs of bodies.
+    It does if a chain of contacts (pairs of bodies) between bodies that move joins one of the cause
+    to one of the effect. A body that the ``contact_terms`` do not know joins all.
     """
     still, together = set(terms["still"]), [set(group) for group in terms["together"]]
     group = {body: bodies for bodies in together for body in bodies}
     everything = set[str]().union(*together)
     islands: list[set[str]] = []
     for pair in touching:
-        members = set(pair).union(
-            *(group.get(body, everything) for body in pair if body not in still)
-        )
+        moving = (group.get(body, everything) for body in pair if body not in still)
+        members = set(pair).union(*moving)
         joined = [island for island in islands if island & members - still]
         islands = [island for island in islands if not island & members - still]
         islands.append(members.union(*joined))
@@ -136,10 +129,7 @@ def holds(
 
 @final
 class _Listener:
-    """Stands in for a backend: takes physics steps one by one, and notes what touches in each.
-
-    A backend lists the contacts of its last physics step only.
-    """
+    """Stands in for a backend, which lists the contacts of its last physics step only."""
 
     def __init__(self, backend: Any) -> None:
         self._backend = backend
@@ -149,30 +139,24 @@ class _Listener:
         return getattr(self._backend, name)
 
     def step(self, command: Floats, substeps: int) -> None:
-        """Hold a command for some physics steps."""
+        """Hold a command for some physics steps, and note what touches in each."""
         for _ in range(substeps):
             self._backend.step(command, 1)
             self.contacts.append(self._backend.contacts())
 
 
 def contacts_of(world: Simulation, action: ArrayLike) -> Touching:
-    """Take a control step, and return the contacts of each of its physics steps.
-
-    Raises:
-        ModelError: A backend does not list all contacts of a physics step of this model.
-    """
+    """Take a control step, and return the contacts of each of its physics steps."""
     if getattr(world.structure, "staged", False):
-        problem = (
-            "the contacts in each stage of RK4 are not known, so that any edge by contact may act; "
-            "read the model with settings={'integrator': 'implicitfast'} to know them"
-        )
-        raise ModelError([problem])
-    engine: Any = world.backend
-    listener: Any = _Listener(engine)
+        problem = "the contacts in each stage of RK4 are not known, so that any edge may act"
+        remedy = "read the model with settings={'integrator': 'implicitfast'} to know them"
+        raise ModelError([f"{problem}; {remedy}"])
+    backend: Any = world.backend
+    listener: Any = _Listener(backend)
     world.backend = listener
     try:
         world.step(action)
     finally:
-        world.backend = engine
+        world.backend = backend
     contacts: Touching = listener.contacts
     return contacts

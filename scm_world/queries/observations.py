@@ -20,7 +20,7 @@ class Observations(NamedTuple):
     """Observations of some units.
 
     Attributes:
-        values: By variable, shape (rows, steps, *shape); NaN where nothing was observed.
+        values: Every variable, shape (rows, steps, *shape); NaN where it was not observed.
         rows: How many units.
         steps: How many control steps; 1 without lagged edges.
         one: Whether a single unit was given, without an axis for rows.
@@ -33,22 +33,13 @@ class Observations(NamedTuple):
 
 
 def observations(model: SCM, observed: Any) -> Observations:
-    """Read observations.
+    """Read observations: values or labels by name, a data frame, or a ``Dataset``.
 
-    Args:
-        model: Whose variables were observed.
-        observed: Values or labels by name, a data frame, or a ``Dataset``. Names of components,
-            such as ``"v[2]"``, are put together. Rows of several control steps are put side by
-            side.
-
-    Raises:
-        UnknownVariable: The model has no variable of a name.
-        ModelError: Shapes do not fit together, a vector was observed in part, or something was
-            done in a row.
-        ImpossibleObservation: A value is infinite, or neither number nor label.
+    Names of components, such as ``"v[2]"``, are put together. Rows of several control steps are put
+    side by side. What is drawn once per episode is known once it is seen.
     """
     temporal, columns = model.is_temporal, _columns(model, observed)
-    leads, found = set[tuple[int, ...]](), dict[str, Value]()
+    leads = set[tuple[int, ...]]()
     for name, values in columns.items():
         shape = model.declared(name).shape
         lead = values.shape[: values.ndim - len(shape)]
@@ -57,8 +48,6 @@ def observations(model: SCM, observed: Any) -> Observations:
             said = f"{name!r} was observed with shape {values.shape}: give {allowed}"
             raise ModelError([said + f" and then {shape}" * bool(shape)])
         leads.add(lead)
-        rows = lead[0] if len(lead) > temporal else 1
-        found[name] = values.reshape(rows, lead[-1] if temporal else 1, *shape)
         unknown = np.isnan(values.reshape(*lead, int(np.prod(shape))))
         if np.isinf(values).any():
             said = "an observation is finite, or NaN where there is none"
@@ -68,23 +57,39 @@ def observations(model: SCM, observed: Any) -> Observations:
     if len(leads) != 1 or 0 in next(iter(leads)):
         said = "observe at least one variable, and all of the same rows and control steps"
         raise ModelError([said])
-    rows, steps = next(iter(found.values())).shape[:2]
-    return Observations(found, rows, steps, len(leads.pop()) == temporal)
+    lead = leads.pop()
+    rows, steps = lead[0] if len(lead) > temporal else 1, lead[-1] if temporal else 1
+    found: dict[str, Value] = {}
+    for variable in model.variables:
+        values = columns.get(variable.name, np.array(np.nan))
+        whole = (rows, steps, *variable.shape)
+        values = values.reshape(whole) if values.ndim else np.full(whole, values)
+        if per(variable) == "episode":
+            first = np.isfinite(values).argmax(axis=1)[:, None]
+            values = np.where(np.isnan(values), np.take_along_axis(values, first, axis=1), values)
+        found[variable.name] = values
+    return Observations(found, rows, steps, len(lead) == temporal)
+
+
+def per(variable: Any) -> str:
+    """Return whether a variable is drawn once for an ``"episode"`` or in every ``"step"``."""
+    return getattr(variable, "per", "step")
 
 
 def _columns(model: SCM, observed: Any) -> dict[str, Value]:
     """Return numbers by variable, shape (..., *shape), with an axis for rows if there are many."""
     if hasattr(observed, "regimes"):  # a Dataset
-        given = dict(zip(observed.names, observed.values.T, strict=True))
+        given: dict[str, Any] = dict(zip(observed.names, observed.values.T, strict=True))
         given |= {"episode": observed.episode, "step": observed.step}
         given["intervention_targets"] = np.array([bool(names) for names in observed.targets])
     elif isinstance(observed, Mapping) or hasattr(observed, "columns"):
         names = observed if isinstance(observed, Mapping) else observed.columns
-        given = {str(name): np.asarray(observed[name]) for name in names}
+        given = {str(name): observed[name] for name in names}
     else:
         allowed = ("values by name", "a table by name", "a data frame", "a Dataset")
         raise UnknownOption("observed", observed, allowed)
-    about = {name: given.pop(name) for name in RECORDED if name in given and name not in model}
+    own = [name for name in RECORDED if name in given and name not in model]
+    about = {name: np.asarray(given.pop(name)) for name in own}
     if any(target is not None and target is not np.False_ for target in about.get(RECORDED[3], ())):
         advice = "take its rows without (table.observational), or ask model.do({…}) of the others"
         raise ModelError([f"the table has rows in which something was done: {advice}"])
@@ -109,19 +114,18 @@ def _columns(model: SCM, observed: Any) -> dict[str, Value]:
     return columns
 
 
-def _numbers(model: SCM, name: str, values: Value) -> Value:
-    """Read numbers or labels of a variable; None is NaN.
-
-    Raises:
-        ImpossibleObservation: Something is neither.
-    """
-    bounds = model.declared(name).bounds
-    known = {}
+def _numbers(model: SCM, name: str, observed: Any) -> Value:
+    """Return numbers for numbers or labels of a variable; None is NaN."""
+    bounds, known = model.declared(name).bounds, dict[Any, int]()
     if isinstance(bounds, Categories) and bounds.labels:
         known = dict(zip(bounds.labels, bounds.members, strict=True))
-    if values.dtype.kind in "OUS":
-        values = np.array([known.get(v, v) for v in values.ravel().tolist()]).reshape(values.shape)
     try:
+        values = np.asarray(observed)
+        if values.dtype.kind in "OUS":
+            listed = [known.get(v, v) for v in values.ravel().tolist()]
+            values = np.array(listed).reshape(values.shape)
+        if values.dtype.kind == "c":
+            raise TypeError("these are complex")
         return values.astype(float)
     except (TypeError, ValueError) as error:
         allowed = f", and labels are {', '.join(known)}" if known else ""

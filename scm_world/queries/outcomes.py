@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Literal, final
 
 import numpy as np
@@ -14,11 +15,9 @@ from scm_world.queries.equations import Equations, System
 from scm_world.tasks.rewards import FRACTION
 from scm_world.variables.spaces import Frozen
 
-MANY = 10  # numbers, of which an error shows the first wrong one
 ORDERLESS = ("final", "first", "path")
 """The summaries that categories have."""
 HOWS = ("final", "mean", "max", "min", "sum", "first", "change", "path")
-Given = "str | Outcome | Callable[[Episode], Any]"
 
 
 @final
@@ -51,14 +50,7 @@ class Outcome(Frozen):
         return np.asarray(self.of_many(np.asarray(episode[self.name])[None])[0])
 
     def of_many(self, values: Value) -> Floats:
-        """Read it off the values of the variable in several episodes.
-
-        Args:
-            values: Shape (n, instants, *shape).
-
-        Returns:
-            Shape (n, ...).
-        """
+        """Read it off the values in n episodes, shape (n, instants, *shape); shape (n, ...)."""
         values = np.asarray(values, dtype=np.float64)
         n, instants = values.shape[:2]
         if self.component is not None:
@@ -87,35 +79,33 @@ class Outcome(Frozen):
 
 
 def as_outcome(given: Any) -> Any:
-    """Turn the name of a variable into its final value.
-
-    Raises:
-        UnknownOption: It is neither a name, nor an ``Outcome``, nor a function.
-    """
+    """Turn the name of a variable into its final value; refuse what is not an outcome."""
     if isinstance(given, str):
         return Outcome(given)
     if isinstance(given, Outcome) or callable(given):
         return given
-    raise UnknownOption(
-        "outcome",
-        given,
-        ("the name of a variable", "Outcome(name, how)", "a function of the episode"),
-    )
+    allowed = ("the name of a variable", "Outcome(name, how)", "a function of the episode")
+    raise UnknownOption("outcome", given, allowed)
 
 
-def is_category(world: Any, name: str) -> bool:
-    """Return whether a variable of a system has categories, whose numbers have no order or mean."""
-    return name in world.model and world.model.declared(name).dtype == "categorical"
+def as_outcomes(given: Any) -> list[Any]:
+    """Return outcomes, each as ``as_outcome`` does; a single one counts as a list of one."""
+    alone = not isinstance(given, Iterable) or isinstance(given, str | Outcome)
+    return [as_outcome(outcome) for outcome in ((given,) if alone else given)]
+
+
+def is_category(system: System, outcome: Any) -> bool:
+    """Return whether an outcome has categories, whose numbers have no order or mean."""
+    if not isinstance(outcome, Outcome) or outcome.name not in system.model:
+        return False
+    return system.model.declared(outcome.name).dtype == "categorical"
 
 
 def usual_outcomes(world: System) -> tuple[str, ...]:
-    """Name what is read off episodes if nothing else is asked for.
+    """Return the names of what is read off episodes if nothing else is asked for.
 
     That is the fractional success of the robot's tasks, and of any other world everything that
     is computed from its states: readouts, outcomes, reward and success; of equations everything.
-
-    Raises:
-        UnknownOption: Nothing is computed from the states.
     """
     if isinstance(world, Equations):
         return tuple(name for name in world.model if name not in world.compiled.actions)
@@ -130,12 +120,7 @@ def usual_outcomes(world: System) -> tuple[str, ...]:
 
 
 def read(outcome: Any, episode: Episode) -> Floats:
-    """Read an outcome off an episode, as numbers.
-
-    Raises:
-        UnknownOption: It is no finite numbers.
-        FunctionFailure: A function raised an error.
-    """
+    """Read an outcome off an episode, as finite numbers."""
     if isinstance(outcome, Outcome):
         return as_numbers(outcome.of(episode), outcome)
     with blamed(f"the outcome {label(outcome)!r}"):
@@ -144,19 +129,13 @@ def read(outcome: Any, episode: Episode) -> Floats:
 
 
 def as_numbers(value: Any, outcome: Any) -> Floats:
-    """Check the value of an outcome.
-
-    Raises:
-        UnknownOption: It is no finite numbers.
-    """
+    """Return the value of an outcome as finite numbers; refuse others, and name the first one."""
     try:
         number = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         number = np.asarray(np.nan)
     if not np.isfinite(number).all():
-        wrong = (
-            value if np.size(value) < MANY else np.ravel(number)[~np.isfinite(np.ravel(number))][0]
-        )
+        wrong = value if np.size(value) < 10 else number[~np.isfinite(number)][0]
         raise UnknownOption(f"value of the outcome {label(outcome)!r}", wrong, ("finite numbers",))
     return number
 

@@ -224,6 +224,15 @@ def _several(value: Any) -> tuple[Any, ...]:
     return (as_act(value),)
 
 
+def has_times(request: Any) -> bool:
+    """Return whether anything in a request has a time, or is plain data that may have one."""
+    if isinstance(request, Mapping):
+        return "kind" in request or any(map(has_times, request.values()))
+    if isinstance(request, list | tuple):
+        return len(request) > 0 and isinstance(request[0], ACTS) and any(map(has_times, request))
+    return isinstance(request, ACTS) and request.time is not None
+
+
 def do(request: Mapping[str, Any]) -> Plan:
     """Return the plan that does this; see ``Plan``.
 
@@ -369,6 +378,9 @@ class Schedule:
                 held: Intervention = at_once(act)
                 return held
         return Natural()
+
+
+UNPLANNED = Schedule()
 
 
 @final

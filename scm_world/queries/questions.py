@@ -12,7 +12,6 @@ from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import UnknownOption
 from scm_world.graph import scm as graph
-from scm_world.queries import samples
 from scm_world.queries.abduction import Counterfactuals, counterfactuals
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import Equations, System
@@ -22,7 +21,7 @@ from scm_world.queries.outcomes import Outcome, as_outcome, is_category, usual_o
 from scm_world.queries.plans import Plan, Schedule, numbered
 from scm_world.queries.progress import Progress, part
 from scm_world.queries.rollouts import Unit, as_names, length
-from scm_world.queries.samples import Samples, Setting
+from scm_world.queries.samples import Samples, Setting, sample
 from scm_world.queries.twins import AnyTwins, EquationTwins
 from scm_world.variables import Variable
 
@@ -41,13 +40,9 @@ class Questions(ABC):
         """Add something to what is given in every episode."""
 
     def _averaged(self, outcome: Any) -> System:
-        """Return a system that knows what is declared; refuse an outcome without a mean.
-
-        Raises:
-            UnknownOption: The outcome is a category.
-        """
+        """Return a system that knows what is declared; refuse an outcome without a mean."""
         system, wanted = self._asked()[1], as_outcome(outcome)
-        if isinstance(wanted, Outcome) and is_category(system, wanted.name):
+        if is_category(system, wanted):
             event = f"lambda episode: episode.final({wanted.name!r}) == …"
             allowed = ("a number", f"a function whose mean is a probability, as {event}")
             raise UnknownOption("outcome of an effect", outcome, allowed)
@@ -69,7 +64,7 @@ class Questions(ABC):
             policy: A function of the world that gives an action, shape (n_actions,); actions of
                 shape (n_actions,) or (steps, n_actions); ``"random"``; or None: the idle
                 action. See ``as_policy`` for others that have a name.
-            seed: Of the noise.
+            seed: Seed of the noise.
             episode: Number of the episode within that noise.
             do: Interventions, with or without a time.
             steps: How many control steps; as many as the task has if None.
@@ -79,16 +74,10 @@ class Questions(ABC):
             InterventionError: An intervention was refused.
             ActionError: The policy is none, or gave no action.
         """
-        twins, plan = self._asked()[0], self._with(do)
+        twins, schedule = self._asked()[0], Schedule([(0, self._with(do))])
         with twins.twin() as world:
-            unit = Unit(
-                seed=seed,
-                number=episode,
-                schedule=Schedule([(0, plan)]),
-                policy=policy,
-                steps=length(world, steps),
-                names=as_names(record),
-            )
+            names = as_names(record)
+            unit = Unit(seed, episode, schedule, policy, length(world, steps), names)
             return Episode(twins, unit, unit.run(world))
 
     def live(
@@ -101,30 +90,17 @@ class Questions(ABC):
     ) -> LiveEpisode:
         """Begin an episode that is run by hand: ``step``, ``do``, ``split``, ``episode``.
 
-        Args:
-            policy: Acts where ``step`` is given no action; see ``rollout``.
-            seed: Of the noise.
-            episode: Number of the episode within that noise.
-            do: Interventions, with or without a time.
-
-        Raises:
-            InterventionError: An intervention was refused.
+        Arguments and errors are those of ``rollout``; the policy acts where ``step`` is given no
+        action.
         """
-        plan = self._with(do)
-        made = LiveEpisode(self._asked()[0], Unit(seed, episode, Schedule([(0, plan)]), policy, 1))
+        schedule = Schedule([(0, self._with(do))])
+        made = LiveEpisode(self._asked()[0], Unit(seed, episode, schedule, policy, 1))
         made.begin()
         return made
 
-    def see(
-        self,
-        n: int,
-        *,
-        outcomes: Iterable[Any] | None = None,
-        progress: Progress | None = None,
-        **setting: Any,
-    ) -> Samples:
-        """Sample observational episodes; see ``sample``."""
-        return self.sample(n, outcomes=outcomes, progress=progress, **setting)
+    def see(self, n: int, **options: Any) -> Samples:
+        """Sample observational episodes; the options are those of ``sample``."""
+        return self.sample(n, **options)
 
     def sample(
         self,
@@ -150,18 +126,33 @@ class Questions(ABC):
 
         Raises:
             InterventionError: An intervention was refused.
+            UnknownOption: An outcome is none, an intervention would begin when the episode has
+                ended, or there is no such setting.
         """
         twins, system = self._asked()
-        return samples.sample(
-            twins,
-            system,
-            self._with(do),
-            n,
-            outcomes=usual_outcomes(system) if outcomes is None else outcomes,
-            setting=Setting.of(system, setting),
-            first=first,
-            progress=progress,
-        )
+        made, plan = Setting.of(system, setting), self._with(do)
+        wanted = usual_outcomes(system) if outcomes is None else outcomes
+        return sample(twins, system, plan, n, wanted, made, first=first, progress=progress)
+
+    def _arms(
+        self,
+        outcomes: tuple[Any, ...],
+        plans: Sequence[Mapping[str, Any] | None],
+        n: int,
+        progress: Progress | None,
+        setting: Mapping[str, Any],
+        *,
+        paired: bool = True,
+    ) -> list[Samples]:
+        """Sample under one intervention after another, in the same units if they are paired."""
+        (twins, system), total = self._asked(), n * len(plans)
+        made = Setting.of(system, setting)
+        arms = []
+        for before, plan in zip(range(0, total, n), map(self._with, plans), strict=True):
+            first, share = 0 if paired else before, part(progress, before, total)
+            given = twins, system, plan, n, outcomes, made
+            arms.append(sample(*given, first=first, progress=share))
+        return arms
 
     def effect(
         self,
@@ -194,14 +185,8 @@ class Questions(ABC):
                 one, with a function.
         """
         system, count = self._averaged(outcome), whole_number("n", n, least=2)
-        treated, control = (
-            self.sample(count, plan, outcomes=(outcome,), first=first, progress=share, **setting)
-            for plan, first, share in (
-                (do, 0, part(progress, 0, 2 * count)),
-                (versus, 0 if paired else count, part(progress, count, 2 * count)),
-            )
-        )
-        return effect_of(system, outcome, treated, control, paired=paired)
+        arms = self._arms((outcome,), (do, versus), count, progress, setting, paired=paired)
+        return effect_of(system, outcome, *arms, paired=paired)
 
     def direct_effect(
         self,
@@ -216,20 +201,10 @@ class Questions(ABC):
     ) -> Effect:
         """Estimate the part of an effect that does not go through mediators.
 
-        The *controlled* direct effect holds them at given values in both arms. The *natural* one
-        lets each unit keep, under ``do``, the values that its mediators have under ``versus``.
-
-        Args:
-            outcome: As in ``effect``.
-            do: What is done.
-            versus: The intervention it is compared with; none if None.
-            mediators: Values by name for the controlled effect; names for the natural one.
-            n: How many units.
-            progress: Called after each episode.
-            setting: See ``sample``.
-
-        Returns:
-            The effect, paired.
+        The *controlled* direct effect holds ``mediators``, values by name, in both arms. The
+        *natural* one, of names alone, lets each unit keep, under ``do``, the values that its
+        mediators have under ``versus``. Both are paired. The other arguments are those of
+        ``effect``.
 
         Raises:
             UnknownOption: The natural effect is asked of what has several instants, where a
@@ -239,29 +214,19 @@ class Questions(ABC):
             Pearl, *Direct and indirect effects*, UAI 2001, definitions 1 and 3.
         """
         if isinstance(mediators, Mapping):
-            arms = ({**Plan(given), **mediators} for given in (do, versus))
-            both: dict[str, Any] = {**setting, "n": n, "progress": progress}
-            return self.effect(outcome, do=next(arms), versus=next(arms), **both)
-        self._averaged(outcome)
-        names, (twins, system) = as_names(mediators), self._asked()
+            held, other = ({**Plan(given), **mediators} for given in (do, versus))
+            return self.effect(outcome, do=held, versus=other, n=n, progress=progress, **setting)
+        system, names, twins = self._averaged(outcome), as_names(mediators), self._asked()[0]
         if not isinstance(system, Equations) or system.model.is_temporal:
             allowed = ("values of mediators by name, such as {'m': 1.0}: the controlled effect",)
             raise UnknownOption("mediators of several instants", names, allowed)
-        count = whole_number("n", n, least=2)
-        outcomes = (outcome, *(Outcome(name) for name in names))
-        share = part(progress, 0, 2 * count)
-        control = self.sample(count, versus, outcomes=outcomes, progress=share, **setting)
-        kept = [values for _, values in zip(range(len(names) + 1), control.values(), strict=True)]
-        treated = samples.sample(
-            twins,
-            system,
-            self._with(do),
-            count,
-            outcomes=(outcome,),
-            setting=Setting.of(system, setting),
-            each=[dict(zip(names, row, strict=True)) for row in zip(*kept[1:], strict=True)],
-            progress=part(progress, count, 2 * count),
-        )
+        count, made = whole_number("n", n, least=2), Setting.of(system, setting)
+        asked = twins, system, self._with(versus), count, (outcome, *map(Outcome, names)), made
+        control = sample(*asked, progress=part(progress, 0, 2 * count))
+        _, *kept = control.values()
+        each = [dict(zip(names, row, strict=True)) for row in zip(*kept, strict=True)]
+        asked = twins, system, self._with(do), count, (outcome,), made
+        treated = sample(*asked, each=each, progress=part(progress, count, 2 * count))
         return effect_of(system, outcome, treated, control)
 
     def effect_over(
@@ -276,29 +241,16 @@ class Questions(ABC):
     ) -> tuple[Effect, ...]:
         """Estimate the paired effects of values of a variable, each against the first one.
 
-        Args:
-            outcome: As in ``effect``.
-            name: Of the variable.
-            values: Two or more.
-            n: How many units.
-            progress: Called after each episode.
-            setting: See ``sample``.
+        ``values`` are two or more values of the variable ``name``; the other arguments are those of
+        ``effect``.
         """
         if not isinstance(name, str):
             raise UnknownOption("name", name, ("the name of a variable",))
         if not isinstance(values, Sequence | np.ndarray) or len(values) < 2:
             raise UnknownOption("values", values, ("two or more values of the variable",))
         system, count = self._averaged(outcome), whole_number("n", n, least=2)
-        control, *others = (
-            self.sample(
-                count,
-                {name: value},
-                outcomes=(outcome,),
-                progress=part(progress, index * count, len(values) * count),
-                **setting,
-            )
-            for index, value in enumerate(values)
-        )
+        plans = [{name: value} for value in values]
+        control, *others = self._arms((outcome,), plans, count, progress, setting)
         return tuple(effect_of(system, outcome, one, control) for one in others)
 
     def effect_by(
@@ -315,44 +267,30 @@ class Questions(ABC):
     ) -> tuple[tuple[tuple[float, float], Effect], ...]:
         """Estimate paired effects among units that differ in a covariate.
 
-        Args:
-            outcome: As in ``effect``.
-            do: What is done.
-            versus: The intervention it is compared with; none if None.
-            by: The covariate: like an outcome, one number; read off the world of ``versus``.
-            bins: Into how many groups of equal size the units are sorted. Units with one value are
-                in one group: of a covariate with no more values than that, each has its own.
-            n: How many units, over all groups.
-            progress: Called after each episode.
-            setting: See ``sample``.
+        The covariate ``by`` is, like an outcome, one number; it is read off the world of
+        ``versus``. The ``n`` units are sorted into ``bins`` groups of equal size. Units with one
+        value are in one group: of a covariate with no more values than that, each has its own. The
+        other arguments are those of ``effect``.
 
         Returns:
             For each group the ends of the covariate, and the effect.
         """
         system, covariate = self._averaged(outcome), as_outcome(by)
         count = whole_number("n", n, least=2 * whole_number("bins", bins, least=1))
-        treated, control = (
-            self.sample(count, plan, outcomes=(outcome, by), progress=share, **setting)
-            for plan, share in (
-                (do, part(progress, 0, 2 * count)),
-                (versus, part(progress, count, 2 * count)),
-            )
-        )
+        treated, control = self._arms((outcome, by), (do, versus), count, progress, setting)
         _, place = control.values()
         if place.ndim != 1:
             allowed = ("one number for each unit, such as Outcome(name, 'first', 0)",)
             raise UnknownOption("by", by, allowed)
         kinds = len(np.unique(place))
-        category = isinstance(covariate, Outcome) and is_category(system, covariate.name)
-        if category and kinds > bins:
+        if is_category(system, covariate) and kinds > bins:
             raise UnknownOption("bins", bins, (f"{kinds} or more: categories have no order",))
-        groups = _alike(place, bins)
         return tuple(
             (
                 (float(place[group].min()), float(place[group].max())),
                 effect_of(system, outcome, treated, control, rows=group),
             )
-            for group in groups
+            for group in _alike(place, bins)
         )
 
 
@@ -473,7 +411,7 @@ class SCM(Questions, graph.SCM):
                 "a replay of a simulated unit, rollout(seed=…).counterfactual({…})",
             )
             raise UnknownOption("do", do, allowed)
-        return counterfactuals(self, observed, do, n=n, seed=seed, tolerance=tolerance)
+        return counterfactuals(self, observed, do, n, seed, tolerance)
 
     def given(self, do: Mapping[str, Any]) -> Self:
         """Give the model in which this is done too: the same as ``do``."""

@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import real_numbers, whole_number
-from scm_world._types import Floats, Integers, Value
+from scm_world._types import Floats, Value
 from scm_world.backends.base import ContactPoint
 from scm_world.errors import ActionError, UnknownOption, blamed
 from scm_world.policies.scripted import Policy, as_policy
@@ -17,7 +17,8 @@ from scm_world.queries.equations import Equations, System
 from scm_world.queries.local import contacts_of
 from scm_world.queries.plans import GroupedSchedules, Key, Schedule
 from scm_world.world import Audit, Simulation
-from scm_world.world.batch import Batch, StateTable
+from scm_world.world.batch import Batch
+from scm_world.world.mechanisms import Mechanisms, Rows
 
 EVERY = 10
 """Control steps from one snapshot to the next."""
@@ -238,7 +239,7 @@ class Running:
         world, trace = self.world, self.trace
         if world.version != self._version:
             self._version = world.version
-            now = world.current()[0] if isinstance(world, Simulation) else {}
+            now = world.row if isinstance(world, Simulation) else {}
             values = {name: np.array(now[name]) for name in world.static_names}
             trace.statics.append((step, values))
             if not trace.declarations or trace.declarations[-1][1].plan != world.compiled.plan:
@@ -289,7 +290,7 @@ class RunningTogether:
         n_actions = self._rows[0].world.compiled.n_actions
         self._commands = np.zeros((self._steps, len(batch), n_actions))
         self._numbers: list[list[Floats]] = [[] for _ in units]  # of rows, not in the trace yet
-        self._tables: dict[int, StateTable] = {}  # of the rows that have such numbers
+        self._mechanisms: dict[int, Mechanisms] = {}  # of the rows that have such numbers
 
     def begin(self) -> None:
         """Bring every world to the first instant."""
@@ -308,9 +309,8 @@ class RunningTogether:
         """Record an instant of those rows that have not been recorded by themselves."""
         rows = np.flatnonzero(self._pending)
         for table, members in self._batch.tables(rows) if len(rows) else ():
-            numbers = table.matrix[members[:, None], _columns(table, self._names)]
-            for row, mine in zip(members.tolist(), numbers, strict=True):
-                self._tables[row] = table
+            for row, mine in zip(members.tolist(), table.numbers[members], strict=True):
+                self._mechanisms[row] = table.mechanisms
                 self._numbers[row].append(mine)
 
     def act(self, step: int) -> None:
@@ -350,23 +350,9 @@ class RunningTogether:
         """Move the numbers of a row into its trace."""
         if not self._numbers[row]:
             return
-        table, trace = self._tables[row], self._rows[row].trace
-        numbers, self._numbers[row] = np.array(self._numbers[row]), []
-        width = table.state_size
-        trace.vectors.extend(numbers[:, :width].copy())
+        mechanisms, trace = self._mechanisms[row], self._rows[row].trace
+        rows, self._numbers[row] = Rows(mechanisms, np.array(self._numbers[row])), []
+        trace.vectors.extend(rows.numbers[:, : mechanisms.state_size].copy())
         for name in self._names:
-            if name in table.compiled.model:
-                shape = table.compiled.model.declared(name).shape
-                size = table.where[name].stop - table.where[name].start
-                found = numbers[:, width : width + size].reshape(-1, *shape)
-                width += size
-                values = trace.values[name]
-                cast = found.astype(values[-1].dtype)  # recorded by the world itself
-                values.extend(cast if np.array_equal(cast, found, equal_nan=True) else found)
-
-
-def _columns(table: StateTable, names: Sequence[str]) -> Integers:
-    """Return the columns of a table that are recorded: the state, and variables by name."""
-    places = [table.where[name] for name in names if name in table.compiled.model]
-    found: Integers = np.r_[slice(0, table.state_size), *places]
-    return found
+            if name in rows:
+                trace.values[name].extend(np.array(rows[name]))

@@ -20,7 +20,7 @@ from scm_world.queries.outcomes import (
     ORDERLESS,
     Outcome,
     as_numbers,
-    as_outcome,
+    as_outcomes,
     column,
     is_category,
     read,
@@ -63,11 +63,7 @@ class Setting:
 
     @classmethod
     def of(cls, system: System, given: Mapping[str, Any]) -> Setting:
-        """Complete what is given: a world acts at random by default, equations with zeros.
-
-        Raises:
-            UnknownOption: The number of steps is none, or there is no such setting.
-        """
+        """Complete and check a setting: a world acts at random by default, equations with zeros."""
         for name in given:
             one_of("setting", name, [field.name for field in fields(cls)])
         defaults: dict[str, Any] = {}
@@ -75,55 +71,27 @@ class Setting:
             defaults = {"steps": STEPS if system.model.is_temporal else 0, "policy": None}
         found = cls(**{**defaults, **given})
         length(system, found.steps)
+        if found.workers is not None:
+            whole_number("workers", found.workers, least=1)
         return found
 
-    def plan(self, world: System, do: Mapping[str, Any] | None) -> Plan:
-        """Combine the intervention on a unit with the context that varies by itself.
-
-        Args:
-            world: Knows which names are coordinates of one quantity.
-            do: What is done.
-        """
+    def unit(
+        self, world: System, do: Mapping[str, Any] | None, number: int, names: Iterable[str] = ()
+    ) -> Unit:
+        """Return an episode to run, with an intervention and what varies by itself."""
         nature, acts = Plan(self.nature), Plan(do)
         for name in acts:
             if name in nature and name not in acts.at_start():
                 acts = acts.do({name: (*nature[name], *acts[name])})  # until then nature counts
-        return Plan(merged(world.model, nature, acts))
-
-    def unit(self, world: System, plan: Plan, number: int, names: Iterable[str] = ()) -> Unit:
-        """Return the unit of an episode.
-
-        Args:
-            world: Knows how long an episode is.
-            plan: As ``plan`` gave it.
-            number: Which unit.
-            names: Variables to write down.
-
-        Raises:
-            UnknownOption: The number of steps is none.
-        """
-        return Unit(
-            seed=self.seed,
-            number=number,
-            schedule=Schedule([(0, plan)]),
-            policy=self.policy,
-            steps=length(world, self.steps),
-            names=as_names(names),
-        )
+        schedule = Schedule([(0, Plan(merged(world.model, nature, acts)))])
+        steps = length(world, self.steps)
+        return Unit(self.seed, number, schedule, self.policy, steps, as_names(names))
 
     def episode(
         self, twins: AnyTwins, world: System, do: Mapping[str, Any] | None, number: int, names: Any
     ) -> Episode:
-        """Run one unit.
-
-        Args:
-            twins: Of the world.
-            world: Knows which names are coordinates of one quantity.
-            do: What is done to it.
-            number: Which unit.
-            names: Variables to write down.
-        """
-        unit = self.unit(world, self.plan(world, do), number, names)
+        """Run the episode of ``unit``."""
+        unit = self.unit(world, do, number, names)
         with twins.twin() as twin:
             return Episode(twins, unit, unit.run(twin))
 
@@ -131,12 +99,12 @@ class Setting:
 @final
 @dataclass(frozen=True)
 class Samples(Mapping[str, Floats]):
-    """What was seen in some episodes, one row for each.
+    """Outcomes of some episodes, one row for each.
 
     Attributes:
         columns: Values by outcome, shape (n, ...).
-        numbers: Which episodes.
-        seed: Of the noise.
+        numbers: Numbers of the episodes.
+        seed: Seed of the noise.
         plan: What was done in each.
     """
 
@@ -153,11 +121,6 @@ class Samples(Mapping[str, Floats]):
 
     def __len__(self) -> int:
         return len(self.columns)
-
-    def copy(self) -> Samples:
-        """Copy the numbers."""
-        columns = {name: values.copy() for name, values in self.columns.items()}
-        return Samples(columns, self.numbers, self.seed, self.plan)
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -191,67 +154,56 @@ class Samples(Mapping[str, Floats]):
         beside.write_text(json.dumps(about, indent=1) + "\n")
 
 
+def refuse_late(plan: Plan, steps: int) -> None:
+    """Refuse an intervention that would begin when the episode has ended."""
+    for name, act in plan.timed():
+        if (act.time.start or 0) >= max(steps, 1):
+            allowed = (f"a control step before {steps}, where episodes end",)
+            raise UnknownOption(f"time of an intervention on {name}", act, allowed)
+
+
 def sample(
     twins: AnyTwins,
-    world: System,
+    system: System,
     do: Mapping[str, Any] | None,
     n: int,
-    *,
     outcomes: Iterable[Any],
     setting: Setting,
+    *,
     first: int = 0,
     each: Sequence[Mapping[str, Any]] = (),
     progress: Progress | None = None,
 ) -> Samples:
-    """Run episodes under an intervention, and read outcomes off them.
+    """Run episodes on twins of a system, and read outcomes off them; see ``Questions.sample``.
 
-    Args:
-        twins: Of the world.
-        world: Is not touched.
-        do: What is done in all of them; None to see only.
-        n: How many.
-        outcomes: What to read off: names of variables, ``Outcome`` or functions of the episode.
-        setting: The circumstances.
-        first: Number of the first episode.
-        each: What is done in each of them besides.
-        progress: Called after each episode.
-
-    Raises:
-        UnknownOption: An intervention would begin when the episode has ended, or an outcome
-            averages categories.
+    Each episode may have further interventions of its own (``each``).
     """
-    count = whole_number("n", n, least=1)
-    alone = not isinstance(outcomes, Iterable) or isinstance(outcomes, str | Outcome)
-    given = (outcomes,) if alone else outcomes
-    wanted = [as_outcome(outcome) for outcome in given]
+    count, first = whole_number("n", n, least=1), whole_number("first", first, least=0)
+    wanted = as_outcomes(outcomes)
     for one in wanted:
-        if isinstance(one, Outcome) and one.how not in ORDERLESS and is_category(world, one.name):
+        if is_category(system, one) and one.how not in ORDERLESS:
             raise UnknownOption(f"summary of the categories of {one.name!r}", one.how, ORDERLESS)
     names = tuple(dict.fromkeys(one.name for one in wanted if isinstance(one, Outcome)))
-    done = 0
+    unit = setting.unit(system, do, first, names)
+    refuse_late(Plan(do), unit.steps)
+    units = [replace(unit, number=number) for number in range(first, first + count)]
+    if each:
+        schedule: Any = unit.schedule
+        own = [Schedule([(0, schedule.layers[0][1].do(more))]) for more in each]
+        units = [replace(one, schedule=its) for one, its in zip(units, own, strict=True)]
+    told = 0
 
     def finish(place: int, result: Result) -> list[Floats]:
-        nonlocal done
+        nonlocal told
         if isinstance(result, Exception):
             raise result
         episode = Episode(twins, units[place], result)
-        found = [read(outcome, episode) for outcome in wanted]
-        done += 1
+        row = [read(outcome, episode) for outcome in wanted]
+        told += 1
         if progress is not None:
-            progress(done, count)
-        return found
+            progress(told, count)
+        return row
 
-    first = whole_number("first", first, least=0)
-    numbers, plan = range(first, first + count), setting.plan(world, do)
-    unit = setting.unit(world, plan, first, names)
-    for name, act in Plan(do).timed():
-        if (act.time.start or 0) >= max(unit.steps, 1):
-            allowed = (f"a control step before {unit.steps}, where episodes end",)
-            raise UnknownOption(f"time of an intervention on {name}", act, allowed)
-    units = [replace(unit, number=number) for number in numbers]
-    if each:
-        several = [Schedule([(0, plan.do(more))]) for more in each]
-        units = [replace(one, schedule=own) for one, own in zip(units, several, strict=True)]
     if isinstance(twins, EquationTwins) and all(isinstance(one, Outcome) for one in wanted):
         vectors = paths(twins, units)
         read_off = (one.of_many(twins.layout.read(one.name, vectors)) for one in wanted)
@@ -267,14 +219,10 @@ def sample(
             raise UnknownOption("value of an outcome", "of several shapes", allowed) from None
     columns: dict[str, Floats] = {}
     for outcome, values in zip(wanted, found, strict=True):
-        columns[_column(outcome, columns)] = values
-    return Samples(columns, tuple(numbers), setting.seed, Plan(do))
-
-
-def _column(outcome: Any, taken: Iterable[str]) -> str:
-    """Name a column: by its outcome, with a number where that is taken."""
-    text, number = column(outcome), 1
-    names = set(taken)
-    while (name := text if number == 1 else f"{text} ({number})") in names:
-        number += 1
-    return name
+        name = text = column(outcome)
+        number = 1
+        while name in columns:
+            number += 1
+            name = f"{text} ({number})"
+        columns[name] = values
+    return Samples(columns, tuple(unit.number for unit in units), setting.seed, Plan(do))

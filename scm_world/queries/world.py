@@ -10,20 +10,19 @@ from typing import Any, Self, final
 
 import networkx as nx
 
-from scm_world._types import ArrayLike, Floats
+from scm_world._types import ArrayLike
 from scm_world.backends import Backend
-from scm_world.errors import UnknownOption
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import System
 from scm_world.queries.local import local_graph
-from scm_world.queries.plans import Key, Plan, Schedule
+from scm_world.queries.plans import UNPLANNED, Key, Plan, Schedule, has_times
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import Questions
 from scm_world.queries.twins import AnyTwins, twins_of
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion
-from scm_world.world import Audit, Simulation, WorldSnapshot
+from scm_world.world import Audit, Batch, Simulation, WorldSnapshot
 from scm_world.world.interventions import merged
 
 
@@ -43,31 +42,26 @@ class World(Simulation, Questions):
         0.05
         >>> episode.counterfactual({}) == episode
         True
+
+    With ``num_worlds=n`` it makes n worlds in one ``scm_world.world.Batch``, which are stepped
+    together, and read as arrays with a leading axis:
+
+        >>> worlds = World("pushing", backend="fake", num_worlds=3)
+        >>> _ = worlds.reset(seed=0, do={"tool_block.mass": [0.02, 0.05, 0.08]})
+        >>> worlds.step(worlds["joint_positions"])
+        >>> worlds["tool_block.mass"], worlds["tool_block.cartesian_position"].shape
+        (array([0.02, 0.05, 0.08]), (3, 3))
+        >>> worlds.world(1).effect("reward", do={"floor_friction": 0.9}, n=2, steps=3).n
+        2
+        >>> worlds.close()
     """
 
-    @classmethod
-    def of(cls, world: Simulation) -> Self:
-        """Return a world like another one, at the same instant, that can be asked.
-
-        Args:
-            world: Such as ``env.unwrapped.world``; it is left as it is.
-
-        Raises:
-            UnknownOption: It is not a world.
-
-        Example:
-            >>> import gymnasium
-            >>> env = gymnasium.make("scm_world/Pushing-v0", backend="fake")
-            >>> _ = env.reset(seed=0)
-            >>> with World.of(env.unwrapped.world) as world:
-            ...     world.effect("reward", do={"floor_friction": 0.9}, n=2, steps=3).n
-            2
-        """
-        if not isinstance(world, Simulation):
-            raise UnknownOption("world", world, ("a world, such as env.unwrapped.world",))
-        build, (_, *how) = Simulation.__reduce__(world)
-        made: Self = build(cls, *how)
-        return made
+    def __new__(cls, *args: Any, num_worlds: int | None = None, **options: Any) -> Self:
+        """Make one world, or several."""
+        if num_worlds is None:
+            return super().__new__(cls)
+        batch: Any = Batch.of(cls, num_worlds, *args, **options)
+        return batch  # type: ignore[no-any-return] # types of Python know no such case
 
     @classmethod
     def from_mjcf(
@@ -173,8 +167,10 @@ class World(Simulation, Questions):
         )
 
     _standing: Plan = Plan()
-    _schedule: Schedule = Schedule(())
+    _schedule: Schedule = UNPLANNED
     _fired: Mapping[Key, int] = MappingProxyType({})
+    _space: AnyRegion | None = None
+    _acted = -1  # the last control step at which the plan was carried out
 
     # --- another world ------------------------------------------------------------------------
 
@@ -201,10 +197,8 @@ class World(Simulation, Questions):
         other._standing = self._with(do)
         if other._started:
             other._schedule = Schedule([*self._schedule.layers, (other.index, Plan(do))])
-            other._fired = fired = dict(self._fired)
-            due = other._schedule.due(other, other.index, fired)
-            if due:
-                other.do(due)
+            other._acted = -1
+            other.act()
         return other
 
     def counterfactual(
@@ -309,6 +303,8 @@ class World(Simulation, Questions):
                 "_standing": self._standing,
                 "_schedule": self._schedule,
                 "_fired": dict(self._fired),
+                "_space": self._space,
+                "_acted": self._acted,
             },
         )
 
@@ -320,36 +316,60 @@ class World(Simulation, Questions):
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
     ) -> Audit | None:
-        """Begin an episode, with what is given; see ``Simulation.reset``."""
-        plan = self._with(do)
-        if not len(self._standing) and not any(True for _ in plan.timed()):
-            self._schedule, self._fired = Schedule(()), {}
+        """Begin an episode, with what is given; see ``Simulation.reset``.
+
+        What has a time is done within the episode, where it must lie in ``space`` too.
+        """
+        self._schedule, self._fired, self._space, self._acted = UNPLANNED, {}, space, -1
+        if not (len(self._standing) or (do and has_times(do))):
             return super().reset(seed=seed, episode=episode, do=do, space=space)
         super().reset(seed=seed, episode=episode)
-        fired: dict[Key, int] = {}
-        self._schedule, self._fired = Schedule([(0, plan)]), fired
-        due = self._schedule.due(self, 0, fired)
-        return self.do(due, space=space) if due else None
+        self._schedule = Schedule([(0, self._with(do))])
+        return self.act()
 
-    def advance(self, command: Floats) -> None:
-        """Advance one control step, with what is due at its beginning."""
-        if self._schedule.layers and self.index:
-            fired = dict(self._fired)
-            due = self._schedule.due(self, self.index, fired)
-            self._fired = fired
-            if due:
-                self.do(due)
-        super().advance(command)
+    def step(self, action: ArrayLike) -> None:
+        """Advance one control step, after what is due at its beginning; see ``Simulation.step``."""
+        if self.is_planned:
+            self.act()
+        super().step(action)
+
+    @property
+    def is_planned(self) -> bool:
+        """Whether the present episode has a plan, which acts within it."""
+        return bool(self._schedule.layers)
+
+    def may_act(self, step: int) -> bool:
+        """Return whether the plan of the episode may still do something at a control step."""
+        return step != self._acted and self._schedule.concerns(self, step, self._fired)
+
+    def act(self) -> Audit | None:
+        """Do what the plan of the episode contains for this instant, as the next step would.
+
+        Returns:
+            What it did; None if there was nothing, or it was done already.
+
+        Raises:
+            InterventionError: It was refused.
+        """
+        if not self.may_act(self.index):
+            return None
+        fired = dict(self._fired)
+        due = self._schedule.due(self, self.index, fired)
+        audit = self.do(due, space=self._space) if due else None
+        self._fired, self._acted = fired, self.index
+        return audit
 
     def snapshot(self) -> WorldSnapshot:
-        """Save everything, with the events that have happened."""
-        return replace(super().snapshot(), memory=(self._schedule, dict(self._fired)))
+        """Save everything, with the plan and the events that have happened."""
+        memory = (self._schedule, dict(self._fired), self._space, self._acted)
+        return replace(super().snapshot(), memory=memory)
 
     def restore(self, snapshot: WorldSnapshot) -> None:
         """Go back to a snapshot, bit for bit."""
         super().restore(snapshot)
         if snapshot.memory is not None:
-            self._schedule, self._fired = snapshot.memory[0], dict(snapshot.memory[1])
+            self._schedule, fired, self._space, self._acted = snapshot.memory
+            self._fired = dict(fired)
 
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
         """Add something to what is given; of two names of one quantity the later one counts."""

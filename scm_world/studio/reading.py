@@ -214,7 +214,7 @@ def described(spec: Spec, live: Any) -> dict[str, Any]:
 
 def period(live: Any) -> float:
     """Return the length of a control step [s]; equations count steps of one second."""
-    return float(live.control_period) if isinstance(live, Simulation) else 1.0
+    return float(live.options.control_period) if isinstance(live, Simulation) else 1.0
 
 
 def lit_edges(world: Simulation, pairs: frozenset[tuple[str, str]]) -> list[int]:

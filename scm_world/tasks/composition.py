@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from scm_world._types import Floats, Value, Values
 from scm_world.geometry.hulls import Hull
@@ -78,6 +80,7 @@ class Composition:
         bodies: Names of the bodies that can come and go. Their variables begin with these names.
         hides_goals: Whether something that never moves may make goals impossible.
         solid: Whether no episode may begin with two bodies in one place.
+        screened: The variables of which ``clear`` can tell that bodies lie in one another.
     """
 
     system: Any
@@ -86,6 +89,7 @@ class Composition:
     bodies: tuple[str, ...] = ()
     hides_goals: bool = False
     solid: bool = False
+    screened: tuple[str, ...] = ()
 
     def __init__(self, system: Any, commands: Commands | None = None) -> None:
         self.system, self.commands = system, commands
@@ -130,13 +134,14 @@ class Composition:
         tolerance = TOLERANCE if tolerance is None else tolerance
         return overlaps(scene, tolerance, self._meant, max(enough, tolerance))
 
-    def thin(self, candidates: Any, limit: float) -> None:
-        """Leave out candidates that obviously put bodies in one place.
+    def clear(self, values: Values, limit: float) -> NDArray[np.bool_]:
+        """Return which of several draws do not obviously put bodies in one place, shape (n,).
 
         Args:
-            candidates: Draws of an intervention, with ``parameter``, ``state`` and ``keep``.
+            values: Of ``screened``, shape (n, k) each.
             limit: How deep bodies lie in one another already [m].
         """
+        raise NotImplementedError
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         """List goals, of some, that lie in something that never moves: nothing can fill them."""

@@ -16,7 +16,7 @@ from scm_world._types import Floats
 from scm_world.backends import Backend, read_model
 from scm_world.errors import UnknownOption
 from scm_world.geometry import chains
-from scm_world.models import Model, Readout, Row
+from scm_world.models import Model, ModelRow, Readout
 from scm_world.tasks.base import Goal, Observation, Observed, Task, Timing
 from scm_world.tasks.composition import Commands, Composition, clock
 from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
@@ -318,7 +318,7 @@ class ModelTask(DeclaredTask):
             )
             yield from beginning(state, self.start.get(row.name))
 
-    def _fields(self, row: Row, *more: str) -> dict[str, Any]:
+    def _fields(self, row: ModelRow, *more: str) -> dict[str, Any]:
         """Return fields of a declaration, with what was asked for."""
         given, where = self.spaces.get(row.name, {}), f"spaces[{row.name!r}]"
         kind, shape = getattr(row, "kind", "real"), row.shape
@@ -338,7 +338,7 @@ class ModelTask(DeclaredTask):
         left_out = {"default", "distribution"}.difference(more)
         return {name: value for name, value in fields.items() if name not in left_out}
 
-    def _action(self, row: Row) -> Action:
+    def _action(self, row: ModelRow) -> Action:
         fields = self._fields(row)
         if fields["bounds"] is None:  # an actuator without a range
             fields["bounds"] = Box(-1.0, 1.0)

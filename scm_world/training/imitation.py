@@ -373,7 +373,7 @@ def _episode(
     noises, learns, over, info = action_noise(random, size), False, False, dict[str, Any]()
     pairs, row, said = list[tuple[Any, ...]](), 0, np.empty(0)
     while not over:
-        right = np.clip(env.toward(teacher(env.world)), -1.0, 1.0)
+        right = np.clip(env.as_action(teacher(env.world)), -1.0, 1.0)
         now = teacher.memory(env.world) if lesson.memory else said
         before, said = said if pairs else np.zeros_like(now), now
         pairs.append((observation, right, before, said))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Mapping, Sequence
-from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, final
 
@@ -20,7 +19,7 @@ from pydantic import (
 
 from scm_world._arguments import one_of
 from scm_world.curricula import Curriculum, as_curriculum, everything, goals
-from scm_world.env import ScmWorldEnv
+from scm_world.env import ENV_OPTIONS
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
 from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.output.reading import read_text
@@ -114,7 +113,7 @@ class Recipe(Frozen):
     @field_validator("env")
     @classmethod
     def _plain(cls, env: dict[str, Any]) -> dict[str, Any]:
-        known = [name for name in signature(ScmWorldEnv).parameters if name not in RESERVED]
+        known = [name for name in ENV_OPTIONS if name not in RESERVED]
         for name in env:
             one_of("option of the environment in a recipe", name, known)
         if env.get("observation_mode") == "pixel":

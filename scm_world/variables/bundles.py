@@ -1,4 +1,4 @@
-"""Bundles: variables that are others one after another, such as the joints of all fingers."""
+"""Bundles: variables that join others, such as the joints of all fingers, in one vector."""
 
 from __future__ import annotations
 
@@ -26,11 +26,10 @@ def bundle(name: str, parts: Sequence[Variable], **fields: Any) -> Derived | Mea
     """Declare a bundle: a computed variable on which an intervention is one on each of its parts.
 
     Args:
-        name: Of the bundle.
-        parts: What it is put together from: all parameters, all states, all readouts or all
-            actions.
-        fields: Further fields of the variable. If not given, the unit is what the parts have in
-            common, and bounds, A and B are boxes if those of all parts are.
+        name: Name of the bundle.
+        parts: The variables that it joins: all parameters, all states, all readouts or all actions.
+        fields: Further fields of the variable. If not given, the unit is the common unit of the
+            parts, and bounds, A and B are boxes if those of all parts are.
 
     Raises:
         ValueError: The parts are of different roles.
@@ -64,26 +63,17 @@ def bundle(name: str, parts: Sequence[Variable], **fields: Any) -> Derived | Mea
 
 
 def _joined(spaces: Sequence[Space | None], shapes: tuple[tuple[int, ...], ...]) -> Box | None:
-    """Put boxes together; None where one is no box, or follows other variables."""
-    low: list[float] = []
-    high: list[float] = []
-    for space, shape in zip(spaces, shapes, strict=True):
-        if not isinstance(space, Box) or space.parents():
-            return None
-        ends = space.bounds(shape, {})
-        low += np.ravel(ends[0]).tolist()
-        high += np.ravel(ends[1]).tolist()
+    """Join boxes; None where another space is given, or one that follows variables."""
+    boxes = [space for space in spaces if isinstance(space, Box) and not space.parents()]
+    if len(boxes) < len(spaces):
+        return None
+    ends = [box.bounds(shape, {}) for box, shape in zip(boxes, shapes, strict=True)]
+    low, high = (np.concatenate([*map(np.ravel, end)]).tolist() for end in zip(*ends, strict=True))
     return Box(tuple(low), tuple(high))
 
 
 def part_of(box: Box, where: slice, size: int, shape: tuple[int, ...]) -> Box:
-    """Give the part of a box that belongs to some of its components.
-
-    Args:
-        box: Of ``size`` components.
-        where: Which components.
-        size: How many there are.
-        shape: Of the part.
+    """Return the part of a box, of ``size`` components, for some of them, in the given shape.
 
     Example:
         >>> part_of(Box((0.0, 1.0, 2.0), 3.0), slice(1, 2), 3, ())
@@ -95,14 +85,10 @@ def part_of(box: Box, where: slice, size: int, shape: tuple[int, ...]) -> Box:
 
 
 def divided(variable: Variable, act: Intervention) -> dict[str, Intervention]:
-    """Give the interventions on the parts of a bundle that one on the bundle stands for.
+    """Return the interventions on the parts of a bundle that a checked one on it stands for.
 
-    A draw, and another mechanism, are those of the whole bundle: the noise is the same, and so is
-    the function; see ``Draw.of``.
-
-    Args:
-        variable: The bundle, or any other variable: then the intervention is on itself.
-        act: Which has been checked.
+    A draw, and another mechanism, remain those of the whole bundle; see ``Draw.of``. If the
+    variable is not a bundle, the intervention is on itself.
     """
     parts = variable.parts
     if not parts:
@@ -121,4 +107,4 @@ def divided(variable: Variable, act: Intervention) -> dict[str, Intervention]:
 
 def whole_of(act: Any, name: str) -> str:
     """Name the bundle that an intervention is a part of; the variable itself if there is none."""
-    return (isinstance(act, Draw | Mechanism) and vars(act).get("of")) or name
+    return (type(act) in (Draw, Mechanism) and act.of) or name

@@ -1,4 +1,4 @@
-"""Whether a value may be given to a variable, and the error that says why not."""
+"""Checks of values and spaces for a variable, which raise the errors of an intervention."""
 
 from __future__ import annotations
 
@@ -34,24 +34,17 @@ def _expected(variable: Variable) -> str:
 
 
 def coerce(variable: Variable, value: Any) -> Value:
-    """Turn what a user gave into a value of the variable.
+    """Return a user's value as an array of the declared shape; float64 if real, else int64.
 
-    Returns:
-        An array of the declared shape; float64 for a real variable, int64 else.
-
-    Raises:
-        WrongValue: It is not a number, not a whole one where one is asked for, not finite, or of
-            another shape.
+    Another kind or shape, and numbers that are not finite, raise ``WrongValue``.
     """
     if isinstance(variable.bounds, Categories) and variable.bounds.labels:
         with suppress(KeyError, ValueError, TypeError):  # refused below
             value = variable.bounds.numbers(value)
-    if np.ma.isMaskedArray(value):  # there is something under the mask
-        raise WrongValue(variable.name, value, _expected(variable))
-    try:
-        given = np.asarray(value)
-    except (ValueError, TypeError):  # a ragged list, or an object that refuses
-        raise WrongValue(variable.name, value, _expected(variable)) from None
+    given = np.asarray("")
+    if not np.ma.isMaskedArray(value):  # which hides numbers under its mask
+        with suppress(ValueError, TypeError):  # a ragged list, or an object that refuses
+            given = np.asarray(value)
     if given.dtype.kind not in "iuf":
         raise WrongValue(variable.name, value, _expected(variable))
     if given.shape != variable.shape:
@@ -66,68 +59,44 @@ def coerce(variable: Variable, value: Any) -> Value:
     return given.astype(np.int64)
 
 
-def _plain(value: Any) -> Any:
-    return np.asarray(value).tolist()
+def _out_of_bounds(
+    variable: Variable, value: Value, allowed: str, nearest: Value | None, space: str = ""
+) -> OutOfBounds:
+    plain = None if nearest is None else np.asarray(nearest).tolist()
+    given, unit = np.asarray(value).tolist(), variable.unit
+    return OutOfBounds(variable.name, given, allowed=allowed, nearest=plain, unit=unit, space=space)
 
 
 def check_bounds(variable: Variable, value: Value, values: Values) -> None:
-    """Refuse what is physically impossible.
-
-    Raises:
-        WrongValue: It came out of a shift, a scale or other coordinates without being finite.
-        OutOfBounds: With the nearest value that is possible.
-    """
+    """Refuse a value that is physically impossible, or not finite after a shift or scale."""
     if not np.isfinite(value).all():
-        raise WrongValue(variable.name, _plain(value))
+        raise WrongValue(variable.name, np.asarray(value).tolist())
     bounds = variable.bounds
     if bounds is not None and not bounds.contains(value, values):
-        raise OutOfBounds(
-            variable.name,
-            _plain(value),
-            allowed=bounds.describe(variable.shape, values),
-            nearest=_plain(bounds.nearest(value, values)),
-            unit=variable.unit,
-        )
+        allowed = bounds.describe(variable.shape, values)
+        raise _out_of_bounds(variable, value, allowed, bounds.nearest(value, values))
 
 
 def check_draw(variable: Variable, act: Draw) -> None:
-    """Refuse a draw from a space that is not declared, or of another shape than the variable.
-
-    Raises:
-        InterventionError: There is no such space, or the numbers of a distribution are too many
-            or too few.
-    """
-    if isinstance(act.source, str):
-        if variable.space(act.source) is None:
-            raise InterventionError(
-                f"{variable.name!r} has no space {act.source} to draw from; draw from a "
-                "distribution, such as Draw(Box(low, high))",
-                variable=variable.name,
-                value=act,
-            )
-        return
-    if act.source.parents():
-        return  # known only when it is drawn
-    try:
-        fits = Noise(0).draw(act.source, variable.name, variable.shape, {})[0].shape
-    except ValueError:
+    """Refuse a draw from a space that is not declared, or of another shape than the variable."""
+    source, said = act.source, ""
+    if isinstance(source, str):
+        if variable.space(source) is None:
+            said = f"{variable.name!r} has no space {source} to draw from; draw from a "
+            said += "distribution, such as Draw(Box(low, high))"
+    elif not source.parents():  # else known only when it is drawn
         fits = None
-    if fits != variable.shape:
-        raise InterventionError(
-            f"do({variable.name}): {act.source!r} does not fit its shape {variable.shape}; give "
-            "one number for all, or one for each component",
-            variable=variable.name,
-            value=act,
-        )
+        with suppress(ValueError):
+            fits = Noise(0).draw(source, variable.name, variable.shape, {})[0].shape
+        if fits != variable.shape:
+            said = f"do({variable.name}): {source!r} does not fit its shape {variable.shape}; give "
+            said += "one number for all, or one for each component"
+    if said:
+        raise InterventionError(said, variable=variable.name, value=act)
 
 
 def check_region(variable: Variable, region: SpaceName | Space) -> None:
-    """Refuse a region that a variable does not have, or that reaches beyond its bounds.
-
-    Raises:
-        InterventionError: There is no such space, or it is of another shape.
-        OutOfBounds: A corner of it is physically impossible.
-    """
+    """Refuse a region that a variable does not have, or that reaches beyond its bounds."""
     check_draw(variable, Draw(region))
     if isinstance(region, str) or region.parents() or variable.bounds is None:
         return
@@ -140,17 +109,7 @@ def check_region(variable: Variable, region: SpaceName | Space) -> None:
 
 
 def check_subset(subset: Subset, variables: Iterable[Variable], *, may_come: bool = False) -> None:
-    """Refuse patterns that name nothing, and regions that variables cannot lie in.
-
-    Args:
-        subset: Of the parameter space.
-        variables: That there are.
-        may_come: Whether others may come, which patterns may name.
-
-    Raises:
-        UnknownVariable: A pattern names nothing.
-        InterventionError: A region is none of the variable, or beyond its bounds.
-    """
+    """Refuse patterns without a variable, unless some may come, and regions beyond bounds."""
     known = {variable.name: variable for variable in variables}
     if not may_come:
         for pattern in subset.unused(known):
@@ -165,28 +124,17 @@ def check_subset(subset: Subset, variables: Iterable[Variable], *, may_come: boo
 def check_space(
     variable: Variable, value: Value, space: SpaceName | Subset, values: Values
 ) -> None:
-    """Refuse what lies outside the space that was asked for.
-
-    Raises:
-        OutOfBounds: With the nearest value of the space.
-    """
+    """Refuse a value outside the space that was asked for."""
     region = space.region(variable.name) if isinstance(space, Subset) else space
-    found = variable.space(region) if isinstance(region, str) else region
-    without, near, inside = "", None, False
     if isinstance(region, str):
         inside = variable.in_space(value, region, values)
+        found, nearest = variable.space(region), variable.nearest_in_space(value, region, values)
         without = " without A" * (region == "B" and variable.a not in (None, variable.b))
-        near = variable.nearest_in_space(value, region, values)
-    elif region is not None:
-        inside, near = region.contains(value, values), region.nearest(value, values)
-    if inside:
-        return
-    none = "∅ (none is declared)" if isinstance(region, str) else "∅ (it is not to be set)"
-    raise OutOfBounds(
-        variable.name,
-        _plain(value),
-        space=region if isinstance(region, str) else str(space),
-        allowed=none if found is None else found.describe(variable.shape, values) + without,
-        nearest=None if near is None else _plain(near),
-        unit=variable.unit,
-    )
+        name, none = str(region), "∅ (none is declared)"
+    else:
+        inside = region is not None and region.contains(value, values)
+        found, nearest = region, None if region is None else region.nearest(value, values)
+        name, none, without = str(space), "∅ (it is not to be set)", ""
+    if not inside:
+        words = none if found is None else found.describe(variable.shape, values) + without
+        raise _out_of_bounds(variable, value, words, nearest, name)

@@ -1,4 +1,5 @@
 """Distributions: spaces, which stand for the uniform one, and those of statistics."""
+# ruff: noqa: D102 # ``Sampler`` describes the methods
 
 from __future__ import annotations
 
@@ -15,14 +16,14 @@ from scm_world.variables.spaces import (
     Either,
     Integers,
     Rotations,
-    Source,
+    Sampler,
     refuse_infinite,
 )
 
 
 @final
-class Normal(Source):
-    """The normal distribution, component by component.
+class Normal(Sampler):
+    """The normal distribution, component by component, from two uniform numbers each.
 
     Attributes:
         mean: Mean.
@@ -40,23 +41,20 @@ class Normal(Source):
         super().__init__(mean=mean, std=std, **fields)
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes: two for each component."""
         return 2 * int(np.prod(shape))
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
-        """Turn pairs of uniform numbers into normal ones."""
         half = uniforms.shape[-1] // 2
         radius = np.sqrt(-2.0 * np.log1p(-uniforms[..., :half]))
         standard = radius * np.cos(2.0 * np.pi * uniforms[..., half:])
         return self.mean + self.std * standard.reshape(*uniforms.shape[:-1], *shape)
 
     def describe(self, shape: tuple[int, ...], values: Values) -> str:
-        """Write the distribution down."""
         return f"N({self.mean:g}, {self.std:g}²)"
 
 
 @final
-class Cylinder(Source):
+class Cylinder(Sampler):
     """Uniform over the volume of a box in cylindrical coordinates (radius, angle, …).
 
     A box of cylindrical coordinates, drawn component by component, crowds its points near the
@@ -81,11 +79,9 @@ class Cylinder(Source):
         super().__init__(box=box, **fields)
 
     def parents(self) -> frozenset[str]:
-        """Name the variables that the corners depend on."""
         return self.box.parents()
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
-        """Turn uniform numbers into points, the radius first."""
         low, high = self.box.bounds(shape, values)
         points = np.array(self.box.transform(uniforms, shape, values))
         inner, outer = low[..., 0] ** 2, high[..., 0] ** 2
@@ -93,12 +89,11 @@ class Cylinder(Source):
         return points
 
     def describe(self, shape: tuple[int, ...], values: Values) -> str:
-        """Write the distribution down."""
         return f"uniform by volume over {self.box.describe(shape, values)}"
 
 
 @final
-class Continuous(Source):
+class Continuous(Sampler):
     """A continuous distribution of scipy, by its name there, component by component.
 
     ``Laplace``, ``Exponential``, ``Gamma``, ``StudentT`` and ``Gumbel`` make the usual ones.
@@ -114,11 +109,10 @@ class Continuous(Source):
 
     kind: Literal["continuous"] = "continuous"
     family: str
-    parameters: dict[str, float] = Field(default_factory=dict)
+    parameters: dict[str, float]
 
     def __init__(self, family: str, **parameters: Any) -> None:
-        given = parameters.pop("parameters", parameters)
-        super().__init__(family=family, parameters=given)
+        super().__init__(family=family, parameters=parameters.pop("parameters", parameters))
 
     @cached_property
     def frozen(self) -> Any:
@@ -127,13 +121,13 @@ class Continuous(Source):
 
         family = getattr(stats, self.family, None)
         if not isinstance(family, stats.rv_continuous):
-            raise ValueError(f"{self.family!r} is no continuous distribution of scipy.stats")
+            raise ValueError(f"{self.family!r} is not a continuous distribution of scipy.stats")
         try:
             frozen = family(**self.parameters)
         except TypeError as error:
             raise ValueError(f"scipy.stats.{self.family}: {error}") from None
         if not np.isfinite(frozen.median()):
-            raise ValueError(f"{self.describe((), {})} is no distribution")
+            raise ValueError(f"{self.describe((), {})} is not a distribution")
         return frozen
 
     @model_validator(mode="after")
@@ -142,12 +136,10 @@ class Continuous(Source):
         return self
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
-        """Turn uniform numbers into quantiles."""
         inside = uniforms.reshape(*uniforms.shape[:-1], *shape) + 2.0**-54  # never 0
         return np.asarray(self.frozen.ppf(inside))
 
     def describe(self, shape: tuple[int, ...], values: Values) -> str:
-        """Write the distribution down."""
         return f"{self.family}({', '.join(f'{k}={v:g}' for k, v in self.parameters.items())})"
 
 
@@ -167,7 +159,7 @@ def Gamma(shape: float, scale: float = 1.0, loc: float = 0.0) -> Continuous:  # 
 
 
 def StudentT(df: float, loc: float = 0.0, scale: float = 1.0) -> Continuous:  # noqa: N802
-    """Give Student's t distribution with ``df`` degrees of freedom."""
+    """Return Student's t distribution with ``df`` degrees of freedom."""
     return Continuous("t", df=df, loc=loc, scale=scale)
 
 
@@ -177,14 +169,14 @@ def Gumbel(loc: float = 0.0, scale: float = 1.0) -> Continuous:  # noqa: N802
 
 
 @final
-class Discrete(Source):
+class Discrete(Sampler):
     """A few numbers, each with a probability, component by component.
 
     ``Bernoulli``, ``Categorical`` and ``Empirical`` make the usual ones.
 
     Attributes:
         values: The numbers.
-        probabilities: Of each; all alike if None.
+        probabilities: One for each number; all alike if None.
 
     Example:
         >>> Discrete((0, 10), (0.25, 0.75)).transform(np.array([[0.2], [0.3]]), (), {})
@@ -216,25 +208,23 @@ class Discrete(Source):
         return np.full(n, 1.0 / n) if self.probabilities is None else np.array(self.probabilities)
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
-        """Turn uniform numbers into values."""
         unit = uniforms.reshape(*uniforms.shape[:-1], *shape)
         ends = np.cumsum(self.chances)[:-1]
         return np.asarray(self.values)[np.searchsorted(ends, unit, side="right")]
 
     def describe(self, shape: tuple[int, ...], values: Values) -> str:
-        """Write the distribution down."""
         pairs = zip(self.values[:5], self.chances.tolist(), strict=False)
         more = ", …" if len(self.values) > 5 else ""
         return "{" + ", ".join(f"{value:g}: {p:g}" for value, p in pairs) + more + "}"
 
 
 def Bernoulli(p: float) -> Discrete:  # noqa: N802
-    """Give 1 with probability ``p``, else 0."""
+    """Return the distribution of 1, with probability ``p``, and 0."""
     return Discrete((0, 1), (1.0 - p, p))
 
 
 def Categorical(probabilities: Any, values: Any = None) -> Discrete:  # noqa: N802
-    """Give whole numbers with probabilities: 0, 1, … unless others are given."""
+    """Return whole numbers with probabilities: 0, 1, … unless others are given."""
     return Discrete(range(np.size(probabilities)) if values is None else values, probabilities)
 
 

@@ -1,7 +1,7 @@
-"""What one can do to a variable, as values.
+"""Interventions on a variable, as values.
 
 A plain number or array is the hard intervention: the variable is cut from its parents and held
-at this value. ``Shift`` and ``Scale`` keep the parents and change what they say; ``Draw`` cuts
+at this value. ``Shift`` and ``Scale`` keep the parents and change their effect; ``Draw`` cuts
 them and draws. In a plan each has a time: ``Hard(0.2, at=10)``, ``Shift(0.1, during=(5, 9))``,
 ``Draw("A", every=25)``, ``Natural(when=Contact("robot", "tool_block"))``.
 """
@@ -25,9 +25,9 @@ from scm_world.variables.kinds import (
     SpaceName,
     names,
 )
-from scm_world.variables.mechanisms import Concatenation, Function, Linear, Table, check_order
+from scm_world.variables.mechanisms import EQUATIONS, Equation, check_order
 from scm_world.variables.spaces import Frozen
-from scm_world.variables.times import Timed
+from scm_world.variables.times import TimedIntervention
 
 Number = float | tuple[float, ...]
 
@@ -43,7 +43,7 @@ def _number(what: str, value: Any) -> Any:
 
 
 @final
-class Hard(Timed):
+class Hard(TimedIntervention):
     """Set a variable to a value, independently of its parents."""
 
     model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
@@ -56,8 +56,8 @@ class Hard(Timed):
 
 
 @final
-class Shift(Timed):
-    """Add to what a variable would have been. Its parents remain causes.
+class Shift(TimedIntervention):
+    """Add a number to the value that a variable would have. Its parents remain causes.
 
     Example:
         >>> Shift(0.1)
@@ -74,8 +74,8 @@ class Shift(Timed):
 
 
 @final
-class Scale(Timed):
-    """Multiply what a variable would have been. Its parents remain causes."""
+class Scale(TimedIntervention):
+    """Multiply the value that a variable would have. Its parents remain causes."""
 
     model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
 
@@ -87,15 +87,15 @@ class Scale(Timed):
 
 
 @final
-class Draw(Timed):
+class Draw(TimedIntervention):
     """Draw a variable from its space ``"A"``, ``"B"`` or ``"A|B"``, or from a distribution.
 
     Attributes:
-        source: Where from.
+        source: The space or distribution.
         stream: Name of its noise: draws of the variable with one name give the same numbers. If
-            None, what a model draws has nothing in common with the variable's own noise.
-        of: A bundle that is drawn as a whole; the variable gets its part of it. ``do`` on the
-            bundle gives this to each of its parts.
+            None, the draws of a model have nothing in common with the variable's own noise.
+        of: A bundle that is drawn as a whole; the variable gets its part of it. ``do`` sets it on
+            the parts of a bundle.
 
     Example:
         >>> Draw("A").source
@@ -120,15 +120,15 @@ class Draw(Timed):
 
 
 @final
-class Mechanism(Timed):
-    """Give a variable another structural equation: it follows other variables than before.
+class Mechanism(TimedIntervention):
+    """Replace the structural equation of a variable, which then follows other variables.
 
     A parameter may follow parameters (so that a color can cause a friction, which it does not by
-    default), a state is set to what the function gives at that instant, and an action follows
+    default), a state is set to the result of the function at that instant, and an action follows
     anything at every step: then the function is the policy.
 
-    Noise stays what it is: a function that takes ``noise`` is given the same numbers as the one
-    that it replaces. With ``noise`` alone, function and parents stay, and the noise is another one.
+    The noise stays the same: a function that takes ``noise`` is given the numbers of the one that
+    it replaces. With ``noise`` alone, function and parents stay, and the noise is another one.
 
     Attributes:
         function: Called with the values of the parents, in their order, and with ``noise=`` if it
@@ -136,11 +136,11 @@ class Mechanism(Timed):
             parents in another order is refused.
         parents: The causes; the graph then has these edges in place of the others.
         noise: Distribution of the noise; that of the variable if None.
-        inverse_noise: As of ``Derived``, for counterfactuals of units observed under it.
-        of: A bundle that the function gives as a whole; the variable gets its part of it.
+        inverse_noise: As in ``Derived``, for counterfactuals of units observed under it.
+        of: A bundle that the function returns as a whole; the variable gets its part of it.
 
     Example:
-        >>> tie = Mechanism(Function("numpy:mean"), ["floor_color"])
+        >>> tie = Mechanism(np.mean, ["floor_color"])
         >>> tie.parents[0].name, tie.parents[0].lag
         ('floor_color', 0)
     """
@@ -155,18 +155,17 @@ class Mechanism(Timed):
     of: str | None = None
 
     @property
-    def equation(self) -> Function | Linear | Concatenation | Table:
-        """The function; ``do`` has put that of the variable in the place of None."""
+    def equation(self) -> Equation:
+        """The function; ``do`` has replaced None by that of the variable."""
         if self.function is None:
             raise ModelError(["a mechanism without a function is complete only in a model"])
         return self.function
 
     def __init__(self, function: Any = None, parents: Any = (), **fields: Any) -> None:
         named = (parents,) if isinstance(parents, str | Parent) else tuple(parents)
-        known = (Function, Linear, Concatenation, Table, dict)
-        if function is None and fields.get("noise") is not None and not named:
-            pass
-        elif not (callable(function) or isinstance(function, known)):
+        known = callable(function) or isinstance(function, (*EQUATIONS, dict))
+        noise_alone = function is None and fields.get("noise") is not None and not named
+        if not known and not noise_alone:
             allowed = ("a function of the parents", "Function", "Linear", "Table")
             raise UnknownOption("Mechanism(function)", function, allowed)
         super().__init__(function=function, parents=named, **fields)
@@ -178,18 +177,18 @@ class Mechanism(Timed):
 
 
 @final
-class Natural(Timed):
-    """Hand a variable back to its own structural equation: no intervention holds it any more."""
+class Natural(TimedIntervention):
+    """Return a variable to its own structural equation, and end an earlier intervention on it."""
 
     kind: Literal["natural"] = "natural"
 
 
 @final
-class Null(Timed):
-    """An entity is not there: asked for by its name, not by a variable of it.
+class Null(TimedIntervention):
+    """Remove an entity: a block, an obstacle or a goal, by its name.
 
-    A block, an obstacle or a goal is taken out of the world and of its graph, with everything that
-    is computed from it. It comes back with the next episode.
+    It leaves the world and its graph, with everything that is computed from it, and comes back
+    with the next episode.
     """
 
     kind: Literal["null"] = "null"
@@ -201,13 +200,13 @@ class Null(Timed):
         super().__init__(**fields)
 
 
+ACTS = (Hard, Shift, Scale, Draw, Mechanism, Natural, Null)
+"""The classes of interventions."""
+
+SOFT = (Shift, Scale)
+"""The interventions that leave the parents in place."""
+
 Intervention = Annotated[
     Hard | Shift | Scale | Draw | Mechanism | Natural | Null, Field(discriminator="kind")
 ]
 """Anything that ``do`` accepts, once a plain value has become ``Hard``."""
-
-ACTS = (Hard, Shift, Scale, Draw, Mechanism, Natural, Null)
-"""The same, as classes."""
-
-SOFT = (Shift, Scale)
-"""The interventions that leave the parents in place."""

@@ -1,4 +1,5 @@
 """The kinds of variable. One declaration per variable; it reads like a row of a table."""
+# ruff: noqa: D102 # ``Variable`` describes the properties
 
 from __future__ import annotations
 
@@ -12,6 +13,7 @@ from pydantic import BeforeValidator, Field, WrapValidator, model_validator
 from scm_world._types import Value, Values
 from scm_world.variables.distributions import Distribution
 from scm_world.variables.mechanisms import (
+    EQUATIONS,
     Concatenation,
     Equation,
     Function,
@@ -43,11 +45,7 @@ def _as_number(value: Any) -> Any:
 
 
 def _as_mechanism(value: Any) -> Any:
-    return (
-        Function(value)
-        if callable(value) and not isinstance(value, Function | Linear | Table)
-        else value
-    )
+    return Function(value) if callable(value) and not isinstance(value, EQUATIONS) else value
 
 
 AsNumber = Annotated[Number, BeforeValidator(_as_number)]
@@ -80,16 +78,8 @@ class Parent(Frozen):
 class Coupled(tuple[Parent, ...]):
     """The edges into a state: its own, and those of lag 1 that very many states share.
 
-    What is known of the shared ones need not be looked up for each state.
-
-    Args:
-        before: Its own that come first.
-        shared: By name. Where one of its own has the same cause at the same lag, it counts.
-        after: Its own that come last.
-
-    Attributes:
-        own: Those that are not shared.
-        shared: As it was given.
+    The shared ones are checked once for all states. An own edge with lag, from the same cause,
+    replaces a shared one.
     """
 
     own: tuple[Parent, ...]
@@ -98,7 +88,7 @@ class Coupled(tuple[Parent, ...]):
     def __new__(
         cls, before: Iterable[Parent], shared: Mapping[str, Parent], after: Iterable[Parent]
     ) -> Coupled:
-        """Put the edges in a row."""
+        """Join its own edges that come first, the shared ones by name, and its own last ones."""
         own = (*before, *after)
         others = {**shared}
         for parent in own:
@@ -113,8 +103,13 @@ class Coupled(tuple[Parent, ...]):
         return tuple, ((*self,),)
 
 
+def own(parents: tuple[Parent, ...]) -> tuple[Parent, ...]:
+    """Return the edges that may have lag 0 or the condition "set": not those that are shared."""
+    return parents.own if isinstance(parents, Coupled) else parents
+
+
 def _without(space: Space | None, other: Space | None) -> Space | None:
-    """Leave out of a set of whole numbers those that another one has too."""
+    """Remove from a set of whole numbers those of another one."""
     match space, other:
         case Integers(low=low, high=high), Integers() if low <= other.high and other.low <= high:
             if other.low <= low and other.high < high:
@@ -137,7 +132,7 @@ def _as_parents(value: Any, validate: Callable[[Any], Any]) -> Any:
 
 @lru_cache(maxsize=2**14)
 def parent_of(name: str, lag: int = 0, when: str | None = None) -> Parent:
-    """Return an edge; many variables have the same ones, which are one object then."""
+    """Return an edge; equal ones of many variables are one object."""
     return Parent(name, lag, when)
 
 
@@ -145,18 +140,18 @@ AsParents = Annotated[tuple[Parent, ...], WrapValidator(_as_parents)]
 
 
 class Variable(Frozen):
-    """What all kinds have in common.
+    """The base class of all kinds of variables.
 
     Attributes:
         name: ``"<entity>.<quantity>"``.
         unit: SI unit; ``"1"`` for a pure number.
-        shape: Of one value.
+        shape: Shape of one value.
         dtype: ``"real"``, ``"integer"`` or ``"categorical"``.
-        bounds: What is physically possible, or None for anything finite.
+        bounds: The physically possible values, or None for anything finite.
         a: The training space, or None.
         b: The held-out space, or None. A point that lies in both belongs to A, unless the two are
             the same space: then nothing is held out.
-        a_or_b: What ``A|B`` means, where it is not the union of the two.
+        a_or_b: The space ``A|B``, where it is not the union of the two.
         doc: One sentence.
     """
 
@@ -177,15 +172,12 @@ class Variable(Frozen):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """What a bundle is put together from, in order: its parents; nothing for other variables.
-
-        An intervention on a bundle is one on each of its parts.
-        """
+        """The variables that a bundle joins, in order; none for other variables."""
         return ()
 
     @property
     def role(self) -> Role:
-        """What an intervention on it means."""
+        """The meaning of an intervention on it; see ``docs/variables.md``."""
         return "parameter"
 
     @property
@@ -194,7 +186,7 @@ class Variable(Frozen):
         return True
 
     def array(self, value: Any) -> Value:
-        """Turn a number, or a flat tuple, into a value of the declared dtype and shape."""
+        """Return a number, or a flat tuple, as a value of the declared dtype and shape."""
         kind = np.float64 if self.dtype == "real" else np.int64
         return np.asarray(value, dtype=kind).reshape(self.shape)
 
@@ -235,40 +227,32 @@ class Variable(Frozen):
         return next((c for c in candidates if self.in_space(c, name, values)), None)
 
     @model_validator(mode="after")
-    def _whole_numbers_have_whole_spaces(self) -> Variable:
+    def _spaces_and_parts_fit(self) -> Variable:
         for space in (self.bounds, self.a, self.b):
             if self.dtype != "real" and isinstance(space, Box | Rotations):
                 raise ValueError(f"{self.name}: {self.dtype} values need Integers or Categories")
-        return self
-
-    @model_validator(mode="after")
-    def _bundles_fit(self) -> Variable:
-        mechanism = getattr(self, "mechanism", None)
-        if isinstance(mechanism, Concatenation):
-            n = mechanism.slices[-1].stop if mechanism.slices else 0
-            if len(mechanism.shapes) != len(self.all_parents) or self.shape != (n,):
-                raise ValueError(
-                    f"{self.name}: a bundle has one shape for each part, and their numbers in one "
-                    f"row: {len(self.all_parents)} parts, {mechanism.shapes}, {self.shape}"
-                )
-            if any(parent.lag or parent.when for parent in self.all_parents):
-                raise ValueError(f"{self.name}: the parts of a bundle are present values")
-        return self
-
-    @model_validator(mode="after")
-    def _categories_are_listed(self) -> Variable:
         if self.dtype == "categorical" and self.bounds is None:
             raise ValueError(f"{self.name}: a categorical variable needs bounds=Categories(…)")
+        mechanism, parents = getattr(self, "mechanism", None), self.all_parents
+        if isinstance(mechanism, Concatenation):
+            n = mechanism.slices[-1].stop if mechanism.slices else 0
+            if len(mechanism.shapes) != len(parents) or self.shape != (n,):
+                raise ValueError(
+                    f"{self.name}: a bundle has one shape for each part, and their numbers in one "
+                    f"row: {len(parents)} parts, {mechanism.shapes}, {self.shape}"
+                )
+            if any(parent.lag or parent.when for parent in parents):
+                raise ValueError(f"{self.name}: the parts of a bundle are present values")
         return self
 
 
 @final
 class Exogenous(Variable):
-    """A root: its default, or a draw from its distribution.
+    """A root of the graph: its default, or a draw from its distribution.
 
     Attributes:
         default: The value without a draw.
-        distribution: Where ``sample`` draws from; None for the default.
+        distribution: The distribution for ``sample``; None for the default.
         per: When it is drawn in a model with lagged edges: once for an ``"episode"``, as a
             parameter is, or anew in every ``"step"``.
     """
@@ -280,7 +264,7 @@ class Exogenous(Variable):
 
     @property
     def all_parents(self) -> tuple[Parent, ...]:
-        """The variables that the bounds of its distribution follow; mostly there are none."""
+        """The variables that the bounds of its distribution follow."""
         followed = () if self.distribution is None else sorted(self.distribution.parents())
         return tuple(Parent(name) for name in followed)
 
@@ -294,7 +278,7 @@ class Exogenous(Variable):
 
 
 class _Computed(Variable):
-    """A variable that names its parents."""
+    """A variable with declared parents."""
 
     if TYPE_CHECKING:
         parents: AsParents
@@ -302,18 +286,16 @@ class _Computed(Variable):
 
     @property
     def all_parents(self) -> tuple[Parent, ...]:
-        """The edges into this variable."""
         return self.parents
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """The parents of a bundle; nothing for other variables."""
         return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
 
 
 @final
 class Derived(_Computed):
-    """A Python function of its parents.
+    """A variable that a Python function computes from its parents.
 
     Attributes:
         parents: Its causes, in the order in which the mechanism takes them. A function whose
@@ -327,7 +309,7 @@ class Derived(_Computed):
             the parents. It is known of ``Linear``, of a ``Table``, and of a discrete noise.
         start: The value that lagged children see before the first step.
         inverse: For other coordinates of one quantity (cylindrical for Cartesian): the function
-            from a value of this variable to the one of its only parent. An intervention on this
+            from a value of this variable to that of its only parent. An intervention on this
             variable is then one on the parent.
     """
 
@@ -373,10 +355,10 @@ class Derived(_Computed):
 
 @final
 class Measured(_Computed):
-    """Something that physics decides, or a readout of it.
+    """A state of the physics, or a readout of it.
 
-    A state (``mechanism`` None, ``settable_state`` True) can be set at an instant; physics
-    carries it on. So can a bundle of states. A readout cannot be set.
+    A state, or a bundle of states (``settable_state=True``), can be set at an instant; physics
+    carries it on. A readout cannot be set.
 
     Attributes:
         parents: Its causes.
@@ -401,12 +383,10 @@ class Measured(_Computed):
 
     @property
     def role(self) -> Role:
-        """``"state"`` where it can be set, else ``"readout"``."""
         return "state" if self.settable_state else "readout"
 
     @property
     def settable(self) -> bool:
-        """Whether ``do`` accepts it."""
         return self.settable_state
 
     @model_validator(mode="after")
@@ -419,25 +399,23 @@ class Measured(_Computed):
 
     def set_parents(self) -> tuple[str, ...]:
         """Name the parents that act when the state is set."""
-        parents = self.parents.own if isinstance(self.parents, Coupled) else self.parents
-        return tuple(p.name for p in parents if p.when == "set")
+        return tuple(p.name for p in own(self.parents) if p.when == "set")
 
 
 @final
 class Action(Variable):
-    """What the policy decides at every control step."""
+    """A command of the policy at every control step."""
 
     kind: Literal["action"] = "action"
 
     @property
     def role(self) -> Role:
-        """``"action"``."""
         return "action"
 
 
 @final
 class Fixed(Variable):
-    """A constant: what ``do`` puts in the place of a variable, or a fact that cannot change.
+    """A constant: a variable that ``do`` has set, or a fact that cannot change.
 
     Attributes:
         value: The constant.
@@ -450,7 +428,6 @@ class Fixed(Variable):
 
     @property
     def settable(self) -> bool:
-        """Whether ``do`` accepts it."""
         return self.intervenable
 
 

@@ -39,11 +39,8 @@ class Stacked:
 
     A loop that has the numbers in one vector already calls ``kernel`` with it instead.
 
-    Args:
-        kernel: Takes the numbers of the parents one after another, shape (n,), and the constants.
-
     Attributes:
-        kernel: The same.
+        kernel: Takes the numbers of the parents one after another, shape (n,), and the constants.
 
     Example:
         >>> total = Stacked(lambda numbers, scale: scale * numbers.sum())
@@ -57,7 +54,7 @@ class Stacked:
         update_wrapper(self, kernel)
 
     def __reduce__(self) -> str:
-        """Copy and pickle it as what its name stands for."""
+        """Copy and pickle it by its name."""
         return str(self.__qualname__)
 
     def __call__(self, *parents: Value, **constants: Any) -> Any:
@@ -67,16 +64,7 @@ class Stacked:
 
 @final
 class Unboxed:
-    """A function that a user compiled with numba, which computes with numbers.
-
-    Values without a dimension are arrays here; the function is given the numbers in them.
-
-    Args:
-        kernel: The function.
-
-    Attributes:
-        kernel: The same.
-    """
+    """A user's ``kernel``, compiled with numba: it takes numbers for arrays of no dimension."""
 
     def __init__(self, kernel: Callable[..., Any]) -> None:
         self.kernel = kernel
@@ -104,8 +92,7 @@ class Function(Frozen):
         constants: Passed to it by keyword.
 
     From a file, a name is looked up in modules of this package only, unless the reader names
-    further ones (``from_json(text, trusted=("my_package",))``): reading never runs code that
-    the reader did not ask for.
+    further ones (``from_json(text, trusted=("my_package",))``): reading runs no other code.
     """
 
     kind: Literal["function"] = "function"
@@ -129,9 +116,9 @@ class Function(Frozen):
         return data if isinstance(data, dict) else {"reference": data}
 
     def is_defined_in(self, packages: Iterable[str]) -> bool:
-        """Return whether the function is one of some packages or modules, importing no other.
+        """Return whether some packages or modules define the function, importing no other one.
 
-        What a module of theirs merely imports (``"my_package.module:os.system"``) is not.
+        A function that a module imports (``"my_package.module:os.system"``) is not its own.
         """
         packages = tuple(packages)
         if not _lies_in(self.reference.partition(":")[0], packages):
@@ -166,7 +153,7 @@ class Function(Frozen):
         return self._function
 
     def __copy__(self) -> Self:
-        """Copy it without what was bound: the copy may get other constants."""
+        """Copy it without the bound function: the copy may get other constants."""
         copied = super().__copy__()
         copied.__dict__.pop("_bound", None)
         return copied
@@ -207,7 +194,7 @@ class Function(Frozen):
         )
 
     def _is_named(self) -> bool:
-        """Return whether the reference stands for one function: not for a lambda or an object."""
+        """Return whether the reference is unique: not that of a lambda or an object."""
         unnamed = self._function is not None and not hasattr(self._function, "__qualname__")
         return "<" not in self.reference and not unnamed
 
@@ -234,16 +221,7 @@ def check_order(of: str, equation: Any, parents: Sequence[str], *, before: int =
 
     Arguments are given by position, so each of these would get the value of another parent. An
     argument has the name of a parent if it is that name, the name with ``_`` for ``.``, or the part
-    after the last dot. Arguments with other names say nothing.
-
-    Args:
-        of: Name of the variable, for the error.
-        equation: A mechanism; only a ``Function`` that was given as one is looked at.
-        parents: The names of the causes, in the order in which the function takes them.
-        before: How many other arguments come first.
-
-    Raises:
-        ValueError: They are in another order.
+    after the last dot. Arguments with other names say nothing, nor do the first ``before`` ones.
     """
     function = equation._function if isinstance(equation, Function) else None
     if len(parents) < 2 or function is None:
@@ -261,11 +239,7 @@ def check_order(of: str, equation: Any, parents: Sequence[str], *, before: int =
 
 
 def check_portable(functions: Iterable[Function]) -> None:
-    """Refuse to write functions that could not be found again.
-
-    Raises:
-        ModelError: One is a lambda, or has no name of its own.
-    """
+    """Refuse to write functions that could not be found again, such as a lambda."""
     problems = [
         f"the function {function.reference!r} cannot be found under this name; define it at the "
         "top level of a module"
@@ -277,16 +251,7 @@ def check_portable(functions: Iterable[Function]) -> None:
 
 
 def check_trusted(functions: Iterable[Function], trusted: Iterable[str]) -> None:
-    """Refuse functions that a file names, before anything of theirs is imported.
-
-    Args:
-        functions: That the file names.
-        trusted: Packages whose functions may be called, in addition to those of this package that
-            compute numbers.
-
-    Raises:
-        ModelError: One lies elsewhere.
-    """
+    """Refuse functions of a file, before anything is imported, unless their package is trusted."""
     allowed = (*OWN_MECHANISMS, *trusted)
     problems = [
         f"the function {function.reference!r} lies outside the trusted packages "
@@ -327,10 +292,10 @@ class Linear(Frozen):
 
 @final
 class Concatenation(Frozen):
-    """The numbers of the parents one after another: what makes a variable a bundle of them.
+    """The numbers of the parents one after another: the mechanism of a bundle.
 
     Attributes:
-        shapes: Of the parents.
+        shapes: Shapes of the parents.
 
     Example:
         >>> both = Concatenation(shapes=((2,), ()))
@@ -346,12 +311,12 @@ class Concatenation(Frozen):
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
-        """Where the numbers of each parent stand."""
+        """The places of the numbers of each parent."""
         ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)]).tolist()
         return tuple(slice(first, last) for first, last in pairwise(ends))
 
     def bind(self) -> Callable[..., Any]:
-        """Return the function that puts values together, shape ``(..., n)``; leads broadcast."""
+        """Return the function that joins values, shape ``(..., n)``; leading axes broadcast."""
         shapes = self.shapes
 
         def joined(*parts: Value) -> Value:
@@ -380,8 +345,8 @@ class Table(Frozen):
     Attributes:
         probabilities: One after another, the values of the last parent changing fastest.
         shape: How many values each parent has, and last how many the variable has.
-        given: The values of each parent in the order of the table; 0, 1, … where it is empty.
-        values: Those of the variable in this order; 0, 1, … where it is empty.
+        given: The values of each parent in the order of the table; 0, 1, … if empty.
+        values: Those of the variable in this order; 0, 1, … if empty.
 
     Example:
         >>> grass = Table([[0.9, 0.1], [0.2, 0.8]])  # wet (1) or dry (0), given rain
@@ -419,11 +384,7 @@ class Table(Frozen):
         return np.reshape(self.probabilities, self.shape)
 
     def row(self, *parents: Value) -> Any:
-        """Return the probabilities given the parents, shape (..., number of values).
-
-        Raises:
-            ModelError: A parent has another value.
-        """
+        """Return the probabilities given the parents, shape (..., number of values)."""
         places = []
         for axis, parent in enumerate(parents):
             known = np.asarray(self.given[axis] if self.given else range(self.shape[axis]))
@@ -444,4 +405,5 @@ class Table(Frozen):
         return category
 
 
+EQUATIONS = (Function, Linear, Concatenation, Table)
 Equation = Annotated[Function | Linear | Concatenation | Table, Field(discriminator="kind")]

@@ -1,8 +1,7 @@
-"""Noise is a value: every draw is a function of (seed, variable, episode, step).
+"""Keyed noise: every draw is a function of (seed, variable, episode, step).
 
-The streams are counter-based (Philox), so a draw does not depend on what else was drawn before
-it, on the number of worlds or workers, or on the order of calls. Nothing touches a global
-generator.
+The streams are counter-based (Philox), so a draw does not depend on earlier draws, on the number of
+worlds or workers, or on the order of calls. Nothing touches a global generator.
 
 Source:
     Salmon et al., *Parallel random numbers: as easy as 1, 2, 3*, SC 2011.
@@ -34,9 +33,6 @@ class Noise:
     Args:
         seed: Any whole number that is not negative.
 
-    Raises:
-        UnknownOption: The seed is not one.
-
     Attributes:
         key: The 64 bits by which the seed selects its streams.
 
@@ -63,17 +59,9 @@ class Noise:
     def uniforms(
         self, variable: str, *, n: int, episode: int = 0, step: int = 0, count: int = 1
     ) -> Floats:
-        """Draw the uniform numbers of a variable.
+        """Draw uniform numbers of a variable in [0, 1), ``n`` for each episode.
 
-        Args:
-            variable: Its name.
-            n: How many numbers one draw takes.
-            episode: The first episode.
-            step: The control step.
-            count: For how many episodes in a row.
-
-        Returns:
-            Numbers in [0, 1), shape ``(count, n)``.
+        ``count`` episodes in a row have rows of their own: the shape is ``(count, n)``.
         """
         if n == 0:
             return np.empty((count, 0))
@@ -98,11 +86,7 @@ class Noise:
         step: int = 0,
         count: int = 1,
     ) -> Value:
-        """Draw values of a variable, one for each of ``count`` episodes.
-
-        Returns:
-            Shape ``(count, *shape)``.
-        """
+        """Draw values of a variable, one for each of ``count`` episodes: ``(count, *shape)``."""
         n = distribution.n_uniforms(shape)
         uniforms = self.uniforms(variable, n=n, episode=episode, step=step, count=count)
         return distribution.transform(uniforms, shape, values)

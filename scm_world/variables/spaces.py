@@ -1,12 +1,12 @@
 """Sets of values: hard bounds, the training space A and the held-out space B.
 
-The bounds of a space may depend on the present values of other variables (the height of a block
-that lies on the floor is half its size). They are evaluated when asked, never stored.
+The bounds of a space may follow the present values of other variables: the height of a block that
+lies on the floor is half its size.
 """
+# ruff: noqa: D102 # the base classes describe the methods
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cached_property, lru_cache
 from math import isnan, prod
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, final
@@ -40,20 +40,15 @@ class _Named(ModelMetaclass):
     """Turn what pydantic says of a wrong field into an error of this package."""
 
     def __call__(self, *given: Any, **fields: Any) -> Any:
-        """Make a declaration.
-
-        Raises:
-            UnknownOption: There is no such field; the nearest one is suggested.
-            ModelError: Fields are wrong or missing; all of them are named.
-        """
+        """Make a declaration, or raise an error that names all wrong and missing fields."""
         try:
             return super().__call__(*given, **fields)
         except ValidationError as error:
-            raise refused_fields(self, error) from None
+            raise _refused_fields(self, error) from None
 
 
 def problems_of(error: ValidationError) -> list[str]:
-    """List what pydantic says of data, each with the place, without its advice."""
+    """List the problems that pydantic finds in data, each with its place, without its advice."""
     found = []
     for one in error.errors():
         cause, where = one.get("ctx", {}).get("error"), ".".join(map(str, one["loc"]))
@@ -62,27 +57,22 @@ def problems_of(error: ValidationError) -> list[str]:
     return found
 
 
-def refused_fields(kind: Any, error: ValidationError) -> ScmWorldError:
-    """Return what is wrong with the fields of a declaration, as an error of this package."""
+def _refused_fields(kind: Any, error: ValidationError) -> ScmWorldError:
+    """Return the problems that pydantic finds in a declaration as an error of this package."""
     said: dict[str, list[str]] = {}
     for one in error.errors():
-        cause = one.get("ctx", {}).get("error")
+        cause, place = one.get("ctx", {}).get("error"), one["loc"]
         if isinstance(cause, ScmWorldError):
             return cause
-        name = str(one["loc"][0]) if one["loc"] else ""
-        if one["type"] == "extra_forbidden" and len(one["loc"]) == 1:
+        name = str(place[0]) if place else ""
+        if one["type"] == "extra_forbidden" and len(place) == 1:
             return UnknownOption(f"field of {kind.__name__}", name, kind.model_fields)
         field = f"{kind.__name__}.{name}" if name else ""
-        if name and one["type"] != "missing" and len(one["loc"]) < 3:
+        if name and one["type"] != "missing" and len(place) < 3:
             field += f" = {one['input']!r}"
         said.setdefault(field, []).append(one["msg"].removeprefix("Value error, "))
-    return ModelError(
-        [
-            f"{field}: {alternatives}" if field else alternatives
-            for field, words in said.items()
-            for alternatives in [", or ".join(dict.fromkeys(words))]
-        ]
-    )
+    found = {field: ", or ".join(dict.fromkeys(words)) for field, words in said.items()}
+    return ModelError([f"{field}: {words}".removeprefix(": ") for field, words in found.items()])
 
 
 class Frozen(BaseModel, metaclass=_Named):
@@ -115,7 +105,7 @@ class Affine(Frozen):
     offset: float = 0.0
 
     def evaluate(self, values: Values) -> Floats:
-        """Compute the bound from the values of the variables."""
+        """Compute the bound from the values of all variables."""
         parent = np.asarray(values[self.parent], dtype=np.float64)
         component = parent if self.index is None else parent[..., self.index]
         return np.asarray(self.offset + self.scale * component)
@@ -138,7 +128,7 @@ class Switch(Frozen):
     at: float = 0.5
 
     def evaluate(self, values: Values) -> Floats:
-        """Compute the bound from the values of the variables."""
+        """Compute the bound from the values of all variables."""
         return np.where(np.asarray(values[self.parent]) < self.at, self.below, self.above)
 
 
@@ -146,30 +136,28 @@ Bound = float | Affine | Switch
 Bounds = Bound | tuple[Bound, ...]
 
 
-def _parents(*bounds: Bounds) -> Iterator[str]:
-    for bound in bounds:
-        for part in bound if isinstance(bound, tuple) else (bound,):
-            if isinstance(part, Affine | Switch):
-                yield part.parent
+def listed(bounds: Bounds) -> tuple[Bound, ...]:
+    """Return the ends of a box as a tuple, if there is one for each component or one for all."""
+    return bounds if isinstance(bounds, tuple) else (bounds,)
 
 
 @lru_cache(maxsize=1024)
-def _constant(bound: float | tuple[float, ...], shape: tuple[int, ...]) -> Floats:
+def _broadcast(bound: float | tuple[float, ...], shape: tuple[int, ...]) -> Floats:
     numbers = np.asarray(bound, dtype=np.float64)
     return np.broadcast_to(numbers.reshape(shape) if numbers.ndim else numbers, shape)
 
 
 def _evaluate(bound: Bounds, shape: tuple[int, ...], values: Values) -> Floats:
-    if not any(_parents(bound)):
-        return _constant(bound, shape)
-    if not isinstance(bound, tuple):
-        number = bound.evaluate(values) if isinstance(bound, Affine | Switch) else np.float64(bound)
-        return np.broadcast_to(
-            np.asarray(number)[(..., *(None,) * len(shape))], (*np.shape(number), *shape)
-        )
-    parts = [p.evaluate(values) if isinstance(p, Affine | Switch) else np.float64(p) for p in bound]
-    stacked: Floats = np.stack(np.broadcast_arrays(*parts), axis=-1)
-    return stacked.reshape(*stacked.shape[:-1], *shape)
+    """Return a corner of shape ``(..., *shape)``."""
+    parts = [
+        part.evaluate(values) if isinstance(part, Affine | Switch) else np.float64(part)
+        for part in listed(bound)
+    ]
+    if isinstance(bound, tuple):
+        stacked: Floats = np.stack(np.broadcast_arrays(*parts), axis=-1)
+        return stacked.reshape(*stacked.shape[:-1], *shape)
+    number = np.asarray(parts[0])
+    return np.broadcast_to(number[(..., *(None,) * len(shape))], (*number.shape, *shape))
 
 
 def _widened(low: Floats, high: Floats) -> tuple[Floats, Floats]:
@@ -177,24 +165,55 @@ def _widened(low: Floats, high: Floats) -> tuple[Floats, Floats]:
     return low - TOLERANCE * np.abs(low), high + TOLERANCE * np.abs(high)
 
 
-class Source(Frozen):
-    """Anything that values are drawn from: a space, or a distribution."""
+class Sampler(Frozen):
+    """Base class of spaces, which stand for their uniform distribution, and of distributions.
+
+    ``shape`` is that of one value, and ``values`` those of the variables that bounds follow.
+    """
 
     if TYPE_CHECKING:  # as in ``Frozen``
 
         def __init__(self, **fields: Any) -> None: ...
 
     def parents(self) -> frozenset[str]:
-        """Return the names of the variables that it depends on."""
+        """Return the names of the variables that it follows."""
         return frozenset()
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
         """Return how many uniform numbers one draw takes: one for each component."""
         return prod(shape)
 
+    def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
+        """Turn uniform numbers in [0, 1), shape ``(..., n)``, into draws, ``(..., *shape)``."""
+        raise NotImplementedError
+
+    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+        """Write it down for a message."""
+        raise NotImplementedError
+
+
+class Set(Sampler):
+    """Base class of spaces."""
+
+    if TYPE_CHECKING:  # as in ``Frozen``
+
+        def __init__(self, **fields: Any) -> None: ...
+
+    def contains(self, value: Value, values: Values | None = None) -> bool:
+        """Return whether a value lies inside, borders included."""
+        return bool(np.all(self.nearest(value, values) == value))
+
+    def nearest(self, value: Value, values: Values | None = None) -> Value:
+        """Find the point that is nearest to a value."""
+        raise NotImplementedError
+
+    def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
+        """Return the volume, or the number of values, shape ``(...)``."""
+        raise NotImplementedError
+
 
 @final
-class Box(Source):
+class Box(Set):
     """All points between two corners, both included.
 
     Attributes:
@@ -220,50 +239,50 @@ class Box(Source):
 
     def model_post_init(self, context: Any) -> None:
         """Refuse an empty box; a validator would do so again in every declaration that has it."""
-        low, high = (end if isinstance(end, tuple) else (end,) for end in (self.low, self.high))
+        low, high = listed(self.low), listed(self.high)
         if any(isinstance(part, float) and isnan(part) for part in (*low, *high)):
             raise ValueError(f"an end of a box is not a number: {self.low} and {self.high}")
         if len(low) != len(high) and min(len(low), len(high)) != 1:
             raise ValueError(f"a box has corners of one shape; these have {len(low)}, {len(high)}")
         n = max(len(low), len(high))
-        ends = zip(
-            low if len(low) == n else n * low, high if len(high) == n else n * high, strict=True
-        )
-        if any(isinstance(a, float) and isinstance(b, float) and a > b for a, b in ends):
+        corners = (end if len(end) == n else n * end for end in (low, high))
+        pairs = zip(*corners, strict=True)
+        if any(isinstance(a, float) and isinstance(b, float) and a > b for a, b in pairs):
             raise ValueError(f"a box is empty where low > high: {self.low} and {self.high}")
 
     @cached_property
     def _followed(self) -> frozenset[str]:
-        return frozenset(_parents(self.low, self.high))
+        ends = (*listed(self.low), *listed(self.high))
+        return frozenset(end.parent for end in ends if isinstance(end, Affine | Switch))
 
     def parents(self) -> frozenset[str]:
-        """Return the names of the variables that the bounds follow."""
         return self._followed
 
     def bounds(self, shape: tuple[int, ...], values: Values) -> tuple[Floats, Floats]:
         """Evaluate both corners, each of shape ``(..., *shape)``."""
-        if not self._followed:
-            return _constant(self.low, shape), _constant(self.high, shape)
-        return _evaluate(self.low, shape, values), _evaluate(self.high, shape, values)
+        low, high = (
+            _evaluate(end, shape, values) if self._followed else _broadcast(end, shape)
+            for end in (self.low, self.high)
+        )
+        return low, high
 
     @cached_property
-    def _widened(self) -> tuple[Floats, Floats] | None:
+    def _constant(self) -> tuple[Floats, Floats] | None:
         """Both corners, the tolerance included, where they follow no variable."""
-        if self.parents():
+        if self._followed:
             return None
         low, high = np.asarray(self.low, dtype=float), np.asarray(self.high, dtype=float)
         return _widened(low, high)
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Return whether a value lies inside, borders included."""
-        if self._widened is not None and np.ndim(value) < 2:
-            low, high = self._widened
-            return bool((value >= low).all() and (value <= high).all())
+        if self._constant is not None and np.ndim(value) < 2:
+            low, high = self._constant
+            inside = (value >= low) & (value <= high)
+            return bool(inside.all() if inside.ndim else inside)
         low, high = _widened(*self.bounds(np.shape(value), values or {}))
         return bool(np.all(value >= low) and np.all(value <= high))
 
     def nearest(self, value: Value, values: Values | None = None) -> Value:
-        """Find the point of the box that is nearest to a value."""
         low, high = self.bounds(np.shape(value), values or {})
         return np.asarray(np.clip(value, low, high))
 
@@ -278,42 +297,31 @@ class Box(Source):
         return np.asarray(np.clip(value, low + first, high - last))
 
     def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
-        """Multiply the edge lengths that are not zero, shape ``(...)``."""
         low, high = self.bounds(shape, values)
         edges = np.where(high > low, high - low, 1.0)
         return np.asarray(np.prod(edges, axis=tuple(range(-len(shape), 0))))
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
-        """Turn uniform numbers, shape ``(..., n)``, into uniform points, ``(..., *shape)``."""
         low, high = self.bounds(shape, values)
         unit = uniforms.reshape(*uniforms.shape[:-1], *shape)
         return low + (high - low) * unit
 
     def describe(self, shape: tuple[int, ...], values: Values) -> str:
-        """Write the box down."""
         low, high = self.bounds(shape, values)
         return f"[{np.array2string(low, precision=6)}, {np.array2string(high, precision=6)}]"
 
 
 def refuse_infinite(option: str, region: Any) -> None:
-    """Refuse a box that cannot be drawn from.
-
-    Args:
-        option: Its name, for the error.
-        region: Anything.
-
-    Raises:
-        UnknownOption: An end of it is not finite.
-    """
+    """Refuse a box that cannot be drawn from: with an end that is not finite."""
     if isinstance(region, Box):
-        ends = [*np.ravel(np.array(region.low, object)), *np.ravel(np.array(region.high, object))]
+        ends = (*listed(region.low), *listed(region.high))
         if any(isinstance(end, float | int) and not np.isfinite(end) for end in ends):
             raise UnknownOption(option, region, ("a box with finite ends",))
 
 
 @final
-class Integers(Source):
-    """All whole numbers between two ends, both included.
+class Integers(Set):
+    """All whole numbers between two ends, both included; each is equally likely in a draw.
 
     Example:
         >>> Integers(1, 4).contains(np.array(4)), Integers(1, 4).contains(np.array(5))
@@ -333,38 +341,31 @@ class Integers(Source):
             raise ValueError(f"there are no whole numbers from {self.low} to {self.high}")
         return self
 
-    def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Return whether a value is whole and lies between the ends."""
-        whole = np.all(value == np.rint(value))
-        return bool(whole and np.all(value >= self.low) and np.all(value <= self.high))
-
     def nearest(self, value: Value, values: Values | None = None) -> Value:
-        """Find the nearest whole number between the ends."""
         whole: Value = np.clip(np.rint(value), self.low, self.high).astype(np.int64)
         return whole
 
     def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
-        """Count the values."""
         return np.asarray(float(self.high - self.low + 1) ** int(np.prod(shape)))
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
-        """Turn uniform numbers into equally likely whole numbers."""
         unit = uniforms.reshape(*uniforms.shape[:-1], *shape)
         whole: Value = (self.low + np.floor(unit * (self.high - self.low + 1))).astype(np.int64)
         return whole
 
     def describe(self, shape: tuple[int, ...], values: Values) -> str:
-        """Write the range down."""
         return f"{{{self.low}, …, {self.high}}}"
 
 
 @final
-class Categories(Source):
-    """A few whole numbers, without an order, which may have labels.
+class Categories(Set):
+    """A few whole numbers without an order, which may have labels.
+
+    The nearest value of another number is the first member.
 
     Attributes:
         members: The numbers.
-        labels: Of each; ``do`` takes them in the place of numbers. There may be none.
+        labels: A name for each number, which ``do`` takes as well; or none.
 
     Example:
         >>> Categories((1, 20)).contains(np.array(20))
@@ -402,27 +403,19 @@ class Categories(Source):
         found = np.array([known[label] for label in np.ravel(labels).tolist()], dtype=np.int64)
         return found.reshape(np.shape(labels))
 
-    def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Return whether every component is a member."""
-        return bool(np.all(np.isin(value, self.members)))
-
     def nearest(self, value: Value, values: Values | None = None) -> Value:
-        """Keep members; replace others by the first member: there is no order."""
         kept: Value = np.where(np.isin(value, self.members), value, self.members[0])
         return kept.astype(np.int64)
 
     def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
-        """Count the values."""
         return np.asarray(float(len(self.members)) ** int(np.prod(shape)))
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
-        """Turn uniform numbers into equally likely members."""
         unit = uniforms.reshape(*uniforms.shape[:-1], *shape)
         index = np.floor(unit * len(self.members)).astype(np.int64)
         return np.asarray(self.members, dtype=np.int64)[index]
 
     def describe(self, shape: tuple[int, ...], values: Values) -> str:
-        """Write the members down, with their labels."""
         if not self.labels:
             return "{" + ", ".join(map(str, self.members)) + "}"
         pairs = zip(self.members, self.labels, strict=True)
@@ -433,8 +426,10 @@ _Part = Annotated[Box | Integers | Categories, Field(discriminator="kind")]
 
 
 @final
-class Either(Source):
-    """The union of two spaces: not their hull. A draw is uniform over both.
+class Either(Set):
+    """The union of two spaces, not their hull.
+
+    A draw chooses one of them in proportion to its volume, by its first uniform number.
 
     Example:
         >>> gap = Either(Box(0.0, 1.0), Box(2.0, 3.0))
@@ -450,28 +445,22 @@ class Either(Source):
         super().__init__(first=first, second=second, **fields)
 
     def parents(self) -> frozenset[str]:
-        """Return the names of the variables that the bounds follow."""
         return self.first.parents() | self.second.parents()
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Return whether one of the two contains the value."""
         return self.first.contains(value, values) or self.second.contains(value, values)
 
     def nearest(self, value: Value, values: Values | None = None) -> Value:
-        """Find the nearest point of either."""
         candidates = [self.first.nearest(value, values), self.second.nearest(value, values)]
         return min(candidates, key=lambda point: float(np.sum((point - value) ** 2)))
 
     def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
-        """Add the volumes of both."""
         return self.first.volume(shape, values) + self.second.volume(shape, values)
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Return how many uniform numbers one draw takes: one decides which of the two."""
         return 1 + max(self.first.n_uniforms(shape), self.second.n_uniforms(shape))
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
-        """Choose one of the two in proportion to its volume, then a point of it."""
         share = self.first.volume(shape, values) / self.volume(shape, values)
         draws = [
             space.transform(uniforms[..., 1 : 1 + space.n_uniforms(shape)], shape, values)
@@ -482,16 +471,18 @@ class Either(Source):
         return chosen
 
     def describe(self, shape: tuple[int, ...], values: Values) -> str:
-        """Write both down."""
         return f"{self.first.describe(shape, values)} ∪ {self.second.describe(shape, values)}"
 
 
 @final
-class Rotations(Source):
+class Rotations(Set):
     """All unit quaternions (x, y, z, w); q and -q are one rotation, written with w >= 0.
 
+    A value belongs to it if its norm is 1 to six digits; the nearest one of zero is the identity.
+    The volume of the group is π²: half of the unit sphere in four dimensions.
+
     Attributes:
-        keeps_sign: Whether q and -q are distinguished, for backends that keep what they were given.
+        keeps_sign: Whether q and -q are distinguished, for backends that keep the given sign.
 
     Example:
         >>> Rotations().nearest(np.array([0.0, 0.0, 0.0, -2.0]))
@@ -502,11 +493,9 @@ class Rotations(Source):
     keeps_sign: bool = False
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Return whether the norm is 1, to six digits."""
         return bool(np.all(np.abs(np.linalg.norm(value, axis=-1) - 1.0) < 1e-6))
 
     def nearest(self, value: Value, values: Values | None = None) -> Value:
-        """Scale to norm 1 and choose the sign; zero becomes the identity."""
         norm = np.linalg.norm(value, axis=-1, keepdims=True)
         whole = np.where(norm < 1e-12, (0.0, 0.0, 0.0, 1.0), value)
         length = np.where(norm < 1e-12, 1.0, norm)
@@ -516,11 +505,9 @@ class Rotations(Source):
         return unit + 0.0
 
     def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
-        """Return the volume of the group, π²: half of the unit sphere in four dimensions."""
         return np.asarray(float(np.pi**2))
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Return how many uniform numbers one draw takes: three."""
         return 3
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
@@ -536,7 +523,6 @@ class Rotations(Source):
         return self.nearest(np.stack(parts, axis=-1))
 
     def describe(self, shape: tuple[int, ...], values: Values) -> str:
-        """Write the set down."""
         return "the unit quaternions"
 
 

@@ -22,12 +22,11 @@ Region = SpaceName | Space
 
 @final
 class Subset(Frozen):
-    """A part of the parameter space.
+    """A subset of the parameter space: which variables may vary, and where each may lie.
 
-    Every part names variables by a pattern (``*`` and ``?`` stand for any letters) and says where
-    they may lie: in a declared space by its name, in a custom set, or nowhere (None): then
-    they are not to be set. For each variable the last part counts whose pattern fits its name; a
-    variable that none fits is not to be set.
+    Every part has a pattern of names (``*`` and ``?`` stand for any letters) and their region: a
+    declared space by its name, a custom set, or None if they are not to be set. For each variable
+    the last part counts whose pattern fits its name; a variable that none fits is not to be set.
 
     Attributes:
         parts: Pairs of a pattern and a region, in their order.
@@ -60,35 +59,20 @@ class Subset(Frozen):
 
     def __getitem__(self, patterns: str | tuple[str, ...]) -> Subset:
         """Restrict it to the variables that patterns name."""
-        wanted = _patterns(patterns)
-        only = {pattern: region for pattern, region in self.parts if pattern == "*"}
-        if len(self.parts) != 1 or not only:
-            raise UnknownOption(
-                "restriction of",
-                self,
-                (
-                    "A",
-                    "B",
-                    "AB: one region for all",
-                ),
-            )
-        return Subset([(pattern, only["*"]) for pattern in wanted])
+        if len(self.parts) != 1 or self.parts[0][0] != "*":
+            raise UnknownOption("restriction of", self, ("A", "B", "AB: one region for all"))
+        return Subset([(pattern, self.parts[0][1]) for pattern in _patterns(patterns)])
 
     def __mul__(self, other: Subset) -> Subset:
         """Return the product of two parts; where both name a variable, the second one counts."""
         return Subset((*self.parts, *other.parts))
 
     def __sub__(self, patterns: str | tuple[str, ...]) -> Subset:
-        """Leave variables out: they are not to be set."""
-        return Subset((*self.parts, *((pattern, None) for pattern in _patterns(patterns))))
+        """Exclude variables: they are not to be set."""
+        return self * Subset([(pattern, None) for pattern in _patterns(patterns)])
 
     def swap(self, patterns: str | tuple[str, ...], other: Subset | str | Space) -> Subset:
-        """Return a subset in which some variables have other regions.
-
-        Args:
-            patterns: Names of variables, or patterns.
-            other: Where they lie there: another part of the parameter space, or a region.
-        """
+        """Return a subset in which the named variables lie in another one, or in a region."""
         where = other if isinstance(other, Subset) else Subset({"*": other})
         return self * where[patterns]
 
@@ -100,7 +84,9 @@ class Subset(Frozen):
                 yield pattern
 
     def __str__(self) -> str:
-        return " × ".join(f"{_region(region)}[{pattern}]" for pattern, region in self.parts)
+        regions = ("∅" if region is None else region for _, region in self.parts)
+        words = (one if isinstance(one, str) else repr(one) for one in regions)
+        return " × ".join(f"{word}[{self.parts[i][0]}]" for i, word in enumerate(words))
 
 
 def _pair(pair: Any) -> tuple[str, Any]:
@@ -115,12 +101,6 @@ def _patterns(given: str | tuple[str, ...]) -> tuple[str, ...]:
     return (given,) if isinstance(given, str) else tuple(given)
 
 
-def _region(region: Region | None) -> str:
-    if region is None:
-        return "∅"
-    return region if isinstance(region, str) else repr(region)
-
-
 A = Subset("A")
 """The training space of every variable."""
 B = Subset("B")
@@ -133,15 +113,7 @@ AnyRegion = SpaceName | Subset
 
 
 def as_region(option: str, given: Any) -> AnyRegion | None:
-    """Read the space that interventions have to lie in: a name, a subset, or its parts.
-
-    Args:
-        option: Its name, for the error.
-        given: ``"A"``, ``"B"``, ``"A|B"``, a ``Subset``, its patterns and regions, or None.
-
-    Raises:
-        UnknownOption: It is none of these.
-    """
+    """Read a space that interventions have to lie in: a name, a subset, or its parts, or None."""
     if given is None or isinstance(given, Subset) or (isinstance(given, str) and given in SPACES):
         return given
     if isinstance(given, Mapping) and given.keys() == {"parts"}:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, final
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
-from scm_world._arguments import real_number, whole_number
+from scm_world._arguments import whole_number
 from scm_world.errors import UnknownOption
 from scm_world.variables.spaces import Frozen
 
@@ -17,8 +17,8 @@ class Contact(Frozen):
     """The event that two bodies touch: in the last physics step, with a force.
 
     Attributes:
-        first: Name of a body, or the beginning of one: ``"robot"`` is any link.
-        second: Likewise.
+        first: Name of a body, or the beginning of one: ``"robot"`` means any link.
+        second: That of the other body.
     """
 
     kind: Literal["contact"] = "contact"
@@ -26,9 +26,6 @@ class Contact(Frozen):
     second: str
 
     def __init__(self, first: str, second: str, **fields: Any) -> None:
-        for body in (first, second):
-            if not isinstance(body, str):
-                raise UnknownOption("body", body, ("the name of a body, or its beginning",))
         super().__init__(first=first, second=second, **fields)
 
     @property
@@ -52,15 +49,11 @@ class Reaches(Frozen):
     name: str
     above: float | None = None
     below: float | None = None
-    component: int = 0
+    component: int = Field(default=0, ge=0)
 
     def __init__(self, name: str, **fields: Any) -> None:
-        given = [fields.get("above"), fields.get("below")]
-        if (given[0] is None) == (given[1] is None):
+        if (fields.get("above") is None) == (fields.get("below") is None):
             raise UnknownOption("Reaches", fields, ("above=…", "below=…"))
-        number: Any = given[0] if given[1] is None else given[1]
-        real_number("threshold of Reaches", number)
-        whole_number("component of Reaches", fields.get("component", 0), least=0)
         super().__init__(name=name, **fields)
 
 
@@ -68,7 +61,7 @@ Event = Annotated[Contact | Reaches, Field(discriminator="kind")]
 
 
 class _Short(Frozen):
-    """A value whose representation and file leave out fields without a value."""
+    """A declaration whose representation and file leave out rare fields without a value."""
 
     RARE: ClassVar[tuple[str, ...]] = ()
 
@@ -129,16 +122,15 @@ class Time(_Short):
         return f"{again or 'at '}{self.at or 0}"
 
     def holds(self, step: int) -> bool:
-        """Tell whether this is a window, and a control step lies in it."""
+        """Return whether this is a window, and a control step lies in it."""
         start, stop = self.during or (step + 1, None)
         return start <= step and (stop is None or step < stop)
 
     @property
     def start(self) -> int | None:
-        """The first step at which it takes place; None of an event."""
-        if self.when is not None:
-            return None
-        return self.during[0] if self.during is not None else self.at or 0
+        """The first step at which it takes place; None for an event."""
+        first = self.at if self.during is None else self.during[0]
+        return None if self.when is not None else first or 0
 
 
 def _window(given: Any) -> tuple[int, int | None]:
@@ -151,11 +143,8 @@ def _window(given: Any) -> tuple[int, int | None]:
     return start, end
 
 
-_TIMES = frozenset(Time.RARE)
-
-
-class Timed(_Short):
-    """An intervention, and when it takes place in the episode of a plan.
+class TimedIntervention(_Short):
+    """Base class of interventions: each may have a time in the episode of a plan.
 
     Attributes:
         time: At the beginning if None; given as ``at=``, ``during=``, ``every=`` or ``when=``.
@@ -166,6 +155,6 @@ class Timed(_Short):
     time: Time | None = None
 
     def __init__(self, **fields: Any) -> None:
-        if not _TIMES.isdisjoint(fields):
-            fields["time"] = Time(**{n: fields.pop(n) for n in Time.RARE if n in fields})
+        if given := {name: fields.pop(name) for name in Time.RARE if name in fields}:
+            fields["time"] = Time(**given)
         super().__init__(**fields)

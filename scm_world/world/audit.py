@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Value
-from scm_world.backends import Backend
-from scm_world.models import Difference, Parameters
+from scm_world.models import Parameters
 from scm_world.variables import Hard
 from scm_world.world.compiled_task import StepBase
-from scm_world.world.interventions import Solution, same
-from scm_world.world.mechanisms import Row
+from scm_world.world.interventions import Transaction, same
+from scm_world.world.mechanisms import Rows
 
 
 @final
@@ -38,9 +37,11 @@ class Applied:
 
 
 @final
-@dataclass(frozen=True)
 class Audit:
-    """The result of a successful ``do``.
+    """The result of a successful ``do``; it is made when it is first read.
+
+    Args:
+        report: Returns the attributes, in their order.
 
     Attributes:
         targets: One entry for each target, by name.
@@ -56,9 +57,22 @@ class Audit:
     targets: Mapping[str, Applied]
     followed: Mapping[str, tuple[Value, Value]]
     engine: Mapping[str, tuple[Value, Value]]
-    came: tuple[str, ...] = ()
-    went: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
+    came: tuple[str, ...]
+    went: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+    def __init__(self, report: Callable[[], tuple[Any, ...]]) -> None:
+        self._report = report
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in Audit.__annotations__:
+            raise AttributeError(name)
+        vars(self).update(zip(Audit.__annotations__, self._report(), strict=True))
+        del self._report
+        return vars(self)[name]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in Audit.__annotations__}
 
     def __str__(self) -> str:
         lines = []
@@ -83,72 +97,53 @@ def _show(value: Value) -> str:
 
 def report(
     request: Mapping[str, Any],
-    solution: Solution,
-    change: Difference | None,
+    done: Transaction,
     before: StepBase,
-    now: Row,
+    now: Rows,
     inertia: Parameters,
     reported: Parameters,
-    backend: Backend,
-) -> Audit:
-    """Return what a committed intervention did.
+    remarks: tuple[str, ...],
+) -> tuple[Any, ...]:
+    """Return what a committed intervention did; see ``Audit``.
 
     Args:
         request: As it was given, with dotted names.
-        solution: That was applied.
-        change: What the backend had to change.
+        done: What became of it.
         before: The world before.
-        now: The values that the world has now.
+        now: The values after.
         inertia: Principal moments of bodies whose mass or size changed, before.
-        reported: Parameters that were read back already.
-        backend: That took over the change.
+        reported: Parameters that were read back.
+        remarks: Of the backend.
     """
-    compiled, old, changed = solution.compiled, before.row, solution.changed
-    keys, bundles, model = compiled.parameter_keys, compiled.bundles, compiled.model
-    wanted = {keys[t] for name in solution.asked for t in model.targets(name) if t in keys}
-    missing = [*(wanted - reported.keys()), *inertia]
-    reported = {**reported, **backend.parameters(missing)} if missing else reported
+    compiled, old, bundles = done.compiled, before.row, done.compiled.bundles
     targets = {
-        name: Applied(name, request[name], *_asked(solution, now, reported, name))
-        for name in solution.asked
+        name: Applied(name, request[name], *_values(done, now, reported, name))
+        for name in done.asked
     }
     known = {*targets, *(part for name in targets for part in bundles.get(name, ()))}
-    followed = {
-        name: (np.array(old[name]), np.array(now[name])) for name in changed if name not in known
-    }
-    if change is not None and change.state is not None:
-        for name in before.compiled.slices:
-            if name in bundles or name in known or name not in compiled.slices:
-                continue
-            if not same(old[name], now[name]):
-                followed[name] = (np.array(old[name]), np.array(now[name]))
+    names = [name for name in done.changed if name not in known]
+    if done.change is not None and done.change.state is not None:
+        states = (n for n in before.compiled.slices if n in compiled.slices and n not in bundles)
+        names += [n for n in states if n not in known and not same(old[n], now[n])]
+    followed = {name: (np.array(old[name]), np.array(now[name])) for name in names}
     engine = {".".join(key): (was, reported[key]) for key, was in inertia.items()}
-    came: list[str] = []
-    went: list[str] = []
-    if compiled is not before.compiled:
-        there, were = ({*one.composition.bodies} for one in (compiled, before.compiled))
-        came, went = sorted(there - were), sorted(were - there)
-    remarks: tuple[str, ...] = ()
-    set_here = change.parameters if change is not None and change.structure is None else {}
-    if any(what.endswith("friction") for _, what in set_here):
-        frictions = {keys[name]: old[name] for name in changed if name in keys}
-        remarks = backend.capabilities.remarks(backend, frictions)
-    return Audit(targets, followed, engine, tuple(came), tuple(went), remarks)
+    there, were = ({*one.composition.bodies} for one in (compiled, before.compiled))
+    return targets, followed, engine, (*sorted(there - were),), (*sorted(were - there),), remarks
 
 
-def _asked(
-    solution: Solution, now: Row, reported: Parameters, name: str
+def _values(
+    done: Transaction, now: Rows, reported: Parameters, name: str
 ) -> tuple[Value | None, Value | None]:
-    """Return the value that something asked for has now, and what the backend reports of it.
+    """Return the value that a target has now, and what the backend reports of it.
 
     None of an action that is known only at its step, and of what the backend does not know.
     """
-    compiled = solution.compiled
+    compiled = done.compiled
     targets = compiled.model.targets(name)
     values, backs = list[Value](), list[Value]()
     for target in targets:
         if target in compiled.actions:
-            act = solution.checked.acts[target][1]
+            act = done.acts[target][1]
             values += [np.array(act.value)] if isinstance(act, Hard) else []
             continue
         values.append(np.array(now[target]))

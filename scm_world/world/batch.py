@@ -2,67 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from inspect import signature
 from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import whole_number
-from scm_world._types import Floats, Integers
-from scm_world.errors import EngineFailure, UnknownOption
-from scm_world.variables.reserved import CONTROL_INDEX
+from scm_world._arguments import real_numbers, whole_number
+from scm_world._types import ArrayLike, Floats, Integers, Value
+from scm_world.backends import Backend
+from scm_world.errors import ActionError, EngineFailure, ScmWorldError, UnknownOption
+from scm_world.graph import flatten
+from scm_world.variables.subsets import AnyRegion
 from scm_world.work.processes import cores
+from scm_world.world.audit import Audit
 from scm_world.world.compiled_task import CompiledTask
+from scm_world.world.mechanisms import Rows
 from scm_world.world.simulation import Simulation
 
-KEPT = 4
-"""Tables of structures that are kept for when these come again."""
+OF_WORLD = frozenset(signature(Simulation).parameters)
+"""Options of a world; others are those of its task."""
 
-
-@final
-class StateTable:
-    """The present of worlds of one structure: a row for each world, columns for variables.
-
-    Args:
-        compiled: The task in that structure.
-        names: What is computed after every step.
-        n: How many worlds there could be.
-
-    Attributes:
-        compiled: The task in that structure.
-        matrix: Shape (n, width); the first columns are those of the state.
-        state_size: How many these are.
-        where: The columns of each variable. What is computed and not in ``names`` may be old.
-    """
-
-    def __init__(self, compiled: CompiledTask, names: Iterable[str], n: int) -> None:
-        self.compiled = compiled
-        self.names = tuple(name for name in names if name in compiled.model)
-        mechanisms = compiled.mechanisms
-        self.matrix = np.repeat(mechanisms.start[None], n, axis=0)  # rows are views of this
-        self.state_size, self.where = mechanisms.state_size, mechanisms.where
-
-    def column(self, name: str) -> Floats:
-        """Give the values of a variable in all rows, shape (n, k), as a view."""
-        return self.matrix[:, self.where[name]]
-
-    def actions(self) -> Floats:
-        """Give the actions of all rows, shape (n, n_actions), as a view."""
-        return self.matrix[:, self.compiled.mechanisms.actions]
-
-    def clock(self, row: int) -> int:
-        """Give the control step of a row."""
-        return int(self.matrix[row, self.where[CONTROL_INDEX].start])
+Mask = NDArray[np.bool_]
 
 
 @final
 class Batch:
     """Worlds of one task, options and backend, advanced in one call.
 
-    A world in a batch is bit-identical to one that is stepped alone. Between steps,
-    ``world`` gives a world as it is now, to ask it or to do something to it: use that, not a
-    reference of your own, whose present may be older.
+    The present of each world is a row of the values of all worlds of its structure. A world in a
+    batch is bit-identical to one that is stepped alone, and can be used alone at any time.
+    ``World(task, num_worlds=n)`` makes one.
 
     Args:
         worlds: They belong to the batch from now on.
@@ -78,8 +49,8 @@ class Batch:
         ...     world.reset(seed=seed)
         >>> batch = Batch(worlds, names=["reward"])
         >>> batch.advance(np.zeros((3, 9)))
-        >>> batch.table(0).column("reward").shape, batch.world(2).index
-        ((3, 1), 1)
+        >>> batch["reward"].shape, batch.world(2).index
+        ((3,), 1)
     """
 
     def __init__(
@@ -94,62 +65,200 @@ class Batch:
         count = cores() if threads is None else whole_number("threads", threads, least=1)
         backends = [world.backend for world in self._worlds]
         self._engine = backends[0].batch(backends, count)
-        self._names = tuple(names)
-        n = len(self._worlds)
-        self._tables: dict[CompiledTask, StateTable] = {}
-        self._kinds: list[tuple[Any, ...]] = [()] * n  # table, mode and substeps of each world
-        self._groups: list[tuple[Any, Integers]] | None = None  # all worlds, by these
-        self._stepped = np.zeros(n, dtype=np.bool_)  # the world does not know yet
-        self._ready = np.zeros(n, dtype=np.bool_)  # unchanged since it was stepped
-        self._fresh = np.zeros(n, dtype=np.bool_)  # what a step keeps has been computed
+        self._names, n = tuple(names), len(self._worlds)
+        self._tables: dict[CompiledTask, Rows] = {}
+        self._versions = [-1] * n  # of each world when its row was filled
+        self._kinds: list[Any] = [None] * n  # structure of each world, and physics steps
+        self._acts_alone: set[int] = set()
         self._all = np.arange(n)
-        self._held: set[int] = set()
-        self._translating: set[int] = set()
-        self._commands = np.zeros((n, self._worlds[0].structure.n_commands))
+
+    @classmethod
+    def of(
+        cls,
+        kind: type[Simulation],
+        num_worlds: int,
+        task: Any = "pushing",
+        *,
+        threads: int | None = None,
+        **options: Any,
+    ) -> Batch:
+        """Make worlds that share what is declared.
+
+        Args:
+            kind: ``Simulation`` or ``World``.
+            num_worlds: How many.
+            task: As in ``Simulation``.
+            threads: Of the backend; as many as there are cores if None.
+            options: Of ``Simulation``; a backend is given by its name.
+
+        Raises:
+            UnknownOption: An option does not exist, or the number is none.
+        """
+        n = whole_number("num_worlds", num_worlds, least=1)
+        backend = options.get("backend")
+        if isinstance(backend, Backend) and n > 1:
+            raise UnknownOption("backend of many worlds", backend, ("the name of one",))
+        first = kind(task, **options)
+        of_world = {name: value for name, value in options.items() if name in OF_WORLD}
+        return cls(
+            [first, *(kind(first.structures, **of_world) for _ in range(n - 1))], threads=threads
+        )
 
     def __len__(self) -> int:
         """Count the worlds."""
         return len(self._worlds)
 
-    def world(self, index: int) -> Simulation:
-        """Give a world as it is now."""
-        world = self._worlds[index]
-        if self._stepped[index]:
-            world.arrive(self.table(index).clock(index))
-            self._stepped[index] = False
-        self._ready[index] = False
-        return world
-
-    def fill(self, rows: Integers) -> None:
-        """Move the present of some worlds to their rows, with what is computed.
+    def __getitem__(self, name: str) -> Value:
+        """Return the present values of a variable, shape (n, *shape), as a copy.
 
         Raises:
-            NotReset: A world has no episode yet.
+            UnknownVariable: No variable has this name in one of the worlds.
+            NotReset: One of the worlds has no episode yet.
         """
-        for row in rows[~self._ready[rows]].tolist():
-            self._take(row)
+        parts = []
+        for table, rows in self.tables(self._all):
+            self._worlds[rows[0]].model.declared(name)
+            table.evaluate((name,), rows)
+            parts.append((table[name][rows], rows))
+        if len(parts) == 1:
+            return parts[0][0]
+        found = np.empty((len(self), *parts[0][0].shape[1:]), parts[0][0].dtype)
+        for values, rows in parts:
+            found[rows] = values
+        return found
 
-    def table(self, index: int) -> StateTable:
-        """Give the table in whose row of this number the present of a world is."""
-        kind = self._kinds[index]
-        return kind[0] if kind else self._table(self._worlds[index].compiled)
+    @property
+    def index(self) -> Integers:
+        """How many control steps of each episode are over, shape (n,)."""
+        return np.array([world.index for world in self._worlds])
 
-    def tables(self, rows: Integers) -> list[tuple[StateTable, Integers]]:
-        """Give the tables of some worlds, each with the rows of those that are in it."""
-        found: dict[StateTable, list[Integers]] = {}
-        for (table, *_), members in self._grouped(rows):
-            found.setdefault(table, []).append(members)
-        return [(table, np.sort(np.concatenate(parts))) for table, parts in found.items()]
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        which: Any = None,
+        do: Mapping[str, Any] | None = None,
+        space: AnyRegion | None = None,
+    ) -> dict[int, Audit | None]:
+        """Begin an episode in some worlds; in all of them, or in none; see ``Simulation.reset``.
+
+        Args:
+            seed: Of the first world, the next one gets the next number; or one for each.
+            which: Truth values, shape (n,): who is reset; all if None.
+            do: As in ``do``.
+            space: As in ``do``.
+
+        Raises:
+            InterventionError: The intervention was refused; the message says by which world.
+        """
+        seeds, asked = read_seeds(seed, len(self)), self._each(do or {})
+
+        def begin(row: int) -> Audit | None:
+            return self._worlds[row].reset(seed=seeds[row], do=asked(row), space=space)
+
+        return self._everywhere(which, begin)
+
+    def do(
+        self, request: Mapping[str, Any], *, which: Any = None, space: AnyRegion | None = None
+    ) -> dict[int, Audit]:
+        """Intervene now in some worlds; in all of them, or in none; see ``Simulation.do``.
+
+        Args:
+            request: Values, or interventions, by name. A value with a leading axis of n worlds has
+                one for each of them; else it holds in all.
+            which: Truth values, shape (n,): where; everywhere if None.
+            space: In which every target must lie.
+
+        Returns:
+            What it did, by the number of the world.
+
+        Raises:
+            InterventionError: It was refused; the message says by which world. Nothing has changed.
+            NotReset: One of the worlds has no episode yet.
+        """
+        asked = self._each(request)
+        return self._everywhere(which, lambda row: self._worlds[row].do(asked(row), space=space))
+
+    def _each(self, request: Mapping[str, Any]) -> Callable[[int], dict[str, Any]]:
+        """Return what gives the request of one world."""
+        flat = flatten(request)
+
+        def asked(row: int) -> dict[str, Any]:
+            model = self._worlds[row].model
+            return {
+                name: value[row]
+                if isinstance(value, list | np.ndarray)
+                and name in model
+                and np.shape(value) == (len(self), *model.declared(name).shape)
+                else value
+                for name, value in flat.items()
+            }
+
+        return asked
+
+    def _everywhere(self, which: Any, act: Callable[[int], Any]) -> dict[int, Any]:
+        """Change some worlds, all of them or none."""
+        found: dict[int, Any] = {}
+        back: list[Callable[[], None]] = []
+        row = 0
+        try:
+            for row in np.flatnonzero(read_mask("which", which, len(self))).tolist():
+                back.append(self._worlds[row].way_back())
+                found[row] = act(row)
+        except BaseException as error:
+            for undo in back:
+                undo()
+            if isinstance(error, ScmWorldError):
+                located(error, row, "world")
+            raise
+        return found
+
+    def step(self, actions: ArrayLike, *, which: Any = None) -> None:
+        """Advance some worlds one control step.
+
+        Args:
+            actions: Shape (n, n_actions) in SI units; clipped to their range.
+            which: Truth values, shape (n,): who is stepped; all if None.
+
+        Raises:
+            ActionError: Wrong shape, or a number that is not finite. No world was stepped.
+            NotReset: One of them has no episode yet.
+            EngineFailure: The backend lost a state; all other worlds are one step further.
+        """
+        mask = read_mask("which", which, len(self))
+        given = read_actions(actions, mask, self._worlds[0].compiled.n_actions, "world")
+        for row in np.flatnonzero(mask).tolist():
+            self._worlds[row].act()
+        low, high = self._worlds[0].compiled.action_bounds
+        self.advance(np.clip(given, low, high), None if which is None else mask)
+
+    def world(self, index: int) -> Simulation:
+        """Give a world."""
+        return self._worlds[index]
+
+    def table(self, index: int) -> Rows:
+        """Give the rows of all worlds of the structure that a world has."""
+        self.fill(self._all[index : index + 1])
+        return self._tables[self._kinds[index][0]]
+
+    def tables(self, rows: Integers) -> list[tuple[Rows, Integers]]:
+        """Give the rows of some worlds by structure, and which worlds of it are among them."""
+        self.fill(rows)
+        found: dict[CompiledTask, list[Integers]] = {}
+        for (compiled, _), members in self._grouped(rows):
+            found.setdefault(compiled, []).append(members)
+        parts = found.items()
+        return [(self._tables[one], np.sort(np.concatenate(members))) for one, members in parts]
 
     def advance(
-        self, commands: Floats, which: NDArray[np.bool_] | None = None, *, evaluate: bool = True
+        self, commands: Floats, which: Mask | None = None, *, evaluate: bool = True
     ) -> None:
         """Advance worlds one control step; see ``Simulation.advance``.
 
         Args:
             commands: For each world finite numbers in their range, shape (n, n_actions).
             which: Who is advanced, shape (n,); all if None.
-            evaluate: Whether to compute what the tables have.
+            evaluate: Whether to compute what is computed after every step.
 
         Raises:
             NotReset: A world has no episode yet.
@@ -158,91 +267,146 @@ class Batch:
         """
         rows = self._all if which is None else np.flatnonzero(which)
         self.fill(rows)
-        held = self._held.intersection(rows.tolist()) if self._held else ()
-        if held:
+        sent = commands
+        if self._acts_alone:
             commands = commands.copy()
-            for row in held:
-                commands[row] = self.world(row).decided(commands[row])
-        groups = self._grouped(rows)
+            sent = np.zeros((len(self), self._worlds[0].structure.n_commands))
+            for row in rows.tolist():
+                world = self._worlds[row]
+                commands[row] = world.decided(commands[row])
+                sent[row] = world.command(commands[row])
         failed: EngineFailure | None = None
-        for (table, substeps), members in groups:
+        groups = self._grouped(rows)
+        for (compiled, substeps), members in groups:
             try:
-                self._step(table, substeps, members, commands)
+                self._step(self._tables[compiled], substeps, members, commands, sent)
             except EngineFailure as error:
                 failed = failed or error
         if failed is not None:
             raise failed
-        for (table, *_), members in groups if evaluate else ():
-            table.compiled.mechanisms.evaluate(table.names, table.matrix, members)
-            self._fresh[members] = True
+        for (compiled, _), members in groups if evaluate else ():
+            self._tables[compiled].evaluate(self._names, members)
 
-    def _step(self, table: StateTable, substeps: int, rows: Integers, commands: Floats) -> None:
-        matrix, mechanisms = table.matrix, table.compiled.mechanisms
-        if not self._translating:
-            self._commands[rows] = commands[rows]
-        for row in rows.tolist() if self._translating else ():
-            self._commands[row] = self._worlds[row].command(commands[row], table.clock(row))
-        stale = rows[~self._fresh[rows]]
-        if len(stale):
-            mechanisms.evaluate((), matrix, stale)
-        kept, stepped = matrix[rows if self._engine.may_refuse else rows[:0]], self._stepped[rows]
-        mechanisms.remember(matrix, rows)
-        table.actions()[rows] = commands[rows]
-        matrix[rows, table.where[CONTROL_INDEX].start] += 1.0
-        self._fresh[rows] = False
-        self._stepped[rows] = self._ready[rows] = True
+    def _step(
+        self, table: Rows, substeps: int, rows: Integers, commands: Floats, sent: Floats
+    ) -> None:
+        matrix, clock = table.numbers, table.mechanisms.clock
+        kept = matrix[rows if self._engine.may_refuse else rows[:0]]
+        table.remember(rows)
+        table.actions[rows] = commands[rows]
+        matrix[rows, clock] += 1.0
         try:
-            self._engine.step(rows, self._commands, substeps, matrix)
+            self._engine.step(rows, sent, substeps, matrix)
         except BaseException as error:  # or Ctrl-C: the others were stepped
             unmoved = error.unmoved if isinstance(error, EngineFailure) else ()
             for place, row in enumerate(rows.tolist()):
                 if row in unmoved:
-                    matrix[row], self._stepped[row] = kept[place], stepped[place]
-                world = self.world(row)
-                world.backend.read(world.current()[1])
+                    matrix[row] = kept[place]
+                self._worlds[row].backend.read(self._worlds[row].state)
             raise
 
     def _grouped(self, rows: Integers) -> list[tuple[Any, Integers]]:
         """Tell worlds of different structures and presets apart."""
-        if self._groups is not None and len(self._groups) == 1:
-            return [(self._groups[0][0], rows)] if len(rows) else []
-        found: dict[tuple[Any, ...], list[int]] = {}
+        first = self._kinds[0]
+        if self._kinds.count(first) == len(self):
+            return [(first, rows)] if len(rows) else []
+        found: dict[Any, list[int]] = {}
         for row in rows.tolist():
-            found.setdefault(self._kinds[row] or (self.table(row), 0), []).append(row)
+            found.setdefault(self._kinds[row], []).append(row)
         return [(kind, np.array(members)) for kind, members in found.items()]
 
-    def _take(self, row: int) -> None:
-        """Move the present of a world to its row."""
-        world = self._worlds[row]
-        table = self._table(world.compiled)
-        world.evaluate(table.names)
-        if world.numbers.base is not table.matrix:
-            world.move(table.matrix[row : row + 1])
-        kind = (table, world.substeps)
-        if self._kinds[row] != kind:
-            self._kinds[row] = kind
-            alike = all(other == kind for other in self._kinds)
-            self._groups = [(kind, self._all)] if alike else None
-        self._ready[row] = self._fresh[row] = True
-        both = ((self._held, world.holds_action), (self._translating, world.translates))
-        for rows, belongs in both:
-            if belongs:
-                rows.add(row)
-            else:
-                rows.discard(row)
+    def fill(self, rows: Integers) -> None:
+        """Give worlds that have changed their rows, with what is computed after every step.
 
-    def _table(self, compiled: CompiledTask) -> StateTable:
-        found = self._tables.get(compiled)
-        if found is None:
-            used = {id(kind[0]) for kind in self._kinds if kind}
-            unused = [key for key, table in self._tables.items() if id(table) not in used]
-            for key in unused[: max(0, len(self._tables) + 1 - KEPT)]:
-                del self._tables[key]
-            found = StateTable(compiled, self._names, len(self._worlds))
-            self._tables[compiled] = found
-        return found
+        Raises:
+            NotReset: A world has no episode yet.
+        """
+        for row in rows.tolist():
+            world = self._worlds[row]
+            if world.version == self._versions[row]:
+                continue
+            world.evaluate(self._names)
+            self._kinds[row] = world.compiled, world.substeps
+            table = self._table(world.compiled)
+            if world.row.numbers.base is not table.numbers:
+                world.move(table.row(row))
+            (self._acts_alone.add if world.acts_alone else self._acts_alone.discard)(row)
+            self._versions[row] = world.version
+
+    def _table(self, compiled: CompiledTask) -> Rows:
+        if compiled not in self._tables:
+            used = {kind[0] for kind in self._kinds if kind}
+            start = np.repeat(compiled.mechanisms.start[None], len(self), axis=0)
+            kept = {one: table for one, table in self._tables.items() if one in used}
+            self._tables = {**kept, compiled: Rows(compiled.mechanisms, start)}
+        return self._tables[compiled]
 
     def close(self) -> None:
         """Free the backends of all worlds."""
         for world in self._worlds:
             world.close()
+
+
+# --- arguments of many worlds ---------------------------------------------------------------------
+
+
+def located(error: ScmWorldError, index: int, what: str) -> ScmWorldError:
+    """Say in an error in which world it happened.
+
+    Example:
+        >>> print(located(ScmWorldError("the block is in the table"), 3, "world"))
+        world 3: the block is in the table
+    """
+    error.args = (f"{what} {index}: {error}",)
+    return error
+
+
+def read_seeds(seed: Any, size: int) -> list[Any]:
+    """Return the seed of each world.
+
+    Example:
+        >>> read_seeds(7, 3)
+        [7, 8, 9]
+    """
+    if seed is None:
+        return [None] * size
+    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
+        return [whole_number("seed", seed, least=0) + index for index in range(size)]
+    if len(seed) != size:
+        raise UnknownOption("seed", seed, ("a whole number", f"a list of {size} of them or None"))
+    return [*seed]
+
+
+def read_mask(name: str, mask: Any, size: int) -> Mask:
+    """Read which worlds are meant; all if None."""
+    if mask is None:
+        return np.ones(size, bool)
+    read = isinstance(mask, np.ndarray) and mask.shape == (size,) and mask.dtype == np.bool_
+    if not (read and mask.any()):
+        allowed = (f"an array of {size} truth values, at least one of them true",)
+        raise UnknownOption(name, mask, allowed)
+    return np.array(mask)
+
+
+def read_actions(actions: Any, which: Mask, size: int, what: str) -> Floats:
+    """Read the actions of all worlds, shape (n, size).
+
+    Args:
+        actions: One for each.
+        which: The worlds that are stepped, shape (n,).
+        size: How many numbers an action has.
+        what: The name of a world in errors.
+    """
+    try:
+        given = real_numbers(actions)
+    except (TypeError, ValueError):  # text, or a ragged list
+        given = np.empty(0)
+    if given.shape != (which.size, size):
+        shape = f"actions of {which.size} {what}s have shape ({which.size}, {size})"
+        raise ActionError(f"{shape}, got {given.shape}", actions)
+    wrong = np.flatnonzero(which & ~np.isfinite(given).all(axis=1))
+    if wrong.size:
+        numbers = "a finite number" if size == 1 else f"{size} finite numbers"
+        text = f"{what} {wrong[0]}: an action is {numbers}, got {given[wrong[0]]!r}"
+        raise ActionError(text, actions)
+    return given

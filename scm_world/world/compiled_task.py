@@ -18,14 +18,17 @@ from scm_world.errors import ActionError, InterventionError, ModelError, Unknown
 from scm_world.geometry.numbers import clip_kernel
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
-from scm_world.models.scene import SURFACES
+from scm_world.models.scene import SURFACES, Overlap
 from scm_world.tasks import Conventions, Task, Timing
 from scm_world.variables import Action, Box, Derived, Exogenous, Intervention, Measured
 from scm_world.variables.checks import check_bounds, coerce
-from scm_world.world.mechanisms import Mechanisms, Row, wrong_value
+from scm_world.world.mechanisms import Mechanisms, Rows, wrong_value
 
 Plan = tuple[Hashable, frozenset[str]]
 """A structure: which bodies the task asks for, and the names of those that were taken away."""
+
+BOXES = 64
+"""How many requests with draws are kept for when they come again."""
 
 PendingInterventions = dict[str, tuple[str, Intervention]]
 """By target: the name that was asked for (the target, or coordinates of it), and what for."""
@@ -172,15 +175,13 @@ class CompiledTask(ActionVector):
         composition: What the variables mean to an engine.
         slices: Where each state stands in the state vector, and each bundle of states that stand
             there one after another.
-        whole: States that are whole numbers.
         bundles: The parts of each bundle.
         parts: Those of all bundles.
         commanded: Where each action stands, with the bundles of actions.
         parameter_keys: Which physical parameter each variable sets.
-        carried: States that follow others when these are set.
-        carried_by_name: The same, by name.
+        carried: States that follow others when these are set, by name, causes before effects.
         set_by_hand: Everything that is set at one instant: states, and the clock.
-        set_parents: These others, of each.
+        set_parents: These others, by state.
         computed: Variables that are computed from what moves, causes before effects.
         static_names: Everything that interventions alone decide, causes before effects.
         static: The same, without their order.
@@ -199,14 +200,10 @@ class CompiledTask(ActionVector):
         self.commanded = {**self.actions, **_in_a_row(self.bundles, self.actions)}
         states = self.composition.system.layout.slices
         self.slices = {**states, **_in_a_row(self.bundles, states)}
-        self.whole = tuple(
-            name for name in self.slices if self.model.declared(name).dtype != "real"
-        )
         ordered = map(self.model.declared, self.model.structure.order)
         measured = [v for v in ordered if isinstance(v, Measured)]
         self.set_parents = {v.name: found for v in measured if (found := v.set_parents())}
-        self.carried = tuple(v for v in measured if v.name in self.set_parents)
-        self.carried_by_name = {v.name: v for v in self.carried}
+        self.carried = {v.name: v for v in measured if v.name in self.set_parents}
         self.set_by_hand = frozenset(v.name for v in self.model.variables if v.role == "state")
         problems = [
             f"{v.name!r} is drawn in every step, which a world does not do: use a noise of the task"
@@ -231,9 +228,7 @@ class CompiledTask(ActionVector):
             if (isinstance(v, Exogenous) and v.distribution) or (isinstance(v, Derived) and v.noise)
         )
         self._coordinates: dict[str, Callable[..., Any]] = {}
-        self._boxes: dict[Any, tuple[Integers, Floats, Floats] | None] = {}
-        self._reached: dict[frozenset[str], frozenset[str]] = {}
-        self._material: dict[str, bool] = {}
+        self._boxes: dict[Any, tuple[frozenset[str], list[Any]]] = {}
         self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._constants: dict[Structure, Mapping[ParameterKey, Floats]] = {}
 
@@ -264,12 +259,6 @@ class CompiledTask(ActionVector):
         return found
 
     @cached_property
-    def can_be_set(self) -> NDArray[np.bool_]:
-        """Which numbers of the state can be set, shape (size,)."""
-        found: NDArray[np.bool_] = self._start.layout.can_be_set
-        return found
-
-    @cached_property
     def movers(self) -> frozenset[str]:
         """The bodies that can come and go, and move."""
         return frozenset(self.composition.movers())
@@ -286,10 +275,6 @@ class CompiledTask(ActionVector):
             for name, where in self.commanded.items()
         }
 
-    def structure(self, values: Values) -> Structure:
-        """Say what the backend has to compile."""
-        return self.composition.structure(values)
-
     def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
         """Name some variables and what follows them at lag 0, without physics, causes first."""
         key = tuple(targets)
@@ -298,54 +283,66 @@ class CompiledTask(ActionVector):
             self._follow[key] = tuple(name for name in self.static_names if name in follow)
         return self._follow[key]
 
-    def box(self, name: str, source: Any) -> tuple[Integers, Floats, Floats] | None:
-        """Return columns, lower ends and edges of a box that a variable is drawn from.
+    def boxes(self, draws: tuple[tuple[str, Any, str], ...]) -> tuple[frozenset[str], list[Any]]:
+        """Find the parameters that are drawn from boxes which follow nothing.
 
-        None where the source is no box, follows other variables or reaches beyond the bounds.
+        Args:
+            draws: Names, sources and streams.
+
+        Returns:
+            Their names; and by size their names, streams, columns, lower ends and edges, the last
+            three of shape (draws, size).
         """
-        key = name, source
-        if key not in self._boxes:
-            variable: Any = self.model.declared(name)
-            space: Any = variable.space(source) if isinstance(source, str) else source
-            self._boxes[key] = None
-            ends = []
-            for one in (space, variable.bounds or space):
-                if isinstance(one, Box) and not one.parents() and variable.dtype == "real":
-                    ends += [np.ravel(end) for end in one.bounds(variable.shape, {})]
-            if len(ends) == 4 and (ends[0] >= ends[2]).all() and (ends[1] <= ends[3]).all():
-                where = self.mechanisms.where[name]
-                columns = np.arange(where.start, where.stop)
-                self._boxes[key] = columns, ends[0], ends[1] - ends[0]
-        return self._boxes[key]
+        if draws not in self._boxes:
+            if len(self._boxes) == BOXES:
+                self._boxes.clear()
+            sizes = dict[int, list[Any]]()
+            for name, source, stream in draws:
+                box = self._box(name, source)
+                if box is not None:
+                    sizes.setdefault(len(box[0]), []).append((name, stream, *box))
+            names = frozenset(one[0] for group in sizes.values() for one in group)
+            groups = [(*zip(*group, strict=True),) for group in sizes.values()]
+            self._boxes[draws] = names, [(*g[:2], *map(np.stack, g[2:])) for g in groups]
+        return self._boxes[draws]
 
-    def reached(self, names: Iterable[str]) -> frozenset[str]:
+    def _box(self, name: str, source: Any) -> tuple[Integers, Floats, Floats] | None:
+        """Return columns, lower ends and edges; None of a source that reaches beyond the bounds."""
+        variable: Any = self.model.declared(name)
+        space: Any = variable.space(source) if isinstance(source, str) else source
+        ends = []
+        for one in (space, variable.bounds or space) if name in self.static else ():
+            if isinstance(one, Box) and not one.parents() and variable.dtype == "real":
+                ends += [np.ravel(end) for end in one.bounds(variable.shape, {})]
+        if len(ends) < 4 or (ends[0] < ends[2]).any() or (ends[1] > ends[3]).any():
+            return None
+        where = self.mechanisms.where[name]
+        return np.arange(where.start, where.stop), ends[0], ends[1] - ends[0]
+
+    def reached(self, names: Iterable[str]) -> set[str]:
         """Name the parameters and states that change at an instant with some targets."""
-        key = frozenset(target for name in names for target in self.model.targets(name))
-        if key not in self._reached:
-            found = {*key, *self.static_order(sorted(key))}
-            for state in self.carried:
-                if not found.isdisjoint(self.set_parents[state.name]):
-                    found.add(state.name)
-            self._reached[key] = frozenset(found)
-        return self._reached[key]
+        targets = {target for name in names for target in self.model.targets(name)}
+        found = {*targets, *self.static_order(sorted(targets))}
+        for name in self.carried:
+            if not found.isdisjoint(self.set_parents[name]):
+                found.add(name)
+        return found
 
-    def surfaces(self, names: Iterable[str]) -> set[str]:
-        """Name those of ``reached`` that decide where bodies are, or how large."""
-        keys = self.parameter_keys
-        shapes = {name for name, key in keys.items() if key[1] in SURFACES}
-        return {name for name in self.reached(names) if name in self.places or name in shapes}
+    @cached_property
+    def surfaces(self) -> frozenset[str]:
+        """The parameters and states that decide where bodies are, or how large."""
+        shapes = (name for name, key in self.parameter_keys.items() if key[1] in SURFACES)
+        return frozenset((*self.places, *shapes))
 
-    def is_material(self, name: str) -> bool:
-        """Return whether a variable moves a body or changes its size, when it is set.
+    @cached_property
+    def material(self) -> frozenset[str]:
+        """The parameters and states that move a body or change its size when they are set.
 
         Goals count as bodies where there are obstacles, in which they must not be.
         """
-        if name not in self._material:
-            follow, hides = self.reached((name,)), self.composition.hides_goals
-            goal = hides and any(n.endswith(tuple(SURFACES)) for n in follow)
-            moves = not follow.isdisjoint(self.set_by_hand)
-            self._material[name] = goal or moves or bool(self.surfaces((name,)))
-        return self._material[name]
+        ends, hides = tuple(SURFACES), self.composition.hides_goals
+        goals = (name for name in self.static if hides and name.endswith(ends))
+        return frozenset((*self.surfaces, *self.set_by_hand, *goals))
 
     @cached_property
     def _start(self) -> State:
@@ -356,7 +353,7 @@ class CompiledTask(ActionVector):
         """Give a state to read into, or one with some numbers."""
         return self._start.copy() if vector is None else self._start.with_vector(vector)
 
-    def state_of(self, row: Row) -> State:
+    def state_of(self, row: Rows) -> State:
         """Return where everything is in a row, as a view of it."""
         return self._start.with_vector(row.numbers[: self.mechanisms.state_size])
 
@@ -364,12 +361,7 @@ class CompiledTask(ActionVector):
         """Give a state in many vectors, shape (n, size): an array of shape (n, *shape)."""
         variable = self.model.declared(name)
         found = vectors[:, self.slices[name]].reshape(len(vectors), *variable.shape)
-        return found.astype(np.int64) if name in self.whole else found
-
-    def view(self, name: str, state: State) -> Value:
-        """Give one state, as a view of a vector."""
-        found: Value = state.vector[self.slices[name]].reshape(self.model.declared(name).shape)
-        return found
+        return found.astype(np.int64) if variable.dtype != "real" else found
 
     def in_coordinates(self, name: str, *values: Value) -> Value:
         """Give a value of a quantity in other coordinates, or values of the parts of a bundle."""
@@ -379,7 +371,7 @@ class CompiledTask(ActionVector):
             function = self._coordinates[name] = variable.mechanism.bind()
         return np.asarray(function(*values))
 
-    def coordinates(self, name: str, row: Row) -> Value:
+    def coordinates(self, name: str, row: Rows) -> Value:
         """Return a parameter or a state of a row, also in other coordinates, or a bundle."""
         targets = self.model.targets(name)
         if targets == (name,):
@@ -388,13 +380,17 @@ class CompiledTask(ActionVector):
 
     def describe(self, values: Values, state: State) -> Scene:
         """Describe the scene that some values stand for."""
-        structure = self.structure(values)
+        structure = self.composition.structure(values)
         if structure not in self._constants:
             self._constants[structure] = structure.default_scene().parameters
         parameters = dict(self._constants[structure])
         for name, key in self.parameter_keys.items():
             parameters[key] = values[name]
         return Scene(structure, parameters, state, *self.composition.looks(values))
+
+    def scene(self, row: Rows) -> Scene:
+        """Describe the scene of a row."""
+        return self.describe(row, self.state_of(row))
 
 
 def _computed(model: SCM) -> tuple[str, ...]:
@@ -448,11 +444,21 @@ class StepBase:
 
     compiled: CompiledTask
     model: SCM
-    row: Row
+    row: Rows
     pending: PendingInterventions = field(default_factory=dict)
     drawn: Mapping[str, int] = field(default_factory=dict)
     at_start: bool = False
     fresh: frozenset[str] = frozenset()
+
+    @cached_property
+    def structure(self) -> Structure:
+        """What is compiled."""
+        return self.compiled.composition.structure(self.row)
+
+    @cached_property
+    def overlaps(self) -> tuple[Overlap, ...]:
+        """What lies in one another, however little."""
+        return self.compiled.composition.overlaps(self.compiled.scene(self.row), 0.0)
 
     def value(self, name: str) -> Value | None:
         """Return a parameter or a state, also in other coordinates; None for anything else."""
@@ -465,37 +471,35 @@ class StepBase:
         return self.row[name] if name in compiled.slices else compiled.coordinates(name, self.row)
 
 
-def beginning(compiled: CompiledTask, key: NoiseKey | None) -> Row:
-    """Compute where an episode begins without interventions.
+def beginning(
+    compiled: CompiledTask,
+    key: NoiseKey | None,
+    model: SCM | None = None,
+    known: Values | None = None,
+) -> Rows:
+    """Compute where an episode begins.
 
     Args:
         compiled: The task.
         key: Where to draw what is random by declaration; its default if None.
+        model: With the interventions that hold, if there are any.
+        known: Values of exogenous variables that are known.
 
     Returns:
         A row with everything that physics does not move, and the states.
     """
-    row = Row(compiled.mechanisms, compiled.mechanisms.start.copy())
-    static = compiled.model.solve(only=compiled.static_names, key=key)
+    row = Rows(compiled.mechanisms, compiled.mechanisms.start.copy())
+    static = (model or compiled.model).solve(known, only=compiled.static_names, key=key)
     for name in compiled.static_names:
         row[name] = static[name]
-    for variable in compiled.model.variables:
-        is_state = variable.name in compiled.slices
-        if isinstance(variable, Measured) and is_state and not variable.parts:
-            row[variable.name] = _first(compiled, variable, static)
+    declared = map(compiled.model.declared, compiled.slices)
+    states = [v for v in declared if isinstance(v, Measured) and not v.parts]
+    default = {v.name: v.array(v.default) for v in states if v.default is not None}
+    for variable in states:
+        start = variable.start
+        parents = ({**default, **static}[name] for name in variable.set_parents() if start)
+        row[variable.name] = start.bind()(*parents) if start else default[variable.name]
     return row
-
-
-def _first(compiled: CompiledTask, variable: Measured, static: Values) -> Value:
-    if variable.start is None:
-        return variable.array(variable.default)
-    known = {**static}
-    for name in variable.set_parents():
-        parent = compiled.model.declared(name)
-        if isinstance(parent, Measured):
-            known[name] = parent.array(parent.default)
-    parents = [known[name] for name in variable.set_parents()]
-    return np.asarray(variable.start.bind()(*parents))
 
 
 def refuse_impossible(compiled: CompiledTask) -> None:
@@ -513,7 +517,7 @@ def refuse_impossible(compiled: CompiledTask) -> None:
                 check_bounds(variable, values[variable.name], values)
             except InterventionError as problem:
                 problems.append(str(problem).replace(f"do({variable.name}):", variable.name + " ="))
-    found = compiled.composition.overlaps(compiled.describe(values, compiled.state_of(values)))
+    found = compiled.composition.overlaps(compiled.scene(values))
     problems += map(str, found)
     if problems:
         advice = f"choose other arguments of the task {compiled.task.name!r}"

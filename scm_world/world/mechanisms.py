@@ -1,9 +1,4 @@
-"""The mechanisms of a structure, evaluated for any number of worlds together.
-
-The present of a world is one row of numbers: its state first, then its actions, its clock, every
-other variable, and what it keeps of one control step ago. A single world has a matrix of one
-row, a batch one of many; both are computed by the same program, so the bits are the same.
-"""
+"""The values of any number of worlds of one structure, and the mechanisms that compute them."""
 
 from __future__ import annotations
 
@@ -26,6 +21,9 @@ from scm_world.variables import Linear, Parent
 from scm_world.variables.mechanisms import PACKAGE, Stacked, Unboxed
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.kernels import NUMBER, VECTOR, WHOLE, addresses, run, weighted_sum
+
+FIRST = np.zeros(1, dtype=np.int64)
+"""The only row of a world by itself."""
 
 
 @final
@@ -52,6 +50,8 @@ class Mechanisms:
         decided: The same, without their order.
         places: Their columns, shape (m,).
         owners: Which of them each of these columns belongs to, shape (m,).
+        clock: Column of the number of control steps.
+        fresh: Column that is 1 where what the memory needs has been computed at this instant.
     """
 
     def __init__(
@@ -91,9 +91,12 @@ class Mechanisms:
         self.kept = places([slice(0, self.state_size), *given, *self.earlier.values()])
         self.owners = np.repeat(np.arange(len(widths)), widths)
         self._steps = {name: self._bound(name) for name in self.computed}
+        self.clock, self.fresh = self.where[CONTROL_INDEX].start, self._take(1).start
+        self._known = {value: self._take(1) for value in (0.0, 1.0)}
+        self._constants += [(place, value) for value, place in self._known.items()]
         remembered = [self.where[name] for name in self.earlier]
-        self._memory = _program([_copy(remembered, self.earlier.values())])
-        self._programs: dict[tuple[str, ...], list[Any]] = {}
+        self._memory = _program([_copy(remembered, self.earlier.values()), self._mark(0.0)])
+        self._programs: dict[tuple[str, ...] | None, list[Any]] = {}
         self.start = np.zeros(self._width)
         for place, value in self._constants:
             self.start[place] = value
@@ -114,26 +117,22 @@ class Mechanisms:
                 stack.extend(p.name for p in self._model.declared(name).all_parents if not p.lag)
         return tuple(name for name in self.computed if name in wanted)
 
-    def evaluate(self, names: tuple[str, ...], matrix: Floats, rows: Integers) -> None:
-        """Compute variables and what they and the memory need, into rows of a matrix.
-
-        Raises:
-            FunctionFailure: A function fails, or gives something that the variable cannot have.
-        """
+    def evaluate(self, names: tuple[str, ...] | None, matrix: Floats, rows: Integers) -> None:
+        """Compute variables and what they and the memory need, into rows of a matrix."""
         program = self._programs.get(names)
         if program is None:
-            steps = [step for name in self.needed(names) for step in self._steps[name]]
-            program = self._programs[names] = _program(steps)
+            wanted = self.computed if names is None else names
+            steps = [step for name in self.needed(wanted) for step in self._steps[name]]
+            program = self._programs[names] = _program([*steps, self._mark(1.0)])
         _execute(program, matrix, rows)
 
     def remember(self, matrix: Floats, rows: Integers) -> None:
         """Keep the present as the values of one control step ago."""
         _execute(self._memory, matrix, rows)
 
-    def view(self, row: Floats, name: str, *, earlier: bool = False) -> Value:
-        """Give a variable of a row, as a view."""
-        place = self.earlier[name] if earlier else self.where[name]
-        return row[place].reshape(self._model.declared(name).shape)
+    def _mark(self, value: float) -> _Compiled:
+        """Return the step that notes whether what the memory needs has been computed."""
+        return _copy([self._known[value]], [slice(self.fresh, self.fresh + 1)])
 
     # --- binding ------------------------------------------------------------------------------
 
@@ -184,26 +183,36 @@ class Mechanisms:
 
 
 @final
-class Row(Mapping[str, Value]):
-    """The values of one world by name: views of one row of numbers, whole numbers as copies.
+class Rows(Mapping[str, Value]):
+    """The values of one world, or of several, by name: views of numbers, whole numbers as copies.
+
+    Each world is a row of numbers: its state first, then its actions, its clock, every other
+    variable, and what it keeps of one control step ago. One program computes one row or many, so
+    the bits are the same.
 
     Args:
         mechanisms: That know the columns.
-        numbers: Shape (width,).
+        numbers: Shape (width,), of one world; or (n, width): then values have a leading axis.
         unknown: Variables whose values are to be computed first.
     """
 
-    __slots__ = ("mechanisms", "numbers", "unknown")
+    __slots__ = ("_views", "mechanisms", "numbers", "unknown")
 
     def __init__(
         self, mechanisms: Mechanisms, numbers: Floats, unknown: Iterable[str] = ()
     ) -> None:
         self.mechanisms, self.numbers, self.unknown = mechanisms, numbers, {*unknown}
+        self._views: dict[str, Value] = {}
 
     def __getitem__(self, name: str) -> Value:
-        place, shape, is_whole = self.mechanisms.reading[name]
-        value = self.numbers[place].reshape(shape)
-        return value.astype(np.int64) if is_whole else value
+        view = self._views.get(name)
+        if view is None:
+            place, shape, is_whole = self.mechanisms.reading[name]
+            view = self.numbers[..., place].reshape(self.numbers.shape[:-1] + shape)
+            if is_whole:
+                return view.astype(np.int64)
+            self._views[name] = view
+        return view
 
     def __setitem__(self, name: str, value: ArrayLike) -> None:
         self.numbers[self.mechanisms.where[name]] = np.ravel(value)
@@ -212,7 +221,66 @@ class Row(Mapping[str, Value]):
     def __contains__(self, name: object) -> bool:
         return name in self.mechanisms.where and name not in self.unknown
 
-    def differing(self, other: Row) -> list[str]:
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.mechanisms.where)
+
+    def __len__(self) -> int:
+        return len(self.mechanisms.where)
+
+    def copy(self) -> Rows:
+        """Return the same values in other numbers."""
+        return Rows(self.mechanisms, self.numbers.copy())
+
+    def row(self, index: int) -> Rows:
+        """Return one of several worlds, as a view."""
+        return Rows(self.mechanisms, self.numbers[index])
+
+    @property
+    def actions(self) -> Floats:
+        """All actions, shape (..., n_actions), as a view."""
+        return self.numbers[..., self.mechanisms.actions]
+
+    def earlier(self) -> dict[str, Value]:
+        """Return the values of one control step ago that are kept, as views."""
+        lead, reading = self.numbers.shape[:-1], self.mechanisms.reading
+        return {
+            name: self.numbers[..., place].reshape(lead + reading[name][1])
+            for name, place in self.mechanisms.earlier.items()
+        }
+
+    def evaluate(self, names: tuple[str, ...] | None = None, which: Integers = FIRST) -> None:
+        """Compute variables, and what a step keeps.
+
+        Args:
+            names: Of the variables; all if None.
+            which: The worlds, shape (m,).
+
+        Raises:
+            FunctionFailure: A function fails, or gives something that the variable cannot have.
+        """
+        self.mechanisms.evaluate(names, self._matrix, which)
+
+    def remember(self, which: Integers = FIRST) -> None:
+        """Keep the present of some worlds as the values of one control step ago."""
+        matrix, fresh = self._matrix, self.mechanisms.fresh
+        if self.numbers.ndim > 1:
+            stale = which[matrix[which, fresh] == 0.0]
+        else:
+            stale = which[: int(matrix[0, fresh] == 0.0)]
+        if stale.size:
+            self.mechanisms.evaluate((), matrix, stale)
+        self.mechanisms.remember(matrix, which)
+
+    @property
+    def _matrix(self) -> Floats:
+        return self.numbers if self.numbers.ndim == 2 else self.numbers[None]
+
+    def take(self, other: Rows) -> None:
+        """Take over the values of another row, in which something may be old."""
+        self.numbers[...] = other.numbers
+        self.numbers[self.mechanisms.fresh] = 0.0
+
+    def differing(self, other: Rows) -> list[str]:
         """List what interventions alone decide, in both rows, and differs in another one."""
         mine, its = self.mechanisms, other.mechanisms
         if mine is not its:
@@ -221,21 +289,15 @@ class Row(Mapping[str, Value]):
         apart = self.numbers[mine.places] != other.numbers[mine.places]
         return [mine.static[i] for i in dict.fromkeys(mine.owners[apart].tolist())]
 
-    def following(self, last: Row) -> Row:
+    def following(self, last: Rows) -> Rows:
         """Take over the clock, the actions and the memory of a row of another structure."""
-        mine, other = self.mechanisms, last.mechanisms
         self[CONTROL_INDEX] = last[CONTROL_INDEX]
-        if last.numbers[other.actions].shape == self.numbers[mine.actions].shape:
-            self.numbers[mine.actions] = last.numbers[other.actions]
-        for name in mine.earlier.keys() & other.earlier.keys():
-            self.numbers[mine.earlier[name]] = last.numbers[other.earlier[name]]
+        if self.actions.shape == last.actions.shape:
+            self.actions[:] = last.actions
+        mine, its = self.earlier(), last.earlier()
+        for name in mine.keys() & its.keys():
+            mine[name][...] = its[name]
         return self
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.mechanisms.where)
-
-    def __len__(self) -> int:
-        return len(self.mechanisms.where)
 
 
 @final

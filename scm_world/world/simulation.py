@@ -5,19 +5,20 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import gymnasium
 import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world._types import ArrayLike, Floats, Value, Values
+from scm_world._types import ArrayLike, Floats, Value
 from scm_world.backends import Backend, backends, make_backend
 from scm_world.backends.base import EngineSnapshot
 from scm_world.errors import (
     CyclicModel,
     EngineFailure,
+    Infeasible,
     InterventionError,
     NotReset,
     SnapshotMismatch,
@@ -26,14 +27,12 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.models import Difference, ParameterKey, Parameters, Scene, State, Structure
+from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
-from scm_world.models.scene import Overlap
-from scm_world.tasks import Conventions, Task
+from scm_world.tasks import Task
 from scm_world.tasks.composition import Composition
 from scm_world.variables import Draw, Mechanism, Subset
 from scm_world.variables.checks import check_subset
-from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Audit, report
 from scm_world.world.compiled_task import (
@@ -43,21 +42,11 @@ from scm_world.world.compiled_task import (
     beginning,
     check_functions,
 )
-from scm_world.world.interventions import (
-    CheckedRequest,
-    Present,
-    Solution,
-    difference,
-    feasible,
-    overlaps,
-    refusal,
-    same,
-)
-from scm_world.world.mechanisms import Row
+from scm_world.world.interventions import Transaction, difference, feasible, overlaps, same
+from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
-from scm_world.world.snapshot import WorldSnapshot, opened
-from scm_world.world.structures import StructureCache, as_structures, as_task
-from scm_world.world.values import PresentValues
+from scm_world.world.snapshot import WorldSnapshot
+from scm_world.world.structures import StructureCache, as_task
 
 READ_BACK = 1e-6  # how far a backend may report a number from what it was given
 
@@ -130,11 +119,14 @@ class Simulation:
             max_episode_length=max_episode_length,
             conventions_name=conventions,
         )
-        self.structures = as_structures(shared or kind, self.options)
+        if shared is not None and shared.options != self.options:
+            name, allowed = "options of a world with these structures", (str(shared.options),)
+            raise UnknownOption(name, self.options, allowed)
+        self.structures = shared or StructureCache(kind, self.options)
         self._checked = self._closed = False
         self.version = 0  # counts changes of anything but what physics moves
         self._origin: EngineSnapshot | None = None
-        self._origin_row: Row | None = None
+        self._origin_row: Rows | None = None
         self._have_no_episode()
         if isinstance(self.variables_space, Subset):
             # Where variables decide which bodies there are, some may be named that are not there.
@@ -145,30 +137,27 @@ class Simulation:
         """Be as a world is that was never reset."""
         self._started, self._lost = False, ""
         self.noise, self.episode = CompiledNoise(0), 0
-        self._index = 0
         self._offset = 0  # by how much interventions have moved control_index
         self._base: StepBase | None = None
+        self._base_step = -1  # control steps before it was taken
         compiled = self.structures.natural(None)
-        self._values = PresentValues(compiled)
-        row = beginning(compiled, None)
-        self._values.put(row, [*compiled.static_names])
+        self._hold(compiled, beginning(compiled, None))
         self._adopt_model(compiled.model)
-        self._adopt_structure(compiled.structure(row))
+        self._adopt_structure(compiled.composition.structure(self.row))
+        self.version += 1
 
-    @property
-    def compiled(self) -> CompiledTask:
-        """The task in the structure that there is."""
-        return self._values.compiled
+    def _hold(self, compiled: CompiledTask, row: Rows) -> None:
+        self.compiled, self.row, self.state = compiled, row, compiled.state_of(row)
 
-    @property
-    def graph(self) -> SCM:
-        """The causal model as it is now, with the parameters that ``do`` holds."""
-        return self._held
+    def move(self, row: Rows) -> None:
+        """Keep the present in another row from now on."""
+        row.numbers[...] = self.row.numbers
+        self._hold(self.compiled, row)
 
     @property
     def index(self) -> int:
         """How many control steps of the episode are over."""
-        return self._index
+        return int(self.row.numbers[self.row.mechanisms.clock])
 
     @property
     def has_begun(self) -> bool:
@@ -183,15 +172,12 @@ class Simulation:
             NotReset: There is no episode yet.
         """
         self.model.declared(name)
-        self._require_episode()
-        self._values.compute()
-        return np.array(self._values.now[name])
+        return np.array(self.evaluate((name,))[name])
 
     def values(self) -> dict[str, Value]:
         """Give the present value of every variable, as copies."""
-        self._require_episode()
-        self._values.compute()
-        return {name: np.array(self._values.now[name]) for name in self.model}
+        row = self.evaluate()
+        return {name: np.array(row[name]) for name in self.model}
 
     def previous(self) -> dict[str, Value]:
         """Give the values of one control step ago that present variables depend on."""
@@ -199,11 +185,11 @@ class Simulation:
         declared = self.model.declared
         return {
             name: value.astype(np.float64 if declared(name).dtype == "real" else np.int64)
-            for name, value in self._values.before.items()
+            for name, value in self.row.earlier().items()
         }
 
-    def evaluate(self, names: tuple[str, ...]) -> dict[str, Value]:
-        """Compute some variables and give all present values without copying them.
+    def evaluate(self, names: tuple[str, ...] | None = None) -> Rows:
+        """Compute some variables, all if None, and give all present values without copying them.
 
         For loops that cannot wait; the values change with the next step.
 
@@ -211,20 +197,19 @@ class Simulation:
             NotReset: There is no episode yet.
         """
         self._require_episode()
-        self._values.compute(names)
-        return self._values.now
+        self.row.evaluate(names)
+        return self.row
 
     def scene(self) -> Scene:
         """Describe the present for a picture, or for another engine."""
         self._require_episode()
-        scene = self.describe(_copies(self._values.now), self._values.state.copy())
-        parameters = {key: np.array(value) for key, value in scene.parameters.items()}
-        return replace(scene, parameters=parameters)
+        row = self.row.copy()
+        return self.compiled.describe(row, self.compiled.state_of(row))
 
     def cameras(self) -> tuple[Camera, ...]:
         """Describe the cameras whose places are variables: the three of the robot."""
         self._require_episode()
-        return self.composition.cameras(_copies(self._values.now))
+        return self.composition.cameras(self.row.copy())
 
     def reset(
         self,
@@ -268,17 +253,16 @@ class Simulation:
             self.backend.restore(self._origin)
         else:
             row = beginning(origin, None)
-            self.backend.build(origin.describe(row, origin.state_of(row)))
+            self.backend.build(origin.scene(row))
             self._origin, self._origin_row = self.backend.snapshot(), row
             self._started = True
         self._adopt(origin, origin.model, row)
         self._draw_nature()
         self._forget()
         if not self._checked:
-            self._values.compute()
-            check_functions(self.compiled, self._values.now)
+            check_functions(self.compiled, self.evaluate())
             self._checked = True
-        self._base = self._step_base(at_start=True)
+        self._keep_base(self._step_base(at_start=True))
 
     def _draw_nature(self) -> None:
         """Draw what is random by declaration: the noise of this episode."""
@@ -286,20 +270,16 @@ class Simulation:
         compiled = self.structures.natural(key)
         if not compiled.random:
             return
-        row, present, base = beginning(compiled, key), self._values.row, self._step_base()
-        change = difference(compiled, present, self.structure, row, present.differing(row))
-        problems: list[Overlap] = []
+        row, now = beginning(compiled, key), self._step_base()
+        changed = now.row.differing(row)
+        change = difference(now, compiled, row, changed)
         if change is not None and compiled.composition.solid:
-            problems = overlaps(compiled, base, present, row, change)
-        if problems:
-            checked = CheckedRequest(
-                self.structures, base, {compiled.random[0]: Draw("A")}, None, key
-            )
-            here = Present(self.structures, base, present, self.structure)
-            raise refusal(here, checked, problems, key)
+            reasons = [*map(str, overlaps(now, now, compiled, row, change))]
+            if reasons:
+                raise Infeasible(compiled.random[0], Draw("A"), reasons)
         if change is not None:
             self.backend.apply(change)
-        self._adopt(compiled, compiled.model, row)
+        self._adopt(compiled, compiled.model, row, changed)
 
     def noise_key(self, index: int) -> NoiseKey:
         """Return the noise key of a control step of this episode.
@@ -316,18 +296,18 @@ class Simulation:
             snapshot = self.snapshot()
         except NotReset:
             snapshot = None
+        how = self.options
         options = {
             "backend": self.backend.name,
-            "preset": self.options.preset,
-            "action_mode": self.action_mode,
-            "frame_skip": self.frame_skip,
-            "max_episode_length": self.given_length,
-            "conventions": self.conventions.name,
+            "preset": how.preset,
+            "action_mode": how.action_mode,
+            "frame_skip": how.frame_skip,
+            "max_episode_length": how.given_length,
+            "conventions": how.conventions.name,
             "variables_space": self.variables_space,
         }
-        usual = self.task.choices["resolution"][0]
-        if self.resolution != usual:  # logs and files of before have none
-            options["resolution"] = self.resolution
+        if how.resolution != self.task.choices["resolution"][0]:
+            options["resolution"] = how.resolution  # logs and files of before have none
         return _copied, (type(self), self.structures.task, options, snapshot)
 
     @property
@@ -351,54 +331,9 @@ class Simulation:
         return self.compiled.composition
 
     @property
-    def slices(self) -> Mapping[str, slice]:
-        """Where each state stands in the state vector."""
-        return self.compiled.slices
-
-    @property
-    def parameter_keys(self) -> Mapping[str, ParameterKey]:
-        """Which physical parameter each variable sets."""
-        return self.compiled.parameter_keys
-
-    @property
     def static_names(self) -> tuple[str, ...]:
         """Everything that interventions alone decide, causes before effects."""
         return self.compiled.static_names
-
-    @property
-    def computed(self) -> tuple[str, ...]:
-        """Variables that are computed from what moves, causes before effects."""
-        return self.compiled.computed
-
-    @property
-    def conventions(self) -> Conventions:
-        """Ours or the predecessor's."""
-        return self.options.conventions
-
-    @property
-    def action_mode(self) -> str:
-        """How the system is commanded."""
-        return self.options.action_mode
-
-    @property
-    def resolution(self) -> str:
-        """How finely the variables are cut."""
-        return self.options.resolution
-
-    @property
-    def frame_skip(self) -> int:
-        """Length of a control step in units of the task; 4 ms for the robot."""
-        return self.options.frame_skip
-
-    @property
-    def control_period(self) -> float:
-        """Length of a control step [s]."""
-        return self.options.control_period
-
-    @property
-    def given_length(self) -> int | None:
-        """Length of an episode in control steps, if one was given."""
-        return self.options.given_length
 
     @property
     def max_episode_length(self) -> int:
@@ -440,24 +375,22 @@ class Simulation:
 
     @property
     def _settings(self) -> tuple[Any, ...]:
-        numbers = (self.frame_skip, self.max_episode_length)
-        options = (self.options.preset, self.action_mode, self.conventions.name)
-        usual = self.task.choices["resolution"][0]
-        finer = () if self.resolution == usual else (self.resolution,)
-        return (self.task.name, *options, *numbers, *finer)
+        how, usual = self.options, self.task.choices["resolution"][0]
+        numbers = (how.frame_skip, self.max_episode_length)
+        finer = () if how.resolution == usual else (how.resolution,)
+        return (
+            self.task.name,
+            how.preset,
+            how.action_mode,
+            how.conventions.name,
+            *numbers,
+            *finer,
+        )
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return what decides what happens here, except versions: the task, and the options."""
         options = (self.backend.name, self.variables_space, self._settings)
         return {**self.structures.__fingerprint__(), "options": options}
-
-    def describe(self, values: Values, state: State) -> Scene:
-        """Describe the scene that some values stand for."""
-        return self.compiled.describe(values, state)
-
-    def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
-        """Name some variables and what follows them at lag 0, without physics, causes first."""
-        return self.compiled.static_order(targets)
 
     # --- a control step -----------------------------------------------------------------------
 
@@ -479,70 +412,61 @@ class Simulation:
         """Advance one control step with finite numbers in their range; see ``step``."""
         self._require_state()
         command = self.decided(command)
-        values = self._values
-        kept = values.matrix.copy()
-        values.remember()
-        values.action[:] = command
+        row = self.row
+        kept = row.numbers.copy()
+        row.remember()
+        row.actions[:] = command
         try:
-            sent = self.command(command, self._index)
-            self.backend.step(sent, self._substeps)
+            self.backend.step(self.command(command), self.substeps)
         except EngineFailure as error:
             left = self.compiled.empty_state()
             self.backend.read(left)
             if np.isfinite(left.vector).all():  # nothing has happened
-                values.matrix[...] = kept
-                values.be_at(self._index)
+                row.numbers[:] = kept
                 raise
             said = f"{error}; {self._largest()}" if left.vector.size else str(error)
-            self._lost = f"the state was lost in control step {self._index}: {said}"
+            self._lost = f"the state was lost in control step {self.index}: {said}"
             raise EngineFailure(self._lost, self.backend.name) from error
-        self.backend.read(values.state)
-        self.arrive(self._index + 1)
+        self.backend.read(self.state)
+        row.numbers[row.mechanisms.clock] += 1.0
 
     def _largest(self) -> str:
         """Name the state with the largest number, as it was before a step."""
-        vector = self._values.state.vector
+        vector = self.state.vector
         worst = int(np.abs(vector).argmax())
         places = self.composition.system.layout.slices.items()
         name = next((name for name, where in places if where.start <= worst < where.stop), "")
         return f"before that step, the largest number was {vector[worst]:.3g}, of {name}"
 
-    def arrive(self, index: int) -> None:
-        """Be at the next control step; where everything is has been written already."""
-        self._index = index
-        self._values.be_at(index)
-        self._base = None
+    def act(self) -> Audit | None:
+        """Do what the plan of the episode contains for this instant: there is none here."""
+        return None
 
     def decided(self, command: Floats) -> Floats:
         """Return the action that is taken: the command, where no action has a mechanism."""
         held = self._held_actions
         if not held:
             return command
-        given = self.compiled.split(command)
-        known = {**self.evaluate(self._inputs), **given}
-        solved = self._held.solve(known, key=self.noise_key(self._index), only=held)
+        known = {**self.evaluate(self._inputs), **self.compiled.split(command)}
+        solved = self.graph.solve(known, key=self.noise_key(self.index), only=held)
         command = command.copy()
         for name in held:
             command[self.compiled.actions[name]] = np.ravel(solved[name])
         return self.compiled.clipped(command)
 
-    def command(self, action: Floats, index: int) -> Floats:
-        """Compute the command of an action in a control step; it is valid until the next call."""
-        commands = self.composition.commands
-        if commands is None or not self.translates:
+    def command(self, action: Floats) -> Floats:
+        """Compute the command of an action; it is valid until the next call."""
+        if not self._translates:
             return action
-        values = self._values
-        return commands.command(action, values.now, values.state.vector, self.noise_key(index))
+        commands: Any = self.composition.commands
+        key = self.noise_key(self.index)
+        found: Floats = commands.command(action, self.row, self.state.vector, key)
+        return found
 
     @property
-    def substeps(self) -> int:
-        """The physics steps of a command."""
-        return self._substeps
-
-    @property
-    def holds_action(self) -> bool:
-        """Whether an action has a mechanism, or a value of its own."""
-        return bool(self._held_actions)
+    def acts_alone(self) -> bool:
+        """Whether what the backend is told is computed from the present, not just the action."""
+        return bool(self._held_actions) or self._translates
 
     # --- interventions ------------------------------------------------------------------------
 
@@ -571,22 +495,20 @@ class Simulation:
             InterventionError: The request was refused; the world is bit-identical to before.
             NotReset: There is no episode yet.
         """
-        if not self._started or self._lost:
-            self._require_state()
-        twice: list[InterventionError] = []
-        flat = flatten(request, twice)
-        base, drawn = self._base or self._step_base(), dict[str, int]()
-        if any(isinstance(act, Draw | Mechanism) for act in flat.values()):
-            twice += self._wrong_actions(flat)
+        self._require_state()
+        problems: list[InterventionError] = []
+        flat, before = flatten(request, problems), self._step_base()
+        base = self.base or before
+        drawn = base.drawn
+        if any(type(act) in (Draw, Mechanism) for act in flat.values()):
+            problems += self._wrong_actions(flat)
             flat, drawn = self._anew(flat, base)
         region = self.variables_space if space is None else as_region("space", space)
-        key = self.noise_key(self._index)
-        here = Present(self.structures, base, self._values.row, self.structure)
-        solution, change = feasible(here, flat, region, key, twice)
-        audit = self._commit(solution, change, flat, check, at_start=base.at_start)
-        self._base = StepBase(
-            base.compiled, base.model, base.row, solution.kept(), drawn or base.drawn, base.at_start
-        )
+        key = self.noise_key(self.index)
+        done = feasible(self.structures, base, before, flat, region, key, problems)
+        audit = self._commit(done, before, flat, check, at_start=base.at_start)
+        base = StepBase(base.compiled, base.model, base.row, done.kept(), drawn, base.at_start)
+        self._keep_base(base)
         return audit
 
     def _anew(
@@ -639,45 +561,54 @@ class Simulation:
         return problems
 
     def _step_base(self, *, at_start: bool = False) -> StepBase:
-        row = Row(self.compiled.mechanisms, self._values.row.numbers.copy())
-        return StepBase(self.compiled, self._held, row, at_start=at_start)
+        return StepBase(self.compiled, self.graph, self.row.copy(), at_start=at_start)
+
+    @property
+    def base(self) -> StepBase | None:
+        """The world at this control step before anyone intervened; None after a step."""
+        return self._base if self.index - self._offset == self._base_step else None
+
+    def _keep_base(self, base: StepBase | None) -> None:
+        self._base, self._base_step = base, self.index - self._offset
 
     def _commit(
         self,
-        solution: Solution,
-        change: Difference | None,
+        done: Transaction,
+        before: StepBase,
         request: Mapping[str, Any],
         check: Callable[[], object] | None,
         *,
         at_start: bool,
     ) -> Audit:
-        """Apply what was computed, read it back, and report; or put everything back and raise."""
-        before, index = self._step_base(), self._index
+        """Apply what was computed, and read it back; or put everything back and raise."""
+        index, change, backend = self.index, done.change or Difference(), self.backend
+        compiled, keys = done.compiled, done.compiled.parameter_keys
 
         def undo() -> None:
-            there = solution.compiled.structure(solution.row)
-            lost = difference(before.compiled, solution.row, there, before.row, solution.changed)
+            after = StepBase(compiled, self.graph, done.row)
+            lost = difference(after, before.compiled, before.row, done.changed)
             if lost is not None:
-                self.backend.apply(lost)
+                backend.apply(lost)
 
         with self._all_or_nothing(before, undo):
-            inertia: Parameters = {}
-            reported: Parameters = {}
-            if change is not None:
-                inertia = self._inertia(change)
-                self.backend.apply(change)
-                reported = self._applied(change)
-            row, changed = solution.row, solution.changed
-            stays = solution.compiled is self.compiled and row[CONTROL_INDEX] == index
-            if stays and change is None and not changed:
-                self._adopt_model(solution.model)
-                self.version += 1
-            else:
-                self._adopt(solution.compiled, solution.model, row, changed, change)
-            now = self._values.row
-            audit = report(request, solution, change, before, now, inertia, reported, self.backend)
-            self._offset += self._index - index
-            if at_start and not (stays and change is None and not changed):
+            inertia = self._inertia(change)
+            if change:
+                backend.apply(change)
+            targets = (t for name in done.asked for t in compiled.model.targets(name))
+            wanted = {keys[target] for target in targets if target in keys}
+            reported = backend.parameters({*change.parameters, *inertia, *wanted})
+            self._refuse_other(change, reported)
+            structure = change.structure or self.structure
+            self._adopt(compiled, done.held(), done.row, done.changed, structure)
+            remarks: tuple[str, ...] = ()
+            set_here = () if change.structure is not None else change.parameters
+            if any(what.endswith("friction") for _, what in set_here):
+                frictions = {keys[n]: before.row[n] for n in done.changed if n in keys}
+                remarks = backend.capabilities.remarks(backend, frictions)
+            now = self.row.copy()
+            audit = Audit(partial(report, request, done, before, now, inertia, reported, remarks))
+            self._offset += self.index - index
+            if at_start:
                 self._forget()
             if check is not None:
                 check()
@@ -686,28 +617,27 @@ class Simulation:
     @contextmanager
     def _all_or_nothing(self, before: StepBase, undo: Callable[[], None]) -> Iterator[None]:
         """Put everything back as it was before, should something fail half way."""
-        kept, offset = self._values, self._offset
+        row, offset = self.row, self._offset
         try:
             yield
         except BaseException:
             undo()
-            self._values = kept
+            self._hold(before.compiled, row)
             self._adopt(before.compiled, before.model, before.row, moved=False)
             self._offset = offset
             raise
 
     def _inertia(self, change: Difference) -> Parameters:
+        """Read the moments of inertia that a change of masses and sizes will change."""
+        compiled = self.compiled
         bodies = {body for body, what in change.parameters if what in ("mass", "size")}
-        if change.structure is not None or not bodies:
+        if change.structure is not None or not bodies or not compiled.movers:
             return {}
-        if not self.compiled.movers:
-            return {}
-        bodies -= {*self.composition.bodies} - self.compiled.movers
+        bodies.difference_update(n for n in compiled.composition.bodies if n not in compiled.movers)
         return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
-    def _applied(self, change: Difference) -> Parameters:
-        """Read back what was applied."""
-        reported = self.backend.parameters(change.parameters)
+    def _refuse_other(self, change: Difference, reported: Parameters) -> None:
+        """Refuse what the backend did not take over."""
         values = change.parameters.items()
         wrong = [".".join(key) for key, value in values if not _close(value, reported[key])]
         if change.state is not None:
@@ -718,15 +648,14 @@ class Simulation:
         if wrong:
             problem = f"the engine did not take over {', '.join(wrong)}"
             raise EngineFailure(problem, self.backend.name)
-        return reported
 
     def _adopt(
         self,
         compiled: CompiledTask,
         model: SCM,
-        row: Row,
-        changed: list[str] | None = None,
-        change: Difference | None = None,
+        row: Rows,
+        changed: Iterable[str] | None = None,
+        structure: Structure | None = None,
         *,
         moved: bool = True,
     ) -> None:
@@ -737,66 +666,48 @@ class Simulation:
             model: With the interventions that hold.
             row: The values.
             changed: What only interventions decide and differs from the present, if known.
-            change: What the backend had to change.
+            structure: Of the row, if known.
             moved: Whether the backend reports where everything is; else the row does.
         """
-        last = self._values
-        if changed is None:
-            changed, structure = last.row.differing(row), compiled.structure(row)
-        else:
-            structure = change.structure if change and change.structure else self.structure
-        if compiled is not last.compiled:
-            self._values, changed = PresentValues(compiled), [*compiled.static_names]
-        values = self._values
-        values.put(row, changed)
+        last, anew = self.row, compiled is not self.compiled
+        changed = last.differing(row) if changed is None else changed
+        if anew:
+            self._hold(compiled, row.copy())
+        self.row.take(row)
         self._adopt_model(model)
-        if changed or values is not last:
-            self._adopt_structure(structure)
+        if changed or anew:
+            self._adopt_structure(structure or compiled.composition.structure(row))
         self.version += 1
         if moved:
-            self.backend.read(values.state)
-        self._index = int(values.row[CONTROL_INDEX])
-        if values is not last:
+            self.backend.read(self.state)
+        if anew:
             self._forget()
-            for name in last.before.keys() & values.before.keys():
-                values.before[name][...] = last.before[name]
+            kept, before = self.row.earlier(), last.earlier()
+            for name in kept.keys() & before.keys():
+                kept[name][...] = before[name]
 
     def _adopt_structure(self, structure: Structure) -> None:
         commands = self.composition.commands
-        self.translates = commands is not None and commands.applies(self._values.row)
+        self._translates = commands is not None and commands.applies(self.row)
         self.structure = structure
-        self._substeps = max(1, round(self.control_period / float(structure.timestep)))
+        self.substeps = max(1, round(self.options.control_period / float(structure.timestep)))
 
     def _adopt_model(self, model: SCM) -> None:
-        self._held, held = model, model.interventions
+        self.graph, held = model, model.interventions
         self._held_actions = tuple(name for name in self.compiled.actions if name in held)
         acts = (held[name] for name in self._held_actions)
         self._inputs = tuple(p.name for a in acts if isinstance(a, Mechanism) for p in a.parents)
 
     def _forget(self) -> None:
         """Take the present as the step before, where there is none."""
-        self._values.compute(())
-        self._values.remember()
+        self.row.remember()
 
     # --- state ------------------------------------------------------------------------
 
     @property
-    def numbers(self) -> Floats:
-        """The present as one row of numbers, shape (1, width); see ``Mechanisms.where``."""
-        return self._values.matrix
-
-    @property
     def vector(self) -> Floats:
         """The live state, flat, shape (size,)."""
-        return self._values.state.vector
-
-    def move(self, matrix: Floats) -> None:
-        """Keep the present in another matrix from now on, shape (1, width)."""
-        self._values.move(matrix)
-
-    def current(self) -> tuple[Values, State]:
-        """Return the live values and the live state; both change with the next step."""
-        return self._values.now, self._values.state
+        return self.state.vector
 
     def snapshot(self) -> WorldSnapshot:
         """Save everything that decides the future of the world. It can be pickled.
@@ -809,8 +720,8 @@ class Simulation:
         return WorldSnapshot(
             engine=self.backend.snapshot(),
             present=self._step_base(),
-            base=self._base,
-            index=self._index,
+            base=self.base,
+            index=self.index,
             offset=self._offset,
             seed=self.noise.seed,
             episode=self.episode,
@@ -842,23 +753,20 @@ class Simulation:
                 self._lost = "a snapshot was restored in part"
 
         try:
-            engine, base = snapshot.unpacked(self.structure), snapshot.base
+            engine, present, base = snapshot.opened(self.structures, self.structure)
             engine.opened(self.backend)
-            present = opened(snapshot.present, self.structures)
-            base = base if base is None else opened(base, self.structures)
             noise = CompiledNoise(snapshot.seed)
             with self._all_or_nothing(self._step_base(), undo):
                 self.backend.restore(engine)
                 self._adopt(present.compiled, present.model, present.row, moved=False)
-                self._values.matrix[0] = present.row.numbers
-                self._values.be_at(self._index)
+                self.row.numbers[:] = present.row.numbers
         except (SnapshotMismatch, EngineFailure):
             raise
         except Exception as error:
             raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
         self._lost, self._offset = "", snapshot.offset
         self.noise, self.episode = noise, snapshot.episode
-        self._base = base
+        self._keep_base(base)
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
@@ -876,24 +784,34 @@ class Simulation:
             >>> world.noise.seed, world.index
             (5, 0)
         """
-        started, lost = self._started, self._lost
-        noise = self.noise, self.episode, self._index, self._offset
-        before = self.snapshot() if started and not lost else None
+        back = self.way_back()
         try:
             yield
         finally:
+            back()
+
+    def way_back(self) -> Callable[[], None]:
+        """Return what goes back to the present, bit for bit; see ``unchanged``."""
+        started, lost = self._started, self._lost
+        noise = self.noise, self.episode, self._offset
+        before = self.snapshot() if started and not lost else None
+
+        def back() -> None:
             if before is not None:
                 self.restore(before)
             elif not started:
                 self._have_no_episode()
             else:
                 self._lost, self._base = lost, None
-                self.noise, self.episode, self._index, self._offset = noise
+                self.noise, self.episode, self._offset = noise
+
+        return back
 
     def close(self) -> None:
         """Free the engine. There is no episode any more."""
         self._closed |= self._started
         self._started = False
+        self.version += 1
         self.backend.close()
 
     def _require_episode(self) -> None:
@@ -913,10 +831,6 @@ def _copied(kind: Any, task: Task, options: Mapping[str, Any], snapshot: Any) ->
     if snapshot is not None:
         world.restore(snapshot)
     return world
-
-
-def _copies(values: Values) -> dict[str, Value]:
-    return {name: np.array(value) for name, value in values.items()}
 
 
 def _close(given: Floats, reported: Floats) -> bool:

@@ -14,48 +14,11 @@ from scm_world.backends.step import StepModel
 from scm_world.errors import SnapshotMismatch
 from scm_world.models import Model
 from scm_world.variables import Intervention
-from scm_world.world.compiled_task import PendingInterventions, Plan, StepBase
-from scm_world.world.mechanisms import Row
+from scm_world.world.compiled_task import Plan, StepBase
+from scm_world.world.mechanisms import Rows
 from scm_world.world.structures import StructureCache
 
-
-@final
-@dataclass(frozen=True, eq=False)
-class SavedBase:
-    """A world at one control step, without what is compiled; see ``StepBase``.
-
-    Attributes:
-        plan: The structure.
-        numbers: The values, shape (width,).
-        interventions: What ``do`` holds.
-        pending: The interventions at this step so far.
-        at_start: Whether an episode is just beginning.
-        drawn: How often each variable was drawn at this step.
-    """
-
-    plan: Plan
-    numbers: Floats
-    interventions: Mapping[str, Intervention]
-    pending: PendingInterventions
-    at_start: bool
-    drawn: Mapping[str, int]
-
-    @classmethod
-    def of(cls, base: StepBase) -> SavedBase:
-        """Leave out what is compiled, and what follows from the rest."""
-        plan, held, mechanisms = base.compiled.plan, base.model.interventions, base.row.mechanisms
-        numbers = mechanisms.start.copy()
-        numbers[mechanisms.kept] = base.row.numbers[mechanisms.kept]
-        return cls(plan, numbers, held, dict(base.pending), base.at_start, base.drawn)
-
-    def opened(self, structures: StructureCache) -> StepBase:
-        """Compile what was left out."""
-        compiled = structures.compiled(self.plan)
-        row = Row(compiled.mechanisms, self.numbers.reshape(compiled.mechanisms.start.shape))
-        model = compiled.model.with_interventions(self.interventions)
-        return StepBase(
-            compiled, model, row, self.pending, at_start=self.at_start, drawn=self.drawn
-        )
+PARTS = ("engine", "present", "base")
 
 
 @final
@@ -63,14 +26,15 @@ class SavedBase:
 class WorldSnapshot:
     """All that decides the future of a world: physics, causes, noise, clock and memory.
 
-    A pickled snapshot leaves the model out: the world that goes back to it has the same one.
+    A pickled snapshot leaves the model and what is compiled out: the world that goes back to it
+    has the same ones. Its parts are bytes until a world opens them.
 
     Attributes:
-        engine: The engine's part; bytes that ``unpacked`` reads once it was pickled.
+        engine: The engine's part.
         present: The world, its memory of one control step ago included.
         base: The world at this control step before anyone intervened; None after a step.
         index: The control step.
-        offset: By how much interventions have moved the index; noise follows the steps taken.
+        offset: By how much interventions have moved the clock; noise follows the steps taken.
         seed: Of the noise.
         episode: Number of the episode.
         world: Task, options and names of all variables, to tell worlds apart.
@@ -78,8 +42,8 @@ class WorldSnapshot:
     """
 
     engine: EngineSnapshot | bytes
-    present: StepBase | SavedBase
-    base: StepBase | SavedBase | None
+    present: StepBase | bytes
+    base: StepBase | bytes | None
     index: int
     offset: int
     seed: int
@@ -88,40 +52,39 @@ class WorldSnapshot:
     memory: Any = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        content = dict(vars(self))
-        for name in ("present", "base"):
-            if isinstance(content[name], StepBase):
-                content[name] = SavedBase.of(content[name])
-        if isinstance(self.engine, EngineSnapshot):
-            file = BytesIO()
-            _Pickler(file, pickle.HIGHEST_PROTOCOL).dump(self.engine)
-            content["engine"] = file.getvalue()
-        return WorldSnapshot, tuple(content.values())
+        content = vars(self)
+        return WorldSnapshot, tuple(
+            _packed(value) if name in PARTS else value for name, value in content.items()
+        )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> WorldSnapshot:
         return self  # nothing writes into it
 
-    def unpacked(self, structure: Any) -> EngineSnapshot:
-        """Return the backend's part.
+    def opened(
+        self, structures: StructureCache, structure: Any
+    ) -> tuple[EngineSnapshot, StepBase, StepBase | None]:
+        """Return engine, present and base, with the task as some structures compile it.
 
         Args:
-            structure: What the world compiles.
+            structures: Of the world.
+            structure: What its backend has compiled.
 
         Raises:
-            SnapshotMismatch: It was taken of another model.
+            SnapshotMismatch: It was taken of another model, or a part is of another kind.
         """
-        if isinstance(self.engine, EngineSnapshot):
-            return self.engine
-        found: EngineSnapshot = _Unpickler(BytesIO(self.engine), structure).load()
-        return found
 
+        def part(given: Any, kind: type) -> Any:
+            if isinstance(given, StepBase):
+                compiled = given.compiled
+                given = given if structures.compiled(compiled.plan) is compiled else _packed(given)
+            if isinstance(given, bytes):
+                given = _Unpickler(BytesIO(given), structures, structure).load()
+            if not isinstance(given, kind):
+                raise SnapshotMismatch(f"the snapshot is damaged: {given!r} is no {kind.__name__}")
+            return given
 
-def opened(base: StepBase | SavedBase, structures: StructureCache) -> StepBase:
-    """Return a saved base with the task as some structures compile it."""
-    if isinstance(base, SavedBase):
-        return base.opened(structures)
-    known = structures.compiled(base.compiled.plan) is base.compiled
-    return base if known else SavedBase.of(base).opened(structures)
+        base = None if self.base is None else part(self.base, StepBase)
+        return part(self.engine, EngineSnapshot), part(self.present, StepBase), base
 
 
 def reference(structure: Any) -> str | None:
@@ -129,21 +92,55 @@ def reference(structure: Any) -> str | None:
     return structure.digest if type(structure) in (Model, StepModel) else None
 
 
+def _packed(part: Any) -> Any:
+    if part is None or isinstance(part, bytes):
+        return part
+    file = BytesIO()
+    _Pickler(file, pickle.HIGHEST_PROTOCOL).dump(part)
+    return file.getvalue()
+
+
+_STRUCTURES = object()
+
+
+def _base(
+    structures: StructureCache,
+    plan: Plan,
+    numbers: Floats,
+    held: Mapping[str, Intervention],
+    *rest: Any,
+) -> StepBase:
+    compiled = structures.compiled(plan)
+    row = Rows(compiled.mechanisms, numbers.reshape(compiled.mechanisms.start.shape))
+    return StepBase(compiled, compiled.model.with_interventions(held), row, *rest)
+
+
 class _Pickler(pickle.Pickler):
-    """Writes references in the place of models."""
+    """Writes references in the place of models and of what is compiled."""
 
     def persistent_id(self, obj: Any) -> str | None:
-        return reference(obj)
+        return "" if obj is _STRUCTURES else reference(obj)
+
+    def reducer_override(self, obj: Any) -> Any:
+        if type(obj) is not StepBase:
+            return NotImplemented
+        mechanisms = obj.row.mechanisms
+        numbers = mechanisms.start.copy()
+        numbers[mechanisms.kept] = obj.row.numbers[mechanisms.kept]
+        what = (obj.compiled.plan, numbers, obj.model.interventions)
+        return _base, (_STRUCTURES, *what, dict(obj.pending), obj.drawn, obj.at_start)
 
 
 class _Unpickler(pickle.Unpickler):
-    """Puts a model in the place of references to it."""
+    """Puts a model and the structures in the place of references to them."""
 
-    def __init__(self, file: BytesIO, structure: Any) -> None:
+    def __init__(self, file: BytesIO, structures: StructureCache, structure: Any) -> None:
         super().__init__(file)
-        self._structure = structure
+        self._structures, self._structure = structures, structure
 
     def persistent_load(self, pid: Any) -> Any:
+        if pid == "":
+            return self._structures
         if pid != reference(self._structure):
             raise SnapshotMismatch("the snapshot is one of another model")
         return self._structure

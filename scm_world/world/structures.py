@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property
@@ -12,7 +12,7 @@ from os import PathLike
 from types import MappingProxyType
 from typing import Any, final
 
-import numpy as np
+import networkx as nx
 
 from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Values
@@ -20,15 +20,16 @@ from scm_world.errors import InterventionError, ModelError, UnknownOption, Unkno
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import Model
 from scm_world.tasks import ModelTask, Task, make_task, tasks
-from scm_world.variables import Exogenous, Intervention, Measured, Mechanism, Null, Variable
+from scm_world.variables import Exogenous, Intervention, Mechanism, Null
+from scm_world.variables.checks import check_bounds, coerce
 from scm_world.world.compiled_task import (
     CompiledTask,
     Options,
     Plan,
     StepBase,
+    beginning,
     refuse_impossible,
 )
-from scm_world.world.mechanisms import Row
 
 KEPT = 8
 """Compiled tasks that are kept for structures that come again."""
@@ -65,13 +66,12 @@ class StructureCache:
     @cached_property
     def digest(self) -> str:
         """Hash of the variables and of the model, not of the arguments of the task."""
-        return digest(fingerprint(self._system, libraries=False))
+        return digest(fingerprint(self._system(), libraries=False))
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return what decides the system: task and arguments, compiled model, variables."""
-        return {**self.task.__fingerprint__(), **self._system}
+        return {**self.task.__fingerprint__(), **self._system()}
 
-    @property
     def _system(self) -> dict[str, Any]:
         physics = {"physics": getattr(self.task, "system", None)}
         model = self.natural(None).model
@@ -122,9 +122,11 @@ class StructureCache:
             if isinstance(v, Exogenous) and v.name not in targets
         }
         values = model.solve(known, key=key)
-        if not all(_possible(variable, values) for variable in self.head.variables):
-            return None  # the intervention will be refused, with the reason
-        return self.plan(values)
+        with suppress(InterventionError):  # refused later, with the reason
+            for variable in self.head.variables:
+                check_bounds(variable, coerce(variable, values[variable.name]), values)
+            return self.plan(values)
+        return None
 
 
 def as_task(task: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Task:
@@ -150,20 +152,6 @@ def as_task(task: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Tas
     raise UnknownOption("task", task, (*tasks(), f"a task that is made, such as {made}"))
 
 
-def as_structures(task: Task | StructureCache | str, options: Options) -> StructureCache:
-    """Return the structures of a task, or those that are given.
-
-    Raises:
-        UnknownOption: There is no such task, or the structures are those of other options.
-    """
-    if not isinstance(task, StructureCache):
-        return StructureCache(as_task(task), options)
-    if task.options != options:
-        name = "options of a world with these structures"
-        raise UnknownOption(name, options, (str(task.options),))
-    return task
-
-
 @contextmanager
 def _refused(task: Task) -> Iterator[None]:
     """Note of which task a variable cannot be declared."""
@@ -174,18 +162,12 @@ def _refused(task: Task) -> Iterator[None]:
         raise
 
 
-def _possible(variable: Variable, values: Values) -> bool:
-    value = values[variable.name]
-    bounds = variable.bounds
-    if np.shape(value) != variable.shape or not np.isfinite(value).all():
-        return False
-    return bounds is None or bool(bounds.contains(value, values))
-
-
 def _head(task: Task) -> SCM:
     """Cut the model of what decides the structure out of what the task's entities share."""
     shared = {variable.name: variable for variable in task.shared()}
-    wanted = _with_causes(task.decided_by, shared)
+    causes = nx.DiGraph((p.name, v.name) for v in shared.values() for p in v.all_parents)
+    causes.add_nodes_from(task.decided_by)
+    wanted = {*task.decided_by}.union(*(nx.ancestors(causes, name) for name in task.decided_by))
     missing = sorted(wanted - shared.keys())
     if missing:
         where = "decides what stands in the world: declare it in shared()"
@@ -194,22 +176,10 @@ def _head(task: Task) -> SCM:
     return SCM(task.conventions.adapt(mine))
 
 
-def _with_causes(names: Iterable[str], declared: dict[str, Variable]) -> set[str]:
-    found: set[str] = set()
-    stack: list[Any] = list(names)
-    while stack:
-        name = stack.pop()
-        if name not in found:
-            found.add(name)
-            variable = declared.get(name)
-            stack.extend(p.name for p in (variable.all_parents if variable else ()))
-    return found
-
-
 def restructured(
     structures: StructureCache, base: StepBase, request: Mapping[str, Any], key: NoiseKey
-) -> StepBase:
-    """Give a step base in the structure that a request asks for.
+) -> tuple[StepBase, dict[str, InterventionError]]:
+    """Return a step base in the structure that a request asks for.
 
     What exists before and after keeps its values, its state and the interventions on it; what is
     new begins as at the start of an episode. Where the structure stays, so does the base.
@@ -217,13 +187,34 @@ def restructured(
     Args:
         structures: Of the task.
         base: As physics left it.
-        request: With dotted names; what it takes away has been checked.
+        request: With dotted names.
         key: Where to draw.
+
+    Returns:
+        The base; and an error for each part of the request that cannot decide which bodies there
+        are: removals of what is no block, obstacle or goal, and mechanisms that follow variables
+        which depend on the bodies.
     """
-    present = base.compiled
-    plan = asked_structure(structures, base, request, key)
+    present, acts = base.compiled, dict(base.pending.values())
+    gone = {name for name, act in acts.items() if isinstance(act, Null)}
+    wrong: dict[str, InterventionError] = {}
+    for name, act in request.items():
+        try:
+            if isinstance(act, Null) and name not in gone:
+                _check_removal(present, name)
+                gone.add(name)
+            elif isinstance(act, Mechanism) and name in structures.head:
+                _check_parents(structures.head, name, act)
+        except InterventionError as problem:
+            wrong[name] = problem
+            continue
+        if name in structures.head:
+            with suppress(InterventionError):  # what is wrong is reported later
+                acts[name] = present.model.accept(name, act)
+    after = structures.after(acts, base.model, base.row, key) or present.plan
+    plan = after[0], present.task.absent | gone
     if plan == present.plan:
-        return base
+        return base, wrong
     compiled = structures.compiled(plan)
     kept = {n: act for n, act in base.model.interventions.items() if n in compiled.model}
     model = compiled.model.with_interventions(kept)
@@ -233,61 +224,11 @@ def restructured(
         for v in model.variables
         if isinstance(v, Exogenous) and v.name in present.static and v.name not in held
     }
-    row = Row(compiled.mechanisms, compiled.mechanisms.start.copy())
-    solved = model.solve(known, key=key, only=compiled.static_names)
-    for name in compiled.static_names:
-        row[name] = solved[name]
-    for name in compiled.slices:
-        variable = compiled.model.declared(name)
-        if name in present.slices:
-            row[name] = base.row[name]
-        elif isinstance(variable, Measured) and variable.default is not None:
-            row[name] = variable.default
-    return replace(
-        base,
-        compiled=compiled,
-        model=model,
-        row=row.following(base.row),
-        fresh=frozenset(compiled.slices.keys() - present.slices.keys()),
-    )
-
-
-def asked_structure(
-    structures: StructureCache, base: StepBase, request: Mapping[str, Any], key: NoiseKey
-) -> Plan:
-    """Give the structure that a request asks for; see ``restructured``."""
-    present = base.compiled
-    before = {name for name, act in base.pending.values() if isinstance(act, Null)}
-    gone = before | {name for name, act in request.items() if isinstance(act, Null)}
-    after: Plan | None = None
-    if len(structures.head):
-        acts = dict(base.pending.values())
-        for name, value in request.items():
-            if name in structures.head:
-                with suppress(InterventionError):  # what is wrong is reported later
-                    acts[name] = present.model.accept(name, value)
-        after = structures.after(acts, base.model, base.row, key)
-    return (after or present.plan)[0], present.task.absent | gone
-
-
-def wrong_structure(
-    structures: StructureCache, base: StepBase, request: Mapping[str, Any]
-) -> dict[str, InterventionError]:
-    """Return an error for each part of a request that cannot decide which bodies there are.
-
-    Such are removals of what is no block, obstacle or goal, and mechanisms that follow variables
-    which depend on the bodies.
-    """
-    wrong: dict[str, InterventionError] = {}
-    for name, act in request.items():
-        try:
-            if isinstance(act, Null):
-                _check_removal(base, name)
-            elif isinstance(act, Mechanism) and name in structures.head:
-                _check_parents(structures.head, name, act)
-        except InterventionError as problem:
-            wrong[name] = problem
-    return wrong
+    row = beginning(compiled, key, model, known).following(base.row)
+    for name in compiled.slices.keys() & present.slices.keys():
+        row[name] = base.row[name]
+    fresh = frozenset(compiled.slices.keys() - present.slices.keys())
+    return replace(base, compiled=compiled, model=model, row=row, fresh=fresh), wrong
 
 
 def _check_parents(head: SCM, name: str, act: Mechanism) -> None:
@@ -301,19 +242,13 @@ def _check_parents(head: SCM, name: str, act: Mechanism) -> None:
         )
 
 
-def _check_removal(base: StepBase, name: str) -> None:
-    if any(asked == name and isinstance(act, Null) for asked, act in base.pending.values()):
-        return  # it was taken away at this instant
-    there = {entity.name: entity for entity in base.compiled.composition.entities}
-    if name not in there and name in base.compiled.model:
-        base.compiled.model.accept(name, Null())  # which says that it is a variable
+def _check_removal(present: CompiledTask, name: str) -> None:
+    there = {entity.name: entity.kind for entity in present.composition.entities}
+    if name not in there and name in present.model:
+        present.model.accept(name, Null())  # which says that it is a variable
     if name not in there:
         raise UnknownVariable(name, there)
-    removable = [n for n, entity in there.items() if entity.kind]
-    if name not in removable:
-        raise InterventionError(
-            f"do({name}): it cannot be taken away; blocks, obstacles and goals can: "
-            + ", ".join(removable),
-            variable=name,
-            value=Null(),
-        )
+    if not there[name]:
+        removable = ", ".join(n for n, kind in there.items() if kind)
+        said = f"do({name}): it cannot be taken away; blocks, obstacles and goals can: {removable}"
+        raise InterventionError(said, variable=name, value=Null())

@@ -99,8 +99,8 @@ def test_a_name_belongs_to_one(registry: dict[str, type[Backend]]) -> None:
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (Twin(), "is no class derived from"),
-        (int, "is no class derived from"),
+        (Twin(), "is not a class derived from"),
+        (int, "is not a class derived from"),
         (type("Nameless", (BackendWrapper,), {}), "has no name"),
         (type("Half", (Backend,), {"name": "half"}), "does not define 'apply'"),
     ],

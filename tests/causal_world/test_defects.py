@@ -160,7 +160,7 @@ def future(world: Simulation) -> list[Any]:
     taken = [world.task.goal.vectors(world.values())[1].tolist()]
     for _ in range(3):
         world.step(np.array(world.task.start))
-        taken.append(world.current()[1].vector.tolist())
+        taken.append(world.vector.tolist())
     return taken
 
 

@@ -129,7 +129,7 @@ def test_d40_goals_are_drawn_once(cameras: list[str], monkeypatch: pytest.Monkey
             drawn.append(scene)
         camera_pixels(*scene, **options)
 
-    monkeypatch.setattr("scm_world.env.pixels.camera_pixels", counted)
+    monkeypatch.setattr("scm_world.env.pictures.camera_pixels", counted)
     env = make("Stacking2", observation_mode="pixel", cameras=cameras, image_size=16)
     space = env.observation_space
     env.reset(seed=0)

@@ -286,7 +286,7 @@ def test_the_range_is_that_of_the_observations(world: World) -> None:
     """A sensor has the same strength here as in the environment."""
     from scm_world.discovery.data.worlds import half_range
 
-    how: Any = Observing(normalize=False)
+    how: Any = Observing(normalize_observations=False)
     vector = observer(world, world.compiled, how, None, world.compiled)
     for name, place in vector.layouts["observation"].items():
         if world.model.declared(name).role in ("state", "readout"):

@@ -64,7 +64,6 @@ def test_reward_of_goals_is_the_reward_of_the_step(
     assert len({round(reward, 9) for _, reward in taken}) > 1
 
 
-@pytest.mark.filterwarnings("ignore:.*decides which bodies exist")
 @pytest.mark.parametrize("id_", MADE)
 def test_rewards_are_computed_for_many_goals_at_once(id_: str) -> None:
     """Leading axes are kept: many rewards at once are the single ones."""
@@ -103,7 +102,6 @@ def test_relabelled_goals_are_fulfilled() -> None:
     np.testing.assert_array_equal(compute(achieved, elsewhere, None), np.zeros(21))
 
 
-@pytest.mark.filterwarnings("ignore:.*decides which bodies exist")
 @pytest.mark.parametrize("id_", MADE)
 def test_random_goals_differ_between_episodes_and_not_between_runs(id_: str) -> None:
     """A random goal is another one in the next episode, and the same for the same seed."""

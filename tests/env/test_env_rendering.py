@@ -14,7 +14,7 @@ from envs import BACKENDS, REACHING, make
 from model_tasks import Balance
 
 from scm_world.env import MODEL_ID
-from scm_world.env.rendering import Window
+from scm_world.env.pictures import has_screen
 from scm_world.errors import EngineError, UnknownOption
 from scm_world.tasks.trifinger.cameras import CAMERAS
 
@@ -54,7 +54,7 @@ def test_without_a_screen_a_window_is_refused(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr("sys.platform", "linux")
-    assert not Window.is_possible()
+    assert not has_screen()
     with pytest.raises(EngineError, match="rgb_array"):
         make(render_mode="human")
     assert make().unwrapped.metadata["render_modes"] == ["rgb_array"]
@@ -98,8 +98,8 @@ def test_depth_and_segmentation_agree() -> None:
     """What shows the block is nearer than the floor behind it."""
     env = make().unwrapped
     env.reset(seed=0)
-    numbers, names = env.segmentation(CAMERAS[1])
-    depth = env.depth(CAMERAS[1])
+    image = env.image(CAMERAS[1])
+    numbers, names, depth = image.segmentation, image.names, image.depth
     assert numbers.shape == depth.shape == (128, 128)
     assert {"floor", "tool_block"} <= {names[i] for i in np.unique(numbers[numbers >= 0])}
     assert 0.2 < depth[numbers == names.index("tool_block")].mean() < 0.8

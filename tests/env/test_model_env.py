@@ -57,7 +57,7 @@ def test_options_of_the_model_and_of_the_environment_go_together() -> None:
     """A model is XML, and a reward a function and what it is given."""
     env = make(CARTPOLE, reward=(upright, ANGLE, PLACE), control_dt=0.05, context="observation")
     inner: Any = env.unwrapped
-    assert (inner.world.control_period, inner.action_mode) == (0.05, "controls")
+    assert (inner.world.options.control_period, inner.action_mode) == (0.05, "controls")
     assert env.action_space.shape == (1,)
     assert list(inner.layout)[:4] == [PLACE, "slider.velocity", ANGLE, "hinge.velocity"]
     assert "pole.mass" in inner.layout
@@ -203,8 +203,8 @@ def test_pictures_are_observed_and_drawn() -> None:
     env.unwrapped.do({ANGLE: 1.5})
     assert (env.unwrapped.observe() != first).any(axis=(1, 2, 3)).all()
     assert env.render().shape == (480, 640, 3)
-    assert env.unwrapped.segmentation("side")[1] == ("world", "cart", "pole")
-    assert env.unwrapped.depth().shape == (480, 640)
+    assert env.unwrapped.image("side").names == ("world", "cart", "pole")
+    assert env.unwrapped.image().depth.shape == (480, 640)
     with pytest.raises(UnknownOption, match="side"):
         make(observation_mode="pixel", cameras=["front"])
     empty = make(Decay(), backend="step", render_mode="rgb_array")

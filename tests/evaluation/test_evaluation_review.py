@@ -13,7 +13,6 @@ from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation import Evaluation, Protocol, WorldPolicy, evaluate, why
 from scm_world.evaluation.again import shard_runner_of
 from scm_world.evaluation.figures import write_figures
-from scm_world.policies import OnnxPolicy
 from scm_world.tasks import Pushing
 
 SHORT: dict[str, Any] = {"max_episode_length": 3}
@@ -76,15 +75,6 @@ def test_a_file_does_not_decide_what_is_called() -> None:
     env = {**found.about["env"], "start": {"floor_friction": act}}
     with pytest.raises(ModelError, match=r"os:getcwd.*trusted"):
         shard_runner_of(Evaluation({**found.about, "env": env}, found.columns))
-
-
-def test_weights_beside_a_network_are_refused(tmp_path: Path) -> None:
-    """They are not summed up with the file, so that others could take their place."""
-    pytest.importorskip("onnxruntime")
-    path = tmp_path / "p.onnx"
-    path.write_bytes(b"..\x0a\x08location\x12\x06p.data..")
-    with pytest.raises(UnreadableFile, match="save it as one file"):
-        OnnxPolicy(path)
 
 
 class Noisy:

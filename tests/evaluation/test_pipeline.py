@@ -348,7 +348,7 @@ def test_what_other_processes_cannot_have_is_refused_at_once(tmp_path: Path) -> 
         ({"policy": {3: "still"}}, "name of an agent"),
         ({"policy": "stil"}, "policy"),
         ({"policy": None}, "policy"),
-        ({"policy": "nowhere.onnx"}, "nowhere.onnx"),
+        ({"policy": "nowhere.zip"}, "nowhere.zip"),
     ],
 )
 def test_wrong_arguments_are_refused_at_once(

@@ -269,8 +269,6 @@ def test_players_can_be_pickled(tmp_path: Path) -> None:
     env = make()
     policy = mlp(env.observation_space.shape[0])
     given = ["still", "random", "sweep", Random(), policy, np.zeros(9), WorldPolicy(_high)]
-    if importlib.util.find_spec("onnx") and importlib.util.find_spec("onnxruntime"):
-        given.append(network(tmp_path / "policy.onnx", policy))
     for one in given:
         player = as_player(one)
         other = pickle.loads(pickle.dumps(player))  # noqa: S301 # our own
@@ -363,81 +361,3 @@ def test_published_archives_act(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes() + b" ")
     with pytest.raises(UnreadableFile, match="another file"):
         player_from(about)
-
-
-def network(path: Path, policy: MlpPolicy, rows: Any = 1, name: str = "observation") -> Path:
-    """Write a policy as an ONNX network."""
-    onnx: Any = pytest.importorskip("onnx")
-    pytest.importorskip("onnxruntime")
-    helper, single = onnx.helper, onnx.TensorProto.FLOAT
-    weights = [
-        onnx.numpy_helper.from_array(array, f"{what}{number}")
-        for number, layer in enumerate(policy.layers)
-        for what, array in (("w", layer.weight), ("b", layer.bias))
-    ]
-    nodes = [
-        helper.make_node("Gemm", [name, "w0", "b0"], ["x"]),
-        helper.make_node("Tanh", ["x"], ["y"]),
-        helper.make_node("Gemm", ["y", "w1", "b1"], ["raw"]),
-        helper.make_node("Tanh", ["raw"], ["action"]),
-    ]
-    graph = helper.make_graph(
-        nodes,
-        "policy",
-        [helper.make_tensor_value_info(name, single, [rows, policy.n_observed])],
-        [helper.make_tensor_value_info("action", single, [rows, 9])],
-        weights,
-    )
-    opset = [helper.make_opsetid("", 17)]
-    onnx.save(helper.make_model(graph, opset_imports=opset, ir_version=9), path)
-    return path
-
-
-@pytest.mark.parametrize("rows", [1, "n"])
-def test_networks_act(tmp_path: Path, rows: Any) -> None:
-    """An ONNX file gives what its network computes, the same ones every time."""
-    env = make()
-    policy = mlp(env.observation_space.shape[0])
-    path = network(tmp_path / "policy.onnx", policy, rows)
-
-    def same(seen: Any) -> Any:
-        return np.tanh(policy.mean(seen))
-
-    found = played(path, env)
-    np.testing.assert_allclose(found, played(same, env), atol=1e-5)
-    about = as_player(str(path)).about
-    assert about["library"].startswith("onnxruntime ")
-    np.testing.assert_array_equal(played(player_from(about), env), found)
-
-
-def test_networks_of_other_observations_are_refused(tmp_path: Path) -> None:
-    """The error names both shapes, or both sets of names."""
-    env = make()
-    policy = mlp(env.observation_space.shape[0])
-    path = network(tmp_path / "policy.onnx", policy)
-    with pytest.raises(UnreadableFile, match=r"shape \(1, 56\).*float32 of shape \(1, 65\)"):
-        played(path, make(include=["joint_torques"]))
-    with pytest.raises(UnreadableFile, match="achieved_goal"):
-        played(path, make(goal_env=True))
-    (tmp_path / "text.onnx").write_text("no network")
-    with pytest.raises(UnreadableFile, match="no network"):
-        as_player(tmp_path / "text.onnx")
-
-
-def test_networks_take_arrays_by_name(tmp_path: Path) -> None:
-    """A network without an input for a part of the observation does not fit."""
-    env = make(context="privileged")
-    n = env.observation_space["observation"].shape[0]
-    path = network(tmp_path / "policy.onnx", mlp(n))
-    with pytest.raises(UnreadableFile, match=r"takes \['observation'\].*'context'"):
-        played(path, env)
-
-
-def test_a_network_that_gives_no_number_is_named(tmp_path: Path) -> None:
-    """With its file; nothing is clipped or replaced."""
-    env = make()
-    policy = mlp(env.observation_space.shape[0])
-    policy.layers[1].bias[3] = np.nan
-    path = network(tmp_path / "nan.onnx", policy)
-    with pytest.raises(ActionError, match=r"nan\.onnx"):
-        played(path, env)

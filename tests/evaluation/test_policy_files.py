@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import pickle
 from pathlib import Path
@@ -24,7 +25,7 @@ from scm_world.errors import (
 )
 from scm_world.evaluation.players import as_player, in_world, player_from
 from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, networks, save_policy
-from scm_world.policies.cards import KEY, OPTIONS, USUAL
+from scm_world.policies.cards import KEY, OPTIONS, USUAL, plain
 from scm_world.queries import World
 
 SEEN = np.random.default_rng(1).uniform(-1, 1, (5, 4, 56)).astype(np.float32)
@@ -320,7 +321,8 @@ def test_files_are_written_whole_or_not_at_all(
 
 def test_options_of_the_environment_exist() -> None:
     """The format knows the options of the environment by their names, and what is usual."""
-    assert set(OPTIONS) == USUAL.keys()
+    of_env = inspect.signature(ScmWorldEnv).parameters
+    assert {name: plain(of_env[name].default) for name in OPTIONS} == USUAL
     about = PolicyAbout(task="pushing", env={"include": ("joint_torques",), "frame_skip": 10})
     assert about.option("include") == ["joint_torques"]
     assert about.option("context") == "none"
@@ -385,37 +387,6 @@ def test_other_tasks_are_refused_by_what_they_show() -> None:
     """As many numbers as it observes there must be."""
     with pytest.raises(ActionError, match="observes 56 numbers"):
         first_action(as_player(policy(env=RELATIVE)), make("Stacking2"))
-
-
-def test_an_onnx_network_may_say_what_it_was_trained_for(tmp_path: Path) -> None:
-    """It is in its metadata, and checked like that of a policy file."""
-    onnx: Any = pytest.importorskip("onnx")
-    pytest.importorskip("onnxruntime")
-    helper, numbers = onnx.helper, onnx.TensorProto.FLOAT
-    weight = np.ascontiguousarray(FULL["layers.0.weight"].T[:, :9])
-    graph = helper.make_graph(
-        [helper.make_node("MatMul", ["x", "w"], ["y"])],
-        "policy",
-        [helper.make_tensor_value_info("x", numbers, [1, 56])],
-        [helper.make_tensor_value_info("y", numbers, [1, 9])],
-        [onnx.numpy_helper.from_array(weight, "w")],
-    )
-    opset = [helper.make_opsetid("", 13)]
-    model = helper.make_model(graph, opset_imports=opset, ir_version=8)
-    about = PolicyAbout(task="pushing", env=RELATIVE)
-    helper.set_model_props(model, {KEY: about.text()})
-    onnx.save(model, tmp_path / "a.onnx")
-    player: Any = as_player(tmp_path / "a.onnx")
-    assert player.made_for == about
-    assert first_action(player, make()).shape == (9,)
-    with pytest.raises(UnknownOption, match=r"action_mode for 'a\.onnx'"):
-        first_action(
-            player, make(action_mode="delta_end_effector_positions", delta_origin="command")
-        )
-    helper.set_model_props(model, {KEY: "{}"})
-    onnx.save(model, tmp_path / "b.onnx")
-    with pytest.raises(UnreadableFile, match="task: Field required"):
-        as_player(tmp_path / "b.onnx")
 
 
 def test_the_names_are_public() -> None:

@@ -38,7 +38,6 @@ OPTIONS: list[dict[str, Any]] = [
         "action_mode": "delta_joint_positions",
         "start": {"tool_block.mass": Draw("B")},
         "random_goal": "A",
-        "attempts": 5,
         "variables_space": "A|B",
     },
     {"observation_mode": "pixel", "cameras": ["60"], "image_size": (8, 12)},

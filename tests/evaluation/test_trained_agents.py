@@ -125,7 +125,7 @@ def test_options_are_for_agents_that_bring_none() -> None:
     seen = []
 
     def world_policy(world: Any) -> Any:
-        seen.append(world.action_mode)
+        seen.append(world.options.action_mode)
         return np.zeros(9)
 
     two = {"a": policy(env=RELATIVE), "b": WorldPolicy(world_policy)}

@@ -64,7 +64,7 @@ def check_motion(world: World, text: str) -> None:
     """
     random, model = np.random.default_rng(2), mujoco.MjModel.from_xml_string(text)
     world.reset(seed=0)
-    names = [n for n in world.parameter_keys if n.rpartition(".")[2] in PARAMETERS]
+    names = [n for n in world.compiled.parameter_keys if n.rpartition(".")[2] in PARAMETERS]
     values = {name: world[name] * random.uniform(0.75, 1.35) for name in names}
     joints = [model.joint(number).name for number in range(model.njnt)]
     values |= {f"{joint}.position": random.uniform(-0.3, 0.3) for joint in joints}
@@ -91,7 +91,7 @@ def check_rest(world: World) -> None:
     """Check that every free ball comes to rest on its radius and presses with its weight."""
     world.reset(seed=0)
     world.do({"one.mass": 0.3, "other.mass": 2.0, "one.size": 0.12, "gravity": [0.0, 0.0, -5.0]})
-    while world.index * world.control_period < 2.0:
+    while world.index * world.options.control_period < 2.0:
         world.step([])
     contacts = world.backend.contacts()
     for ball in ("one", "other"):

@@ -48,6 +48,16 @@ def test_intervals_cover_the_truth() -> None:
     assert hits[0] / 400 > 0.98  # of pairs taken for strangers: too wide
 
 
+def test_an_arm_without_variance_does_not_lend_its_degrees_of_freedom() -> None:
+    """What is held at a value, compared with five units that vary: Student's t of four degrees."""
+    random, held = np.random.default_rng(0), np.ones(5)
+    hits = 0
+    for _ in range(2000):
+        _, low, high, _ = difference(random.normal(1.0, 2.0, 5), held, paired=False)
+        hits += low <= 0.0 <= high
+    assert 0.94 < hits / 2000 < 0.96
+
+
 @pytest.mark.parametrize("backend", ["mujoco", "bullet"])
 def test_more_friction_stops_a_block_sooner(backend: str) -> None:
     """The effect has its sign, the pairs need far fewer units, and both agree."""
@@ -137,7 +147,7 @@ def test_effects_over_values_and_by_a_covariate() -> None:
 
 
 def test_two_episodes_are_compared() -> None:
-    """What differs, since when, which contacts and which noise are in one only."""
+    """What differs, since when, and which contacts are in one only."""
     world = World("pushing")
     one = world.rollout(steps=10, do=SLIDE)
     assert str(compare(one, one.counterfactual({}))) == "no difference"
@@ -147,7 +157,6 @@ def test_two_episodes_are_compared() -> None:
     assert apart.variables["floor_friction"].first == 3
     assert apart.variables["tool_block.linear_velocity"].first == 4
     assert "goal_block.size" not in apart.variables
-    assert apart.noise == (("floor_friction", 1),)
     high = one.counterfactual({"tool_block.linear_velocity": [0.0, 0.0, 2.0]}, at=5)
     assert (6, ("floor", "tool_block"), 0) in compare(one, high).contacts
     assert compare(one, other, ["floor_color"], tolerance=2.0).variables == {}

@@ -158,7 +158,7 @@ def test_by_feedback_blocks_do_not_slip_out_of_fingers_before_a_wall() -> None:
         policy, _ = Feedback(), runner.begin(everything, seed=21, episode=episode)
         over = False
         while not over:
-            action = np.clip(env.toward(policy(env.world)), -1.0, 1.0)
+            action = np.clip(env.as_action(policy(env.world)), -1.0, 1.0)
             _, _, ends, stops, infos = env.step(action)
             over = ends or stops
         fills.append(infos["fractional_success"])

@@ -204,3 +204,15 @@ def test_estimates_are_those_of_dowhy(criterion: str) -> None:
         return
     made = estimate(found, table, do=1.0, versus=0.0)
     assert made.value == pytest.approx(3.0, rel=0.1)
+
+
+def test_nodes_may_have_names_of_several_kinds() -> None:
+    """Numbers and texts in one graph; another method than one by name is refused."""
+    edges = [(0, "a"), (2, 0), (2, "a"), (0, "b"), ("b", "a"), (0, 3), (3, "a")]
+    found = identify(nx.DiGraph(edges), 0, "a", frontdoor=True)  # type: ignore[arg-type] # numbers
+    assert (found.backdoor, found.frontdoor) == ((2,), ())
+    pandas = pytest.importorskip("pandas")
+    table = pandas.DataFrame({"x": [0.0], "y": [0.0], "z": [0.0]})
+    found = identify(nx.DiGraph([("z", "x"), ("z", "y"), ("x", "y")]), "x", "y")
+    with pytest.raises(UnknownOption, match="method"):
+        estimate(found, table, do=1.0, versus=0.0, method=3)  # type: ignore[arg-type] # the point

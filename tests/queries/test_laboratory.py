@@ -134,3 +134,27 @@ def test_a_table_that_is_none_is_refused(rows: Any, error: type[Exception]) -> N
     with pytest.raises(error):
         mine.run(rows)
     assert mine.spent == 0
+
+
+def test_what_cannot_be_is_seen_beforehand() -> None:
+    """A time after the end, and arguments of another kind, cost nothing."""
+    mine = lab(budget=5)
+    mine.see(2)
+    for ask in (
+        lambda: mine.do({"floor_friction": Hard(0.3, at=3)}),
+        lambda: mine.counterfactual(1, {}, at=3),
+        lambda: mine.counterfactual([1], {}),  # type: ignore[arg-type] # that is the point
+    ):
+        with pytest.raises(UnknownOption):
+            ask()
+    assert mine.spent == 2
+    for options in ({"visible": 3}, {"allow": 3}, {"step": 3}, {"outcomes": [np.sum]}):
+        with pytest.raises(UnknownOption):
+            lab(**options)
+
+
+def test_records_are_not_changed_from_outside() -> None:
+    """What is given out is a copy."""
+    mine = lab()
+    mine.see(2)["floor_friction"][:] = 9.0
+    assert 9.0 not in mine.records[0].samples["floor_friction"]

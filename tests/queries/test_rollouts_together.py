@@ -59,7 +59,7 @@ def units_of(world: World, plans: Sequence[Mapping[str, Any]], **setting: Any) -
     """Say what is to happen, one unit for each plan."""
     names = setting.pop("names", NAMES)
     made = Setting(**{"steps": 14, **setting})
-    return [made.unit(world, made.plan(world, plan), i, names) for i, plan in enumerate(plans)]
+    return [made.unit(world, plan, i, names) for i, plan in enumerate(plans)]
 
 
 def alone(twins: Twins, units: Sequence[Unit]) -> list[Trace | Exception]:

@@ -321,7 +321,7 @@ def test_a_world_takes_the_options_of_its_model(tmp_path: Path) -> None:
     for source in (path, str(path), path.read_text(), mujoco.MjModel.from_xml_path(str(path))):
         world, other = World(source, **options), World.from_mjcf(source, **options)
         assert world.model == other.model
-        assert world.control_period == other.control_period == 0.05
+        assert world.options.control_period == other.options.control_period == 0.05
     root = '<robot name="r"><link name="l"><inertial><mass value="1"/><inertia ixx="1" iyy="1" '
     urdf = root + 'izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
     assert "l.cartesian_position" in World(urdf, fixed_base=False).model

@@ -95,8 +95,8 @@ class Needy(Mine):  # type: ignore[misc] # likewise
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (Mine(), "is no class derived from"),
-        (int, "is no class derived from"),
+        (Mine(), "is not a class derived from"),
+        (int, "is not a class derived from"),
         (type("Nameless", (Task,), {}), "has no name"),
         (type("Weightless", (TriFingerTask,), {}), "has no default_weights"),
         (type("Half", (TriFingerTask,), {"name": "half"}), "does not define 'entities'"),

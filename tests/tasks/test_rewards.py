@@ -232,7 +232,7 @@ def test_velocities_that_change_cost_smoothness() -> None:
 
 def test_conventions_are_chosen_by_name() -> None:
     """Ours differ from the predecessor's in everything that is listed."""
-    assert pushing().conventions is CONVENTIONS["scm_world"]
+    assert pushing().options.conventions is CONVENTIONS["scm_world"]
     ours, theirs = (vars(CONVENTIONS[name]) for name in ("scm_world", "causal_world"))
     assert not [name for name in ours if ours[name] == theirs[name]]
     with pytest.raises(UnknownOption, match="did you mean 'causal_world'"):

@@ -222,7 +222,7 @@ def test_one_seed_is_one_random_wall_on_every_engine() -> None:
         world = begin(StackedBlocks(num_of_levels=3), backend=backend)
         for _ in range(2):
             world.reset(seed=5, do=RANDOM)
-            found.append([world["wall.layout"].tolist(), world.current()[1].positions.tolist()])
+            found.append([world["wall.layout"].tolist(), world.state.positions.tolist()])
     assert all(each == found[0] for each in found)
 
 

@@ -82,7 +82,7 @@ def test_an_action_does_what_a_command_says(options: dict[str, Any]) -> None:
     mode = options.get("action_mode", "joint_positions").removeprefix("delta_")
     command = np.clip(env.world[mode] + 0.01, env.world.action_low, env.world.action_high)
 
-    action: Any = env.toward(command)
+    action: Any = env.as_action(command)
     env.step(action)
 
     np.testing.assert_allclose(env.world["action"], command, atol=1e-12)

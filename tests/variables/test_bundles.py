@@ -150,7 +150,7 @@ def test_bundles_are_checked_when_they_are_declared() -> None:
             Derived(**{**good, **wrong})
     with pytest.raises(ModelError, match="has 'right' as"):
         SCM([LEFT, RIGHT.model_copy(update={"shape": (1,), "default": (3.0,)}), both()])
-    with pytest.raises(ModelError, match="no quantity of its own"):
+    with pytest.raises(ModelError, match="not a quantity of its own"):
         SCM([LEFT, RIGHT, both(), bundle("all", [both(), LEFT])])
 
 

@@ -110,7 +110,9 @@ def test_a_control_step_takes_the_same_time_under_every_preset(
     world.do({"tool_block.linear_velocity": [0.0, 0.0, 1.0]})
     world.step(REST)
     height = world["tool_block.cartesian_position"][2] - 0.0325
-    assert height == pytest.approx(world.control_period) == pytest.approx(0.004 * frame_skip)
+    assert (
+        height == pytest.approx(world.options.control_period) == pytest.approx(0.004 * frame_skip)
+    )
 
 
 def test_episodes_have_the_published_lengths() -> None:

@@ -166,7 +166,7 @@ def test_probe_states_of_a_model_do_not_depend_on_how_many() -> None:
 
 def _state(world: World, snapshot: object) -> bytes:
     world.restore(snapshot)  # type: ignore[arg-type]
-    return world.current()[1].vector.tobytes()
+    return world.vector.tobytes()
 
 
 def test_some_probe_states_have_other_parameters() -> None:

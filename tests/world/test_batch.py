@@ -42,7 +42,7 @@ def check(batch: Batch, alone: list[Simulation], rows: Any) -> None:
     for row in rows:
         now = alone[row].evaluate(NAMES)
         for name in NAMES:
-            found = batch.table(row).column(name)[row]
+            found = np.ravel(batch.table(row)[name][row])
             np.testing.assert_array_equal(found, np.ravel(now[name]), err_msg=f"{name}, {row}")
 
 
@@ -98,7 +98,7 @@ def test_numbers_of_worlds_and_threads(count: int, threads: int) -> None:
     for asked in commands(alone[0], 8):
         alone[0].advance(asked[0].copy())
         batch.advance(np.resize(asked, (count, 9)))
-        np.testing.assert_array_equal(batch.table(0).matrix[0, :40], alone[0].current()[1].vector)
+        np.testing.assert_array_equal(batch.table(0).numbers[0, :40], alone[0].vector)
 
 
 def _lean(joints: Any) -> Any:

@@ -88,7 +88,7 @@ def test_an_interrupted_batch_is_where_its_engine_is(monkeypatch: pytest.MonkeyP
         batch.advance(third, np.arange(COUNT) == index)
         other.advance(third[index].copy())
         assert other.index == batch.world(index).index == 3
-        assert other["reward"] == batch.table(index).column("reward")[index, 0]
+        assert other["reward"] == batch.table(index)["reward"][index]
 
 
 def test_what_was_not_computed_is_remembered_all_the_same() -> None:
@@ -101,7 +101,7 @@ def test_what_was_not_computed_is_remembered_all_the_same() -> None:
             world.advance(asked[index].copy())
             if step % 3 == 2:
                 now = world.evaluate(("reward",))
-                assert batch.table(index).column("reward")[index, 0] == now["reward"]
+                assert batch.table(index)["reward"][index] == now["reward"]
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")

@@ -130,7 +130,7 @@ def test_types_are_those_of_a_single_world(kind: str) -> None:
             world.advance(np.zeros(9))
             now = world.evaluate(("reward", OTHER))
             for name in ("reward", OTHER):
-                assert batch.table(row).column(name)[row, 0] == float(now[name]), name
+                assert batch.table(row)[name][row] == float(now[name]), name
 
 
 def test_what_is_remembered_is_not_cut_to_a_whole_number() -> None:

@@ -30,7 +30,7 @@ from scm_world.errors import (
 )
 from scm_world.models import Difference
 from scm_world.variables import Draw, Normal, Null, Scale, Shift
-from scm_world.world.interventions import Present, feasible
+from scm_world.world.interventions import feasible
 
 NAN = float("nan")
 HUGE = 1e308
@@ -173,7 +173,7 @@ def test_every_settable_variable_is_applied_and_read_back(backend: str, task: st
         np.testing.assert_allclose(world[name], wanted, atol=1e-12)
         np.testing.assert_array_equal(entry.requested, wanted)
         target = world.model.target(name)
-        known = target in world.parameter_keys or target in world.slices
+        known = target in world.compiled.parameter_keys or target in world.compiled.slices
         assert (entry.read_back is not None) == (known or name == "control_index")
         if entry.read_back is not None:
             np.testing.assert_allclose(entry.read_back, wanted, atol=1e-6)
@@ -224,17 +224,15 @@ def test_an_engine_is_told_the_difference_of_the_scenes(backend: str, task: str)
         request = {name: other(world, name)}
         key = world.noise_key(world.index)
         base = world._step_base()
-        here = Present(world.structures, base, base.row, world.structure)
-        solution, told = feasible(here, request, None, key)
-        compiled, row = solution.compiled, solution.row
-        then = compiled.describe(row, compiled.state_of(row))
+        done = feasible(world.structures, base, base, request, None, key)
+        then = done.compiled.scene(done.row)
         now = world.scene()
         if now.structure != then.structure:
             expected = dict(then.parameters)
         else:
             pairs = then.parameters.items()
             expected = {k: v for k, v in pairs if not np.array_equal(v, now.parameters[k])}
-        told = told or Difference()
+        told = done.change or Difference()
         assert told.parameters.keys() == expected.keys()
         assert all(np.array_equal(told.parameters[k], v) for k, v in expected.items())
         stays = now.structure == then.structure and now.state.coincides(then.state)

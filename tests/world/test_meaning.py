@@ -114,7 +114,7 @@ def test_appearances_and_goals_have_no_effect(backend: str, task: str) -> None:
     """Colors, goals and the masses of the finger bases move nothing that moves."""
     world = begin(backend, task)
     start = world.snapshot()
-    n_states = world.current()[1].vector.size
+    n_states = world.vector.size
     commands = actions(50, seed=3, spread=0.8)
     future = play(world, commands)[:, :n_states]
     still = [

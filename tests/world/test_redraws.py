@@ -9,11 +9,12 @@ import pytest
 
 from scm_world import Draw, Mechanism, Shift, World
 from scm_world.errors import Infeasible, InterventionError
+from scm_world.graph import NoiseKey
 from scm_world.variables import Box, Function
 from scm_world.variables.noise import Noise, word_of
 from scm_world.world import interventions
 from scm_world.world.compiled_task import StepBase
-from scm_world.world.interventions import Solution
+from scm_world.world.interventions import Transaction
 from scm_world.world.philox import philox
 
 
@@ -54,15 +55,15 @@ def test_what_no_draw_changes_is_refused_without_drawing_again(
 ) -> None:
     """Two bodies in one place that follow no draw are refused after the first one."""
     attempts: list[int] = []
-    solve = Solution.solve
+    solve = Transaction.solve
 
-    def counted(solution: Solution) -> Any:
-        attempts.append(solution.key.attempt)
-        return solve(solution)
+    def counted(done: Transaction, key: NoiseKey) -> Any:
+        attempts.append(key.attempt)
+        return solve(done, key)
 
     world = World(task, backend="fake")
     world.reset(seed=1)
-    monkeypatch.setattr(Solution, "solve", counted)
+    monkeypatch.setattr(Transaction, "solve", counted)
     with pytest.raises(Infeasible, match="whatever is drawn, '"):
         world.do(request_)
     assert len(attempts) == 1
@@ -148,13 +149,13 @@ def test_draws_are_looked_at_together_and_the_same_one_is_taken(
 ) -> None:
     """Leaving out draws in which bodies overlap changes neither the world nor the error."""
     solved: list[int] = []
-    solve = Solution.solve
+    solve = Transaction.solve
 
-    def noted(solution: Solution) -> Any:
-        solved.append(solution.key.attempt)
-        return solve(solution)
+    def noted(done: Transaction, key: NoiseKey) -> Any:
+        solved.append(key.attempt)
+        return solve(done, key)
 
-    monkeypatch.setattr(Solution, "solve", noted)
+    monkeypatch.setattr(Transaction, "solve", noted)
     monkeypatch.setattr(interventions, "ATTEMPTS", 200)
     found: list[Any] = []
     for screened in (True, False):
@@ -162,7 +163,7 @@ def test_draws_are_looked_at_together_and_the_same_one_is_taken(
         world.reset(seed=2)
         world.step(world.action_high if "reaching" in task else world.task.idle(world))
         if not screened:
-            monkeypatch.setattr(interventions, "_promising", lambda *_: range(200))
+            monkeypatch.setattr(Transaction, "promising", lambda *_: range(200))
         solved.clear()
         try:
             world.do(request_)

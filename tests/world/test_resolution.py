@@ -127,13 +127,13 @@ def test_the_parts_are_those_of_the_whole() -> None:
 def test_the_default_has_the_variables_that_it_always_had() -> None:
     """Worlds, snapshots and copies are those of before where no resolution is asked for."""
     world = World("pushing", backend="fake")
-    assert world.resolution == "vector"
+    assert world.options.resolution == "vector"
     assert not world.compiled.bundles
     for resolution in FINER:
         finer = World("pushing", backend="fake", resolution=resolution)
         assert [n for n in finer.model if n not in finer.compiled.parts] == list(world.model)
     assert len(world.identity) == 7
-    assert copy.copy(world).resolution == "vector"
+    assert copy.copy(world).options.resolution == "vector"
     with pytest.raises(UnknownOption, match="finger"):
         World("pushing", backend="fake", resolution="arm")
 
@@ -252,7 +252,7 @@ def test_a_snapshot_goes_on_at_its_own_resolution(resolution: str) -> None:
     other = pickle.loads(pickle.dumps(world))  # noqa: S301 # our own
     for one in (world, other):
         one.step(REST)
-    np.testing.assert_array_equal(world.current()[1].vector, other.current()[1].vector)
+    np.testing.assert_array_equal(world.vector, other.vector)
     with pytest.raises(SnapshotMismatch):
         World("pushing").restore(world.snapshot())
 
@@ -289,7 +289,7 @@ def test_worlds_that_are_stepped_together(resolution: str) -> None:
             world.step(command)
             now = world.evaluate(names)
             for name in names:
-                column = batch.table(row).column(name)[row]
+                column = np.ravel(batch.table(row)[name][row])
                 np.testing.assert_array_equal(column, np.ravel(now[name]), err_msg=name)
 
 

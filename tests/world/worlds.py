@@ -65,7 +65,7 @@ def play(world: Simulation, commands: Iterable[Any]) -> np.ndarray:
     for command in commands:
         world.step(command)
         now = world.evaluate(("reward", "fractional_success"))
-        state = world.current()[1].vector
+        state = world.vector
         rows.append([*state, float(now["reward"]), float(now["fractional_success"])])
     return np.array(rows)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, Capabilities, ContactPoint, EngineSnapshot
-from scm_world.backends.bullet.client import Client, Instant, Past, SavedState
+from scm_world.backends.bullet.client import CanonicalState, Client, Past, SavedState
 from scm_world.backends.bullet.engine import load
 from scm_world.backends.bullet.honoured import accepted, settle, supports
 from scm_world.errors import EngineFailure, Infeasible
@@ -38,8 +38,8 @@ class Record:
     """
 
     past: Past
-    last: Instant
-    now: Instant
+    last: CanonicalState
+    now: CanonicalState
     world: Past
     saved: SavedState | None = None
 
@@ -119,7 +119,7 @@ class BulletBackend(Backend):
         same = "_at" in vars(self) and structure == self.structure
         known = self._at.now.parameters if same else {}
         parameters = accepted(structure, scene.parameters, known)
-        now = Instant(structure, parameters, settle(structure, scene.state))
+        now = CanonicalState(structure, parameters, settle(structure, scene.state))
         world = Past(now)
         self._holding(world, parameters)
         self._at = Record(world, now, now, world)
@@ -137,7 +137,7 @@ class BulletBackend(Backend):
         parameters, vector = accepted(structure, given, known), now.state
         if difference.state is not None:
             vector = settle(structure, difference.state, state)
-        now = Instant(structure, parameters, vector)
+        now = CanonicalState(structure, parameters, vector)
         at, world = self._at, Past(now)
         if now.differs_lightly(at.last):
             world = at.past
@@ -174,7 +174,7 @@ class BulletBackend(Backend):
             raise EngineFailure(f"Bullet could not step: {error}", self.name) from error
         steps = *past.steps, (now.parameters, numbers, substeps)
         client.holds = past = Past(past.start, steps)
-        last = Instant(now.structure, now.parameters, state)
+        last = CanonicalState(now.structure, now.parameters, state)
         self._at = Record(past, last, last, past)
 
     def contacts(self) -> tuple[ContactPoint, ...]:

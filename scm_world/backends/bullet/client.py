@@ -34,7 +34,7 @@ SOLVER_ITERATIONS = 50  # with 20, towers spike at 40 mm/s
 
 @final
 @dataclass(frozen=True, eq=False)
-class Instant:
+class CanonicalState:
     """A canonical world: a function of these three, without the caches of the engine.
 
     Attributes:
@@ -47,7 +47,7 @@ class Instant:
     parameters: Parameters
     state: Floats
 
-    def differs_lightly(self, other: Instant) -> bool:
+    def differs_lightly(self, other: CanonicalState) -> bool:
         """Return whether it is another one but for parameters that live bodies can take on."""
         settable = self.structure.layout.can_be_set
         return (
@@ -67,7 +67,7 @@ class Past:
         steps: For each, all parameters in force, the command, and for how many physics steps.
     """
 
-    start: Instant
+    start: CanonicalState
     steps: tuple[tuple[Parameters, list[float], int], ...] = ()
 
 

@@ -27,7 +27,7 @@ from scm_world.backends.mujoco.readouts import find_readouts
 from scm_world.backends.mujoco.sources import Source, read_source, realized, understood
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, nearest
-from scm_world.models.model import REPORTED, BodyRow, Model, Parameter, Row, StateRow
+from scm_world.models.model import REPORTED, BodyRow, Model, ModelRow, Parameter, StateRow
 from scm_world.models.scene import REVERSED, reversed_ranges
 
 _JNT = mujoco.mjtJoint
@@ -370,12 +370,12 @@ def _moving(
     trees: Couplings,
     data: mujoco.MjData,
     frame: Literal["body", "world"],
-) -> tuple[dict[str, StateRow], list[Row]]:
+) -> tuple[dict[str, StateRow], list[ModelRow]]:
     """Describe what moves, in MuJoCo's order, what is reported, and the components of a command.
 
     The data are those of the beginning.
     """
-    found, inputs = list[tuple[str, StateRow]](), list[Row]()
+    found, inputs = list[tuple[str, StateRow]](), list[ModelRow]()
 
     def add(
         kind: str, name: str, array: str, places: list[int], ends: tuple[float, float], **rest: Any
@@ -432,7 +432,7 @@ def _moving(
             low, high = _ends(mj.actuator_ctrllimited[i], mj.actuator_ctrlrange[i])
             label = f"{name}.control" if count == 1 else f"{name}.control_{i - first}"
             start = min(max(float(data.ctrl[i]), low), high)
-            inputs.append(Row(label, unit, (), start, low, high, doc, **effect))
+            inputs.append(ModelRow(label, unit, (), start, low, high, doc, **effect))
     found.sort(key=lambda pair: pair[1].reported)
     named = Counter(row.name for _, row in found)
     rows = [

@@ -43,7 +43,7 @@ from scm_world.queries.equations import Equations, Layout, System
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.local import contact_terms
-from scm_world.queries.outcomes import Outcome, as_outcome
+from scm_world.queries.outcomes import Outcome, as_outcomes
 from scm_world.queries.parallel import Result, run_units
 from scm_world.queries.plans import Plan
 from scm_world.queries.rollouts import Unit
@@ -227,8 +227,7 @@ class WorldSource:
         units: list[Unit] = []
         for number, done in zip(numbers, regimes, strict=True):
             given = Plan(merged(self._world.model, self._given, done.plan))
-            plan = self._setting.plan(self._world, given)
-            unit = self._setting.unit(self._world, plan, number, written)
+            unit = self._setting.unit(self._world, given, number, written)
             units.append(replace(unit, listens=self._contacts))
         found = run_units(self._twins, units, finish, self._setting.workers)
         rows: list[Row] = []
@@ -336,8 +335,7 @@ def half_range(world: Simulation, name: str) -> Floats:
 
 
 def _outcomes(given: Iterable[Any], *, every_step: bool) -> tuple[Outcome, ...]:
-    several = (given,) if isinstance(given, str | Outcome) else given
-    found = tuple(dict.fromkeys(as_outcome(outcome) for outcome in several))
+    found = tuple(dict.fromkeys(as_outcomes(given)))
     for outcome in found:
         if not isinstance(outcome, Outcome):
             allowed = ("the name of a variable", "Outcome(name, how)")

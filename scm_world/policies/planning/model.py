@@ -130,8 +130,8 @@ class PlanningModel:
         for step in range(steps):
             self._batch.advance(commands[:, step], which)
             table = self._batch.table(0)
-            for name, shape in self._shapes.items():
-                found[name][:, step] = table.column(name)[:n].reshape(n, *shape)
+            for name in self._shapes:
+                found[name][:, step] = table[name][:n]
         return found
 
     def close(self) -> None:

@@ -3,7 +3,7 @@
 A graph says of each variable that, given its parents and its own noise, nothing else acts on it. So
 all else may be changed together, by much, and the variable has to stay as it is, bit for bit. That
 one question covers effects without an edge, effects that need two causes, thresholds and rare
-values. It covers memory, too: everything is put back after a control step, and what differs later
+values. It covers memory, too: at times everything is put back after a control step; what differs later
 though its parents do not is remembered by something that is no variable. And a mechanism is handed
 its parents as they were: what differs then is read past them. What answers is found by halving:
 causes are left out as long as the difference remains.
@@ -68,7 +68,8 @@ class Markov:
         self._targets = tuple(
             name
             for name in paired.targets
-            if not deciding or deciding.isdisjoint({name, *self._world.static_order((name,))})
+            if not deciding
+            or deciding.isdisjoint({name, *self._world.compiled.static_order((name,))})
         )
         self._geometry = {
             v.name for v in model.variables if v.unit in GEOMETRY or isinstance(v.bounds, Rotations)
@@ -92,7 +93,7 @@ class Markov:
         actions = rng.uniform(*action_range(self._world), (LATER, self._compiled.n_actions))
         for draw in range(DRAWS):
             context = self._other_values(rng, actions=False) if draw else {}
-            base = self._base(context, actions)
+            base = self._base(context, actions if draw % 2 == 0 else actions[:0])
             groups = self._groups(base.request)
             changed = self._other_values(rng, geometry=draw == 0)
             for turn in range(min(MOST_GROUPS, len(groups))):
@@ -137,17 +138,17 @@ class Markov:
                     found[name] = value
         return found
 
-    def _base(self, context: Changed, actions: Floats) -> Run:
+    def _base(self, context: Changed, later: Floats) -> Run:
         """Run in other circumstances, in which some effects show only, and in present ones if not.
 
         Where bodies that press on each other could not be put back, it does not go on.
         """
-        for request, later in ((context, actions), (context, actions[:0]), ({}, actions)):
+        for request, further in ((context, later), (context, later[:0]), ({}, later)):
             try:
-                return self._run(request, {}, later)
+                return self._run(request, {}, further)
             except (InterventionError, EngineFailure):
                 continue
-        return self._run({}, {}, actions[:0])
+        return self._run({}, {}, later[:0])
 
     def _run(
         self, request: Changed, held: Values, later: Floats, back: Values | None = None

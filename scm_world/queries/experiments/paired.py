@@ -125,7 +125,7 @@ class Paired:
 
     def _see_worn(self, effects: Effects) -> None:
         """Note the parameters that the backend has changed by itself; no state comes back then."""
-        now, names = self.world.current()[0], self.world.compiled.parameter_keys
+        now, names = self.world.row, self.world.compiled.parameter_keys
         found = self.world.backend.parameters(names.values())
         for name, key in names.items():
             effects.see_unstable(name, gap(found[key], now[name]))
@@ -154,7 +154,7 @@ class Paired:
 
     def gaps(self, names: Iterable[str], base: Values) -> dict[str, float]:
         """Compute by how much present values differ; what has another shape by now is left out."""
-        now = self.world.current()[0]
+        now = self.world.row
         alike = (n for n in names if n in now and np.shape(now[n]) == np.shape(base[n]))
         return {name: gap(now[name], base[name]) for name in alike}
 
@@ -209,7 +209,7 @@ class Paired:
         The noise of a wall, for one, shows where walls are random.
         """
         model, now = self.model, self.here
-        names = tuple(model) if self.world is None else self.world.static_names
+        names = tuple(model) if self.world is None else self.world.compiled.static_names
         values = {name: now.values[name] for name in names}
         roots = {
             name: another(model.declared(name), values, rng)

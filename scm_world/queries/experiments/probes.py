@@ -197,7 +197,7 @@ def set_others(world: Simulation, rng: Random) -> None:
         v.name: another(v, now, rng, share=JITTER)
         for v in world.model.variables
         if isinstance(v, Exogenous) and v.settable and v.dtype == "real"
-        if not deciding or deciding.isdisjoint(world.static_order((v.name,)))
+        if not deciding or deciding.isdisjoint(world.compiled.static_order((v.name,)))
         if rng.random() < SHARE
     }
     without_refused(drawn, world.do)

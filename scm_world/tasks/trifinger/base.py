@@ -314,9 +314,13 @@ class TriFingerTask(Task):
 
     def idle(self, world: Any) -> Floats:
         """Return the command that keeps the robot at rest (position, or no torque), shape (9,)."""
-        if world.action_mode == "joint_torques":
+        if world.options.action_mode == "joint_torques":
             return super().idle(world)
-        name = "end_effector_positions" if "effector" in world.action_mode else "joint_positions"
+        name = (
+            "end_effector_positions"
+            if "effector" in world.options.action_mode
+            else "joint_positions"
+        )
         return np.array(world[name])
 
     def scenarios(self, world: Any) -> Sequence[Scenario]:

@@ -46,7 +46,7 @@ _BASE_X = tuple(_COS_WORLD * x - _SIN_WORLD * y for x, y, _ in hardware.FINGER_O
 _BASE_Y = tuple(_SIN_WORLD * x + _COS_WORLD * y for x, y, _ in hardware.FINGER_OFFSET)  # [m]
 
 
-class Solution(NamedTuple):
+class InverseSolution(NamedTuple):
     """Joint positions for three targets of the fingertips.
 
     Attributes:
@@ -183,7 +183,7 @@ def forward(joint_positions: ArrayLike, height: float) -> Floats:
     return tips
 
 
-def inverse(targets: ArrayLike, height: float, near: ArrayLike) -> Solution:
+def inverse(targets: ArrayLike, height: float, near: ArrayLike) -> InverseSolution:
     """Find joint positions that bring the fingertips to their targets.
 
     A finger has up to four solutions: the leg points down or up in its plane, and its knee bends
@@ -212,7 +212,7 @@ def inverse(targets: ArrayLike, height: float, near: ArrayLike) -> Solution:
         >>> inverse(np.full(9, 2.0), hardware.NOMINAL_HEIGHT, hardware.REST).reached.tolist()
         [False, False, False]
     """
-    return Solution(*inverse_kernel(_nine(targets), float(height), _nine(near)))
+    return InverseSolution(*inverse_kernel(_nine(targets), float(height), _nine(near)))
 
 
 def _nine(values: ArrayLike) -> Floats:

@@ -49,9 +49,9 @@ class Sweep:
 
     def ahead(self, world: Any, first: int, count: int) -> Floats:
         """Return the actions of some control steps."""
-        if world.action_mode == "joint_torques":
-            raise ActionError("a sweep needs positions as actions, not", world.action_mode)
-        rows = self._way if "effector" in world.action_mode else self._joints
+        if world.options.action_mode == "joint_torques":
+            raise ActionError("a sweep needs positions as actions, not", world.options.action_mode)
+        rows = self._way if "effector" in world.options.action_mode else self._joints
         found: Floats = rows[np.minimum(np.arange(first, first + count), len(rows) - 1)]
         return found
 

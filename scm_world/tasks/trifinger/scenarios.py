@@ -293,9 +293,9 @@ def scenarios(world: Any) -> list[Scenario]:
 
 def driven(world: Any, drive: Floats, rng: Any) -> Floats:
     """Turn fingertip positions into an action of the world's mode, with a little variety."""
-    if world.action_mode == "end_effector_positions":
+    if world.options.action_mode == "end_effector_positions":
         return np.asarray(drive + rng.uniform(-0.005, 0.005, 9))
     joints = joints_for(world, drive) + rng.uniform(-0.05, 0.05, 9)
-    if world.action_mode == "joint_positions":
+    if world.options.action_mode == "joint_positions":
         return np.asarray(joints)
     return np.asarray(np.clip(5.0 * (joints - np.array(world["joint_positions"])), -0.3, 0.3))

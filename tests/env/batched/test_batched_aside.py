@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import weakref
-from typing import Any
-
-import numpy as np
 import pytest
 from many_envs import HERE, actions, check_same, make, sync
 
@@ -36,20 +31,6 @@ def test_what_is_done_to_a_world_itself_is_seen() -> None:
         envs.get_attr("world")[1].do({"sensor_noise": 0.05})
     one, other = (envs.step(actions(2, 2)[1]) for envs in pair)
     check_same(one, other)
-
-
-def test_what_belongs_to_a_structure_that_is_gone_is_freed() -> None:
-    """Tables that a batch does not keep are kept by nobody else."""
-    envs: Any = make("native", 1)
-    envs.reset(seed=0)
-    envs.step(actions(1, 1)[0])
-    table = weakref.ref(envs._batch.table(0))
-    envs._bring(0)
-    envs._batch._tables.clear()
-    envs._batch._kinds[0], envs._batch._groups = (), None
-    gc.collect()
-    assert table() is None
-    assert np.isfinite(envs.step(actions(2, 1)[1])[1]).all()
 
 
 def test_goals_that_are_unlike_the_others_are_named() -> None:

@@ -150,6 +150,9 @@ class BlockWorld(Composition):
         self.bodies, self.hides_goals = (*self.blocks, *self.obstacles), bool(self.obstacles)
         self._systems: dict[int, TriFinger] = {}
         super().__init__(self._system(0), RobotCommands(timing.action_mode))
+        states = self.system.layout.slices.items()
+        joints = (name for name, where in states if where.stop <= N_JOINTS)
+        self.screened = ("robot_height", *joints)
 
     def structure(self, values: Values) -> TriFinger:
         """Return the model of the bodies, with the settings that a preset stands for."""
@@ -190,16 +193,11 @@ class BlockWorld(Composition):
             if overlap.depth > (others if set(LINK_NAMES).isdisjoint(overlap.bodies) else robot)
         )
 
-    def thin(self, candidates: Any, limit: float) -> None:
-        """Leave out candidates whose fingers lie deep in one another, or beyond the ring.
-
-        Most draws of the joints are of this kind.
-        """
-        joints = candidates.state(slice(0, N_JOINTS))
-        if len(joints) > 1:
-            heights = np.broadcast_to(candidates.parameter(("robot", "height")), len(joints))
-            limit = max(limit, self._conventions.robot_tolerance)
-            candidates.keep(_clear(joints, np.ascontiguousarray(heights), limit))
+    def clear(self, values: Values, limit: float) -> NDArray[np.bool_]:
+        """Return which draws leave fingers clear of one another and of the ring; most do not."""
+        joints = np.hstack([values[name] for name in self.screened[1:]])
+        limit = max(limit, self._conventions.robot_tolerance)
+        return _clear(joints, values["robot_height"].ravel(), limit)
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable; edges into states follow from the kinematic trees."""

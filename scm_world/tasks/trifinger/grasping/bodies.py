@@ -131,7 +131,7 @@ class Sight:
         self.before = self.joints  # what was commanded last, if anything
         if world.index > 0:
             last = np.array(world.evaluate(("action",))["action"])
-            self.before = self.solve(last) if "effector" in world.action_mode else last
+            self.before = self.solve(last) if "effector" in world.options.action_mode else last
 
     def _intervened(self, world: Any, values: Mapping[str, Any]) -> None:
         self._version, task = world.version, world.compiled.task

@@ -93,16 +93,16 @@ class Feedback:
         Raises:
             ActionError: Actions are torques, or the task has no blocks that have goals.
         """
-        if world.action_mode == "joint_torques":
+        if world.options.action_mode == "joint_torques":
             problem = "a grasp needs joint or fingertip positions as actions, not torques"
-            raise ActionError(problem, world.action_mode)
+            raise ActionError(problem, world.options.action_mode)
         episode, index = (world.noise.seed, world.episode), world.index
         expected, program = self._programs.get(world, (None, None))
         if program is None or expected != (episode, index):
             program = Program(world)
         self._programs[world] = (episode, index + 1), program
         command = program.command(world)
-        tips = "effector" in world.action_mode
+        tips = "effector" in world.options.action_mode
         return program.sight.tips_at(command).ravel() if tips else command
 
     def memory(self, world: Any) -> Floats:
