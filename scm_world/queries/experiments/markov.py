@@ -3,10 +3,10 @@
 A graph says of each variable that, given its parents and its own noise, nothing else acts on it. So
 all else may be changed together, by much, and the variable has to stay as it is, bit for bit. That
 one question covers effects without an edge, effects that need two causes, thresholds and rare
-values. It covers memory, too: at times everything is put back after a control step; what differs later
-though its parents do not is remembered by something that is no variable. And a mechanism is handed
-its parents as they were: what differs then is read past them. What answers is found by halving:
-causes are left out as long as the difference remains.
+values. It covers memory, too: in some runs everything is put back after a control step, and what
+differs later though its parents do not is remembered by something that is no variable. And a
+mechanism is handed its parents as they were: what differs then is read past them. What answers is
+found by halving: causes are left out as long as the difference remains.
 """
 
 from __future__ import annotations
@@ -96,10 +96,14 @@ class Markov:
             base = self._base(context, actions if draw % 2 == 0 else actions[:0])
             groups = self._groups(base.request)
             changed = self._other_values(rng, geometry=draw == 0)
+            half = {name for name in changed if rng.random() < 0.5}
             for turn in range(min(MOST_GROUPS, len(groups))):
                 parents, children = groups[(number + draw * MOST_GROUPS + turn) % len(groups)]
                 some = {name: value for name, value in changed.items() if name not in parents}
-                later = actions[:0] if turn or len(base.values) == 2 else actions
+                later = actions[:0]
+                if turn == 0 and len(base.values) > 2:
+                    # writing all parameters anew could hide that one of them writes another one
+                    later, some = actions, {n: v for n, v in some.items() if n in half}
                 self._see(some, partial(self._differing, base, parents, children, later))
 
     # --- the pieces -------------------------------------------------------------------------------
