@@ -93,18 +93,19 @@ class Markov:
         actions = rng.uniform(*action_range(self._world), (LATER, self._compiled.n_actions))
         for draw in range(DRAWS):
             context = self._other_values(rng, actions=False) if draw else {}
-            base = self._base(context, actions if draw % 2 == 0 else actions[:0])
+            base = self._base(context, None if draw else actions)
             groups = self._groups(base.request)
             changed = self._other_values(rng, geometry=draw == 0)
-            half = {name for name in changed if rng.random() < 0.5}
             for turn in range(min(MOST_GROUPS, len(groups))):
                 parents, children = groups[(number + draw * MOST_GROUPS + turn) % len(groups)]
                 some = {name: value for name, value in changed.items() if name not in parents}
-                later = actions[:0]
-                if turn == 0 and len(base.values) > 2:
-                    # writing all parameters anew could hide that one of them writes another one
-                    later, some = actions, {n: v for n, v in some.items() if n in half}
-                self._see(some, partial(self._differing, base, parents, children, later))
+                self._see(some, partial(self._differing, base, parents, children, None))
+            if draw == 0:  # writing all parameters anew could hide that one writes another one
+                later = actions if len(base.values) > 2 else actions[:0]
+                chosen = {name for name in changed if rng.random() < 0.5}
+                for half in (chosen, changed.keys() - chosen):
+                    some = {name: value for name, value in changed.items() if name in half}
+                    self._see(some, partial(self._differing, base, (), [], later))
 
     # --- the pieces -------------------------------------------------------------------------------
 
@@ -142,22 +143,23 @@ class Markov:
                     found[name] = value
         return found
 
-    def _base(self, context: Changed, later: Floats) -> Run:
+    def _base(self, context: Changed, later: Floats | None) -> Run:
         """Run in other circumstances, in which some effects show only, and in present ones if not.
 
         Where bodies that press on each other could not be put back, it does not go on.
         """
-        for request, further in ((context, later), (context, later[:0]), ({}, later)):
+        shorter = None if later is None else later[:0]
+        for request, further in ((context, later), (context, shorter)):
             try:
                 return self._run(request, {}, further)
             except (InterventionError, EngineFailure):
                 continue
-        return self._run({}, {}, later[:0])
+        return self._run({}, {}, shorter)
 
     def _run(
-        self, request: Changed, held: Values, later: Floats, back: Values | None = None
+        self, request: Changed, held: Values, later: Floats | None, back: Values | None = None
     ) -> Run:
-        """Take a control step after a change; if it goes on ``later``, after putting all back."""
+        """Take a control step after a change, put all back, and go on; ask mechanisms, too."""
         paired, world, solved = self._paired, self._world, dict[Effect, Value]()
         action = paired.at(request)
         gaps = paired.gaps(held, held)
@@ -166,18 +168,18 @@ class Markov:
             action = paired.at(request)
         values = [world.values()]
         for lag in (0, 1):
-            for name in self._mechanisms if len(later) else ():
+            for name in self._mechanisms if later is not None else ():
                 solved[name, lag] = paired.evaluated(name, paired.here)
             if lag == 0:
                 world.step(action)
         values.append(world.values())
         self._effects.rollouts += 1
-        if len(later):
+        if later is not None and len(later):
             back = values[0] if back is None else back
             moved = (name for name in self._targets if gap(values[1][name], back[name]) > 0.0)
             world.do({name: back[name] for name in moved})
             values.append(world.values())
-        for action in later:
+        for action in () if later is None else later:
             world.step(action)
             self._effects.rollouts += 1
             values.append(world.values())
@@ -188,7 +190,7 @@ class Markov:
         base: Run,
         parents: Collection[str],
         children: list[str],
-        later: Floats,
+        later: Floats | None,
         changed: Changed,
     ) -> dict[Effect, float]:
         """Compute by how much variables differ whose parents do not when others are changed."""
