@@ -67,7 +67,7 @@ _OF_CLASSES = {
     "__weakref__",
     "_abc_impl",
 }
-"""Attributes of a class that say nothing about what it computes, or repeat others."""
+"""Attributes of a class without effect on its results, or that repeat others."""
 
 
 def fingerprint(parts: Any, *, libraries: bool = True) -> Fingerprint:
@@ -78,7 +78,7 @@ def fingerprint(parts: Any, *, libraries: bool = True) -> Fingerprint:
     defaults, its closure and the globals that it uses count, with their contents in turn; lines,
     comments and docstrings do not. Functions and classes of installed libraries, and of this
     package, count by name and by the version of the library. An object with a method
-    ``__fingerprint__`` counts as what that returns; other objects count by their attributes.
+    ``__fingerprint__`` counts as its result; other objects count by their attributes.
 
     ``"version of …"`` follows for each library that is used, unless results are compared bit for
     bit anyhow. After the hash of a part, ``"unread: …"`` names what cannot be compared in it, such
@@ -215,7 +215,7 @@ class _Reader:
     def _read_function(self, function: FunctionType) -> None:
         if not _is_project(function.__module__, function.__code__.co_filename):
             self._name(function.__module__, function.__qualname__)
-            # What a library makes of the user's functions, such as a decorator, holds them here.
+            # The closure of a decorator of a library holds the user's function.
             self._read_all("closure", _cells(function))
             return
         self._read_code(function.__code__)
@@ -232,7 +232,7 @@ class _Reader:
                 self.read(there)
 
     def _read_code(self, code: CodeType) -> None:
-        """Feed the hash with what code does; where it stands and what it is called do not count."""
+        """Feed the hash with the instructions of code, but not with its place and its name."""
         counts = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount
         flags = code.co_flags & (inspect.CO_VARARGS | inspect.CO_VARKEYWORDS)
         arguments = code.co_varnames[: sum(counts)]
@@ -277,7 +277,7 @@ class _Reader:
             lists = [(one,) if isinstance(one, str) else one for one in slots]
             names = sorted({*vars(value)}.union(*lists) - _lazy(kind))
         else:
-            try:  # what it would be pickled as, except tensors of torch, whose pickles differ
+            try:  # its pickle, except for tensors of torch, whose pickles differ
                 tensor = hasattr(value, "detach") and hasattr(value, "numpy")
                 state = value.detach().cpu().numpy() if tensor else value.__reduce_ex__(4)
             except Exception:  # whatever the class raises
@@ -294,7 +294,7 @@ class _Reader:
 
 
 def _cells(function: FunctionType) -> list[Any]:
-    """List what a function's closure holds; a cell that is still empty counts as None."""
+    """List the contents of a function's closure; an empty cell counts as None."""
     found = []
     for cell in function.__closure__ or ():
         try:

@@ -1,4 +1,4 @@
-"""Errors of the package: each carries its data, and says what was given and what is allowed."""
+"""Errors of the package: each carries its data, and names the fault and the allowed values."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SHOWN = 8
 """Near names that a message lists."""
 
 DAMAGED = Exception
-"""What the standard library and NumPy raise where a file is damaged: anything."""
+"""The errors of the standard library and NumPy for a damaged file: any."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
@@ -50,10 +50,10 @@ def _rebuild(kind: type[ScmWorldError], message: str, data: dict[str, Any]) -> S
 
 
 class ScmWorldError(Exception):
-    """Anything this package raises on purpose. It can be pickled, attributes included.
+    """Base class of the errors of this package. They can be pickled, attributes included.
 
     Args:
-        message: What was given, what is allowed and what to do.
+        message: The given value, the allowed ones, and the remedy.
         data: Its attributes.
     """
 
@@ -61,7 +61,7 @@ class ScmWorldError(Exception):
         self.__dict__.update(data)
         super().__init__(message)
 
-    if TYPE_CHECKING:  # each class says what it carries
+    if TYPE_CHECKING:  # each class names its attributes
 
         def __getattr__(self, name: str) -> Any: ...
 
@@ -70,7 +70,7 @@ class ScmWorldError(Exception):
 
 
 class ModelError(ScmWorldError, ValueError):
-    """A causal model, a table or a graph that cannot be used; ``problems`` has all its faults."""
+    """A faulty causal model, table or graph; ``problems`` lists all its faults."""
 
     def __init__(self, problems: Sequence[str], **data: Any) -> None:
         several = [f"{len(problems)} problems:", *(f"  - {one}" for one in problems)]
@@ -82,7 +82,7 @@ class FunctionFailure(ModelError):
     """A function of a user that raised an error, or returned a wrong value.
 
     Attributes:
-        row: Of several worlds, the number of the one in which it happened.
+        row: The number of the world in which it happened, if there are several.
     """
 
     row: int | None = None
@@ -117,14 +117,14 @@ def blamed(name: str | Callable[[], str]) -> Iterator[None]:
 
 
 class ImpossibleObservation(ModelError):
-    """An observation of a ``variable`` that the model cannot give."""
+    """An observation of a ``variable`` that is impossible in the model."""
 
     def __init__(self, variable: str, reason: str) -> None:
         super().__init__([f"{variable!r}: {reason}"], variable=variable)
 
 
 class CyclicModel(ModelError):
-    """A causal model whose contemporaneous edges form ``cycles``, one for each knot."""
+    """A causal model whose contemporaneous edges form ``cycles``, one for each component."""
 
     def __init__(self, cycles: Iterable[Sequence[str]]) -> None:
         found = tuple(tuple(cycle) for cycle in cycles)
@@ -255,7 +255,7 @@ class Infeasible(InterventionError):
 
 
 class SeveralProblems(InterventionError):
-    """More than one of the ``problems`` in one do(), in the order of the request."""
+    """Several ``problems`` in one do(), in the order of the request."""
 
     def __init__(self, problems: Sequence[InterventionError]) -> None:
         lines = "\n".join(f"  - {problem}" for problem in problems)
@@ -289,7 +289,7 @@ class EngineFailure(EngineError):
     """The engine produced a state that is not finite.
 
     Attributes:
-        unmoved: Of a batch, the numbers of the scenes that are as they were.
+        unmoved: The numbers of the scenes of a batch that did not change.
     """
 
     unmoved: tuple[int, ...] = ()
@@ -316,12 +316,12 @@ class NotReset(ScmWorldError, RuntimeError):
 
 
 class UnknownOption(ScmWorldError, ValueError):
-    """A name that is none of the choices.
+    """A value of an option that is none of its choices.
 
     Attributes:
-        option: What is being chosen, for example ``"task"``.
-        value: What was given.
-        choices: What there is.
+        option: The name of the option, for example ``"task"``.
+        value: The given value.
+        choices: The allowed values.
     """
 
     def __init__(self, option: str, value: Any, choices: Iterable[str]) -> None:
@@ -334,7 +334,7 @@ class UnknownOption(ScmWorldError, ValueError):
 
 
 class UnreadableFile(ScmWorldError, ValueError):
-    """A file (``path``) that is not what it should be (``reason``)."""
+    """A file (``path``) that is damaged or of another kind (``reason``)."""
 
     def __init__(self, path: str, reason: str, advice: str) -> None:
         message = f"{path!r} cannot be read: {reason}; {advice}"
@@ -345,13 +345,13 @@ class UnwritableFolder(ScmWorldError, OSError):
     """A folder (``path``) that cannot be written to, or not any more (``reason``)."""
 
     def __init__(self, path: str, reason: str) -> None:
-        message = f"{path!r} cannot be written to: {reason}; what is in it already is complete, and"
+        message = f"{path!r} cannot be written to: {reason}; its files are complete, and"
         message += " the same call goes on there once there is room, or the permission"
         super().__init__(message, path=path, reason=reason)
 
 
 class Forbidden(ScmWorldError, RuntimeError):
-    """Something that a laboratory does not let you do; ``allowed`` says what it does."""
+    """A request that a laboratory does not allow; ``allowed`` lists its variables."""
 
     def __init__(self, what: str, allowed: Iterable[str]) -> None:
         allowed = tuple(allowed)
@@ -374,11 +374,11 @@ class EvaluationError(ScmWorldError, RuntimeError):
 
 
 class Diverged(ScmWorldError, ArithmeticError):
-    """A training whose weights are no finite numbers any more, after so many ``steps``."""
+    """A training whose weights are not finite any more, after so many ``steps``."""
 
     def __init__(self, steps: int) -> None:
         super().__init__(
-            f"the weights are no finite numbers any more after {steps:,} steps; the last "
+            f"the weights are not finite any more after {steps:,} steps; the last "
             "checkpoint is from before; begin in another folder with a lower learning rate "
             "(rate.initial) or smaller rewards",
             steps=steps,

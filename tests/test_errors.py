@@ -157,7 +157,7 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
     ),
     (
         UnwritableFolder("results", "No space left on device"),
-        "'results' cannot be written to: No space left on device; what is in it already is "
+        "'results' cannot be written to: No space left on device; its files are "
         "complete, and the same call goes on there once there is room, or the permission",
         {"path": "results", "reason": "No space left on device"},
     ),
@@ -174,7 +174,7 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
     (EngineFailure("lost", "fake"), "lost", {"engine": "fake"}),
     (
         Diverged(4096),
-        "the weights are no finite numbers any more after 4,096 steps; the last checkpoint is from "
+        "the weights are not finite any more after 4,096 steps; the last checkpoint is from "
         "before; begin in another folder with a lower learning rate (rate.initial) or smaller "
         "rewards",
         {"steps": 4096},

@@ -17,8 +17,9 @@ from scm_world import SCM, Exogenous, World
 from scm_world.curricula import Curriculum
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ScmWorldError
-from scm_world.evaluation import Evaluation, check, evaluate
+from scm_world.evaluation import Evaluation, evaluate
 from scm_world.evaluation import files as evaluation_files
+from scm_world.evaluation.again import shard_runner_of
 from scm_world.evaluation.recording import Recording, record
 from scm_world.evaluation.setups import task_of
 from scm_world.graph.files import from_json
@@ -130,21 +131,21 @@ def _evaluation(change: Callable[[dict[str, Any]], None]) -> Evaluation:
 
 def _check_policy(reference: str) -> None:
     policy = {"kind": "function", "name": reference, "sees": "world"}
-    check(_evaluation(lambda about: about["agents"][0].update(policy=policy)))
+    shard_runner_of(_evaluation(lambda about: about["agents"][0].update(policy=policy)))
 
 
 def _check_task(reference: str) -> None:
-    check(_evaluation(lambda about: about.update(task=reference)))
+    shard_runner_of(_evaluation(lambda about: about.update(task=reference)))
 
 
 def _check_start(reference: str) -> None:
     start = {"stage_friction": _mechanism(reference)}
-    check(_evaluation(lambda about: about["env"].update(start=start)))
+    shard_runner_of(_evaluation(lambda about: about["env"].update(start=start)))
 
 
 def _check_protocol(reference: str) -> None:
     part = {"kind": "do", "request": {"stage_friction": _mechanism(reference)}}
-    check(_evaluation(lambda about: about["protocols"][0].update(act=part)))
+    shard_runner_of(_evaluation(lambda about: about["protocols"][0].update(act=part)))
 
 
 def _recording(reference: str) -> Recording:
@@ -171,7 +172,7 @@ def _load_changed(episode: Episode, **changes: Any) -> None:
 
 def _read_episode(reference: str) -> None:
     episode = World("reaching", backend="fake").rollout("random", seed=0, steps=1)
-    _load_changed(episode, layers=[[0, _plan(reference)]])
+    _load_changed(episode, plan=_plan(reference))
 
 
 def _read_episode_of_equations(reference: str) -> None:
@@ -208,4 +209,4 @@ def test_policies_and_models_of_this_package_need_no_trust() -> None:
     """They run no code that a file could choose."""
     known = {"kind": "function", "name": "scm_world.policies.scripted:Random", "sees": "world"}
     found = _evaluation(lambda about: about["agents"][0].update(policy=known))
-    assert check(found).episodes == 1
+    shard_runner_of(found).close()

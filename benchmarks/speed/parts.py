@@ -88,11 +88,11 @@ def watched_batch(envs: Any, watch: Stopwatch) -> None:
     rewards, and what is known beside them.
     """
     inner = envs.unwrapped
-    tables, readers = inner._batch._tables, inner._readers.values()
+    tables = inner._batch._tables
     places: list[tuple[str, Any, str]] = [
         (PHYSICS, inner._batch._engine, "step"),
         *(("mechanisms", one, "evaluate") for one in {compiled.mechanisms for compiled in tables}),
-        *(("observation", reader, "write") for reader in readers),
+        ("observation", inner, "_take"),
         ("observation", inner, "_observations"),
         ("info", inner, "_infos"),
         ("command", inner, "_commanded"),

@@ -69,7 +69,7 @@ def parse_value(text: str, hint: str = HINT) -> Any:
                 return Scale(_numbers(rest))
             case "draw":
                 return Draw(rest.strip())
-    except UnknownOption:
+    except ValueError:
         wanted = "draw:A, draw:B or draw:A|B" if kind.strip().lower() == "draw" else "numbers"
         raise refused(text, f"expected {wanted}", hint) from None
     raise refused(text, "expected a number, a list, shift:…, scale:… or draw:…", hint)

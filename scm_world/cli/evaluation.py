@@ -41,7 +41,7 @@ def evaluate(
     Example: scm-world evaluate zoo:pushing,random --protocols P0,P5 -n 100
 
     Args:
-        policy: A file (.safetensors, .zip, .npz, .parquet; a .zip of Stable-Baselines3 with
+        policy: A file (.safetensors, .zip; a .zip of Stable-Baselines3 with
             --trust stable_baselines3), the folder of a training run,
             zoo:NAME, random, still, sweep, feedback, or module:function; several with commas;
             NAME=POLICY names one, and A+B are its runs.

@@ -12,58 +12,44 @@ A curriculum is a sentence::
     env = CurriculumEnv(gymnasium.make("scm_world/Pushing-v0"), curriculum)
 """
 
-from scm_world.curricula.base import Do, Memory, Part, Situation
-from scm_world.curricula.combinations import (
+from scm_world.curricula.base import Memory, Part, Progress, Situation
+from scm_world.curricula.curriculum import Curriculum
+from scm_world.curricula.parts import (
     at_reset,
     at_step,
     during,
     every,
-    in_turn,
-    stages,
-    together,
-    weighted,
-    when,
-)
-from scm_world.curricula.curriculum import Curriculum, as_curriculum
-from scm_world.curricula.parts import (
-    Follow,
-    Interpolate,
-    NewGoal,
-    Resample,
     everything,
     follow,
     goals,
+    in_turn,
     interpolate,
     joints,
     looks,
     physics,
     poses,
+    published_actor,
     resample,
+    stages,
+    together,
+    weighted,
+    when,
 )
-from scm_world.curricula.published import ACTORS, published_actor
-from scm_world.curricula.vector import CurriculumVectorEnv, make_vec
-from scm_world.curricula.wrapper import CurriculumEnv, CurriculumRunner
+from scm_world.curricula.wrapper import CurriculumEnv, CurriculumVectorEnv, make_vec
 from scm_world.variables import AB, A, B, Subset
 
 __all__ = [
     "AB",
-    "ACTORS",
     "A",
     "B",
     "Curriculum",
     "CurriculumEnv",
-    "CurriculumRunner",
     "CurriculumVectorEnv",
-    "Do",
-    "Follow",
-    "Interpolate",
     "Memory",
-    "NewGoal",
     "Part",
-    "Resample",
+    "Progress",
     "Situation",
     "Subset",
-    "as_curriculum",
     "at_reset",
     "at_step",
     "during",

@@ -1,94 +1,62 @@
-"""The elements of curricula: values that return a plan for an episode that begins."""
+"""Parts of curricula: values that return a plan for an episode that begins."""
 
 from __future__ import annotations
 
 import hashlib
-from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, final
+from functools import cached_property, wraps
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, final
 
 import numpy as np
-from pydantic import PlainSerializer, PlainValidator, ValidationError
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    NonNegativeInt,
+    PlainSerializer,
+    PlainValidator,
+    ValidationInfo,
+    create_model,
+    model_validator,
+)
 
-from scm_world._arguments import one_of
-from scm_world._types import Value
-from scm_world.errors import ScmWorldError, UnknownOption, UnreadableFile
-from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.queries.plans import Plan, as_act, targets
-from scm_world.variables import Draw, Function, Intervention, Noise, Time
-from scm_world.variables.spaces import Frozen, problems_of
-from scm_world.world.compiled_task import CompiledTask, beginning
+from scm_world._arguments import one_of, whole_number
+from scm_world._types import Floats
+from scm_world.errors import ModelError, UnknownOption
+from scm_world.graph import SCM
+from scm_world.queries.plans import Plan
+from scm_world.variables import Noise
+from scm_world.variables.spaces import Frozen
+from scm_world.world.compiled_task import CompiledTask
 
 STREAM = "curriculum"
-"""First word of the noise of curricula."""
+"""First word of the noise streams of curricula."""
 
 
-@final
-@dataclass
-class Progress:
-    """How far the learner has come in the stages of an adaptive part.
+class Progress(NamedTuple):
+    """How far the learner has come in a part with stages.
 
     Attributes:
         level: The present stage.
         recent: Whether the last episodes of this stage were successes.
     """
 
-    level: int = 0
-    recent: deque[bool] = field(default_factory=deque)
+    level: NonNegativeInt = 0
+    recent: tuple[bool, ...] = ()
 
 
-@contextmanager
-def state_read(source: str) -> Iterator[None]:
-    """Refuse plain data that is no state of a curriculum.
-
-    Args:
-        source: The method whose result is expected.
-
-    Raises:
-        UnreadableFile: What is read inside is something else.
-    """
-    try:
-        yield
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
-        said = f"{error} is missing" if isinstance(error, KeyError) else f"it is none ({error})"
-        advice = f"give what {source} returned, of as many environments"
-        raise UnreadableFile("the state of a curriculum", said, advice) from None
-
-
-@final
-@dataclass
-class Memory:
+class Memory(Frozen):
     """The state of a curriculum between episodes.
 
     Attributes:
-        episode: How many episodes have begun before the present one.
-        stages: Progress of each adaptive part, by its key.
+        episode: Number of the episode, from 0.
+        stages: Progress in each part with stages, by its key.
     """
 
-    episode: int = 0
-    stages: dict[str, Progress] = field(default_factory=dict)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Write it as plain data."""
-        stages = {k: {"level": p.level, "recent": [*p.recent]} for k, p in self.stages.items()}
-        return {"episode": self.episode, "stages": stages}
-
-    @classmethod
-    def from_dict(cls, data: Any) -> Memory:
-        """Read what ``as_dict`` wrote.
-
-        Raises:
-            UnreadableFile: It is something else.
-        """
-        with state_read("state()"):
-            stages = {
-                str(key): Progress(int(kept["level"]), deque(map(bool, kept["recent"])))
-                for key, kept in data["stages"].items()
-            }
-            return cls(int(data["episode"]), stages)
+    episode: NonNegativeInt
+    stages: dict[str, Progress]
 
 
 @final
@@ -97,175 +65,193 @@ class Situation:
     """The episode that begins, as a curriculum sees it.
 
     Attributes:
-        episode: How many episodes the curriculum has seen begin before this one.
-        memory: Of the curriculum: how far the learner has come.
+        memory: The number of the episode, and how far the learner has come.
         compiled: The structure of the episode.
-        noise: Of the episode.
-        number: Of the episode within that noise.
-        time: The time of what has none of its own; None is the reset.
-        first: Where bodies come and go: what decides that, which is asked for before all else,
-            so that the rest finds the bodies that there will be; else None.
+        noise: The noise of the episode.
+        number: Number of the episode within that noise.
+        step: The control step of the part that is asked; 0 is the reset.
+        first: The variables that decide which bodies exist, where only these are asked for: the
+            plan for them comes first, and the rest is asked for the bodies that follow; else None.
+        key: The key of the part that is asked.
+        staged: The keys of the parts with stages that were asked.
     """
 
-    episode: int
     memory: Memory
     compiled: CompiledTask
     noise: Noise
     number: int
-    time: Time | None = None
+    step: int = 0
     first: frozenset[str] | None = None
+    key: str = ""
+    staged: set[str] = field(default_factory=set)
+
+    @property
+    def episode(self) -> int:
+        """Number of the episode within the curriculum."""
+        return self.memory.episode
 
     @property
     def model(self) -> SCM:
-        """The variables that there are."""
+        """The variables of the episode."""
         return self.compiled.model
 
-    @property
-    def step(self) -> int:
-        """The control step for which it is asked; 0 is the reset."""
-        return (self.time and self.time.start) or 0
-
     def uniform(self, key: str) -> float:
-        """Draw a number in [0, 1) from a noise of the curriculum's own.
+        """Return a random number in [0, 1).
 
         Args:
-            key: Of the noise; one key gives one number at one instant.
+            key: Name of the noise stream; one name gives one number at one control step.
         """
-        where: Any = {"episode": self.number, "step": self.step}
-        return float(self.noise.uniforms(f"{STREAM}/{key}", n=1, **where)[0, 0])
+        return float(self._uniforms(key, 1)[0])
 
     def generator(self, key: str) -> np.random.Generator:
-        """Return a generator of random numbers of the curriculum's own; see ``uniform``."""
-        where: Any = {"episode": self.number, "step": self.step}
-        words = self.noise.uniforms(f"{STREAM}/{key}/generator", n=2, **where)[0] * 2.0**53
+        """Return a generator of random numbers; see ``uniform``."""
+        words = self._uniforms(f"{key}/generator", 2) * 2.0**53
         return np.random.default_rng([int(word) for word in words])
 
-    def natural(self, name: str) -> Value | None:
-        """Return a variable at the beginning without interventions; None if it is computed."""
-        row = beginning(self.compiled, NoiseKey(self.noise, self.number, origin=0))
-        known = name in self.compiled.slices or name in self.compiled.static_names
-        return np.array(row[name]) if known else None
+    def _uniforms(self, key: str, n: int) -> Floats:
+        where: Any = {"episode": self.number, "step": self.step}
+        drawn: Floats = self.noise.uniforms(f"{STREAM}/{key}", n=n, **where)[0]
+        return drawn
+
+
+Acts = Mapping[str, Any]
+"""Interventions, as ``Plan`` takes them."""
+Rule = Callable[[Situation], Acts]
+"""A function of the episode that returns its interventions."""
 
 
 class Part(Frozen):
-    """A rule that says what is done in an episode. It is a value, with JSON without loss.
+    """A rule with its arguments: immutable and JSON-serialisable.
 
     Attributes:
         kind: Its name in a file.
     """
 
     KINDS: ClassVar[dict[str, type[Part]]] = {}
+    RULE: ClassVar[Callable[..., Rule]]
 
     kind: str
 
-    if TYPE_CHECKING:  # as in ``Frozen``
+    @model_validator(mode="after")
+    def _has_rule(self) -> Part:
+        self._rule()  # it checks the arguments
+        return self
 
-        def __init__(self, **fields: Any) -> None: ...
+    def _rule(self) -> Rule:
+        fields = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
+        return self.RULE(*fields.pop("of", ()), **fields)
 
-    @classmethod
-    def __pydantic_init_subclass__(cls, **options: Any) -> None:
-        """Know the part by its kind, so that it can be read from a file."""
-        super().__pydantic_init_subclass__(**options)
-        default = cls.model_fields["kind"].default
-        if isinstance(default, str):
-            Part.KINDS[default] = cls
-
-    def acts(self, situation: Situation) -> Mapping[str, Any]:
-        """Return the interventions of the episode, as ``Plan`` takes them; none by default."""
-        return {}
-
-    @final
     def plan(self, situation: Situation) -> Plan:
-        """Return the interventions of the episode; what has no time has that of the situation."""
-        plan, time = Plan(self.acts(situation)), situation.time
-        if time is None:
-            return plan
-        timed = {name: tuple(_at(act, time) for act in acts) for name, acts in plan.items()}
-        return Plan.of(timed)
-
-    def parts(self) -> tuple[Part, ...]:
-        """List its parts."""
-        return ()
-
-    def walk(self) -> Iterator[Part]:
-        """List it and all its parts, recursively."""
-        yield self
-        for part in self.parts():
-            yield from part.walk()
-
-    def live(self, memory: Memory, episode: int) -> Iterator[Part]:
-        """List it and what may act in an episode, as far as its number and the stages say."""
-        yield self
-        for part in self.parts():
-            yield from part.live(memory, episode)
-
-    def check(self, compiled: CompiledTask) -> None:
-        """Look for names that do not exist and values that are impossible, in a structure.
-
-        Raises:
-            UnknownVariable: A name stands for nothing.
-            InterventionError: A region or a value is impossible.
-        """
+        """Return the interventions of an episode."""
+        return Plan(self._rule()(replace(situation, key=self.key)))
 
     @cached_property
     def key(self) -> str:
-        """A word that sums up its content: two parts with one key have the same noise."""
+        """A hash of the content: two parts with one key have the same noise."""
         text = f"{self.kind}/{self.model_dump_json()}"
         return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
-    def functions(self) -> Iterator[Function]:
-        """List the functions of the user's that it calls."""
-        yield from ()
+
+def kind(name: str) -> Callable[[Callable[..., Rule]], Callable[..., Part]]:
+    """Return a decorator: what a function of this kind returns is a part, with a name in files.
+
+    The function returns a rule. Its arguments are the fields of the part, checked and written as
+    their annotations say; several parts are ``*of``.
+    """
+
+    def decorate(function: Callable[..., Rule]) -> Callable[..., Part]:
+        signature = inspect.signature(function, eval_str=True)
+        fields: dict[str, Any] = {"kind": (Literal[name], name)}
+        for one in signature.parameters.values():
+            default = ... if one.default is one.empty else one.default
+            fields[one.name] = _OF if one.name == "of" else (one.annotation, default)
+        made: Any = create_model(name, __base__=Part, __module__=function.__module__, **fields)
+        made.__qualname__ = f"{function.__name__}.part"  # where pickle finds it
+        made.RULE = staticmethod(function)
+        Part.KINDS[name] = made
+
+        @wraps(function)
+        def make(*given: Any, **named: Any) -> Part:
+            found: Part = made(**signature.bind_partial(*given).arguments, **named)
+            return found
+
+        vars(make)["part"] = made
+        return make
+
+    return decorate
 
 
-def _at(act: Any, time: Time) -> Any:
-    return act if act.time is not None else act.model_copy(update={"time": time})
+Kind = TypeVar("Kind", bound=Frozen)
 
 
-def over(model: SCM, *plans: Plan) -> Plan:
-    """Put plans over one another: of two acts on one quantity at one time the later one counts."""
-    found = dict(plans[0])
-    for plan in plans[1:]:
-        mine: dict[Time | None, set[str]] = {}
-        for name, acts in plan.items():
-            for act in acts:
-                mine.setdefault(act.time, set()).update(targets(model, name))
-        for name, acts in [*found.items()]:
-            kept = tuple(
-                act
-                for act in acts
-                if not mine.get(act.time, set()).issuperset(targets(model, name))
-            )
-            if len(kept) < len(acts):
-                found.pop(name)
-            if kept:
-                found[name] = kept
-        found |= {name: (*found.get(name, ()), *acts) for name, acts in plan.items()}
-    return Plan.of(found)
+def nested(value: Any, kind: type[Kind]) -> Iterator[Kind]:
+    """List the values of a kind in a declaration: itself, then those in its fields."""
+    inner: Iterable[Any] = ()
+    if isinstance(value, Frozen):
+        inner = (getattr(value, name) for name in type(value).model_fields)
+    elif isinstance(value, Mapping):
+        inner = value.values()
+    elif isinstance(value, tuple):
+        inner = value
+    if isinstance(value, kind):
+        yield value
+    for one in inner:
+        yield from nested(one, kind)
 
 
 def as_part(given: Any) -> Part:
-    """Take a part, the plain data of one, or an intervention that is always done.
+    """Return a part: itself, from plain data, of a function, or of a fixed intervention.
 
     Raises:
         UnknownOption: It is none of these.
+        ModelError: A field of the plain data is missing or wrong.
     """
     if isinstance(given, Part):
         return given
-    if not isinstance(given, Mapping):
+    fields: Any = given
+    if callable(given):
+        fields = {"kind": "follow", "function": given}
+    elif not isinstance(given, Mapping):
         raise UnknownOption("part of a curriculum", given, ("a part, such as resample('*.mass')",))
-    kind = given.get("kind")
-    if not isinstance(kind, str):
-        return Do(given)
-    one_of("part of a curriculum", kind, Part.KINDS)
+    elif not isinstance(given.get("kind"), str):
+        fields = {"kind": "do", "request": given}
+    one_of("part of a curriculum", fields["kind"], Part.KINDS)
     try:
-        return Part.KINDS[kind].model_validate(dict(given))
-    except ScmWorldError:
-        raise
-    except (ValidationError, TypeError) as error:
-        said = "; ".join(problems_of(error)) if isinstance(error, ValidationError) else str(error)
-        allowed = (f"the data of one, which this is not: {said}",)
-        raise UnknownOption("part of a curriculum", kind, allowed) from None
+        return Part.KINDS[fields["kind"]](**fields)
+    except TypeError as error:  # of an intervention in a file that lacks its value
+        raise ModelError([f"{fields['kind']}: {error}"]) from None
+
+
+# --- types of fields ------------------------------------------------------------------------------
+
+
+def words(option: str, given: Any) -> tuple[str, ...]:
+    """Return names and patterns as a tuple; one may be given by itself.
+
+    Raises:
+        UnknownOption: One of them is not text.
+    """
+    names = tuple(given) if isinstance(given, Iterable) and not isinstance(given, str) else (given,)
+    if not all(isinstance(name, str) for name in names):
+        raise UnknownOption(option, given, ("a name or a pattern", "several of them"))
+    return names
+
+
+def _words(given: Any, info: ValidationInfo) -> tuple[str, ...]:
+    return words(str(info.field_name), given)
+
+
+def _whole(least: int) -> BeforeValidator:
+    def read(given: Any, info: ValidationInfo) -> int:
+        return whole_number(str(info.field_name), given, least=least)
+
+    return BeforeValidator(read)
+
+
+def _some(parts: tuple[Part, ...]) -> tuple[Part, ...]:
+    if not parts:
+        raise UnknownOption("parts", (), ("one part or more",))
+    return parts
 
 
 AnyPart = Annotated[
@@ -274,78 +260,10 @@ AnyPart = Annotated[
     PlainSerializer(lambda part: part.model_dump(mode="json"), return_type=dict),
 ]
 """A part; its ``kind`` says which."""
-
-
-def words(option: str, given: Any) -> tuple[str, ...]:
-    """Read names and patterns: one, or several.
-
-    Raises:
-        UnknownOption: One of them is no word.
-    """
-    names = tuple(given) if isinstance(given, Iterable) and not isinstance(given, str) else (given,)
-    if not all(isinstance(name, str) for name in names):
-        raise UnknownOption(option, given, ("a name or a pattern", "several of them"))
-    return names
-
-
-@final
-class Do(Part):
-    """Do always the same.
-
-    Attributes:
-        request: Interventions, by the name of the variable; each may have a time.
-
-    Example:
-        >>> Do({"tool_block": {"mass": 0.08}}).request["tool_block.mass"].value
-        0.08
-    """
-
-    kind: Literal["do"] = "do"
-    request: dict[str, Intervention]
-
-    def __init__(self, request: Mapping[str, Any], **fields: Any) -> None:
-        super().__init__(request=_acts_of(request), **fields)
-
-    def acts(self, situation: Situation) -> Mapping[str, Any]:
-        """Return the interventions; their draws have noises of their own."""
-        return self._acts
-
-    @cached_property
-    def _acts(self) -> Plan:
-        def own(act: Any) -> Any:
-            if not isinstance(act, Draw) or act.stream:
-                return act
-            return act.model_copy(update={"stream": f"{STREAM}/{self.key}"})
-
-        return Plan({name: own(act) for name, act in self.request.items()})
-
-    def check(self, compiled: CompiledTask) -> None:
-        """Look for names that do not exist and values that are impossible."""
-        for name, act in self._acts.acts():
-            if name not in compiled.entity_names:
-                compiled.model.accept(name, act)
-
-    def functions(self) -> Iterator[Function]:
-        """List the functions of mechanisms."""
-        for act in self.request.values():
-            function = getattr(act, "function", None)
-            if isinstance(function, Function):
-                yield function
-
-
-def _acts_of(request: Any) -> dict[str, Any]:
-    """Read an intervention, as a user writes it or as a file has it: acts may be plain data."""
-    if not isinstance(request, Mapping):
-        return flatten(request)  # which says what is wrong
-    data = {
-        name: act
-        for name, act in request.items()
-        if isinstance(act, Mapping) and isinstance(act.get("kind"), str)
-    }
-    nested = flatten({name: act for name, act in request.items() if name not in data})
-    return {name: as_act(value) for name, value in {**nested, **data}.items()}
-
-
-def in_time(situation: Situation, time: Time | None) -> Situation:
-    """Return a situation in which what has no time of its own has another one."""
-    return replace(situation, time=time)
+_OF = Annotated[tuple[AnyPart, ...], AfterValidator(_some)], Field((), validate_default=True)
+Words = Annotated[tuple[str, ...], BeforeValidator(_words)]
+"""Names and patterns; one may be given by itself."""
+Index = Annotated[int, _whole(0)]
+"""A whole number from 0 on."""
+Count = Annotated[int, _whole(1)]
+"""A whole number from 1 on."""

@@ -3,72 +3,64 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, final
+from typing import Annotated, Any, TypeVar, final
 
-from pydantic import ValidationError
+from pydantic import BeforeValidator
 
-from scm_world.curricula.base import AnyPart, Situation, as_part
-from scm_world.curricula.combinations import Stages
-from scm_world.errors import (
-    DAMAGED,
-    ModelError,
-    UnknownOption,
-    UnknownVariable,
-    UnreadableFile,
-    blamed,
-)
+from scm_world.curricula.base import AnyPart, Memory, Part, Progress, Situation, nested
+from scm_world.curricula.parts import progressed
+from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.output.reading import read_text
 from scm_world.queries.plans import Plan, targets
 from scm_world.tasks.rewards import SUCCESS
-from scm_world.variables import Subset
+from scm_world.variables import Function, Noise, Subset
 from scm_world.variables.checks import check_subset
 from scm_world.variables.mechanisms import check_portable, check_trusted
-from scm_world.variables.spaces import Frozen, problems_of
+from scm_world.variables.spaces import Frozen
+from scm_world.variables.subsets import as_region
 from scm_world.world import Simulation
 
 FORMAT = "scm_world/curriculum/1"
-
 
 Made = TypeVar("Made", bound=Frozen)
 
 
 def read_from(kind: type[Made], data: Any, *, form: str, trusted: Sequence[str]) -> Made:
-    """Read a value that was written down as plain data.
-
-    Args:
-        kind: Of the value.
-        data: Plain data.
-        form: What its ``"format"`` has to be.
-        trusted: Packages other than this one whose functions may be called.
+    """Read a value of a class that was written as plain data, with its ``"format"``.
 
     Raises:
-        ModelError: It is something else, or it calls a function outside of those packages.
+        ModelError: It is something else, or it calls a function outside of the trusted packages.
     """
     what = kind.__name__.lower()
     if not isinstance(data, Mapping) or data.get("format") != form:
         raise ModelError([f"not a {what}: expected the format {form!r}"])
-    validate: Any = kind
+    build: Any = kind
     try:
-        made: Made = validate.model_validate({k: v for k, v in data.items() if k != "format"})
-    except ValidationError as error:
-        raise ModelError([f"not a {what}: {said}" for said in problems_of(error)]) from None
+        made: Made = build(**{k: v for k, v in data.items() if k != "format"})
     except (TypeError, ValueError) as error:
-        said_ = error.problems if isinstance(error, ModelError) else (str(error),)
-        raise ModelError([f"not a {what}: {one}" for one in said_]) from None
-    part: Any = getattr(made, "part")  # noqa: B009 # of a curriculum or a protocol
-    check_trusted((f for one in part.walk() for f in one.functions()), trusted)
+        said = error.problems if isinstance(error, ModelError) else (str(error),)
+        raise ModelError([f"not a {what}: {one}" for one in said]) from None
+    check_trusted(nested(made, Function), trusted)
     return made
+
+
+def _subset(space: Any) -> Subset | None:
+    found = as_region("space", space)
+    return Subset(found) if isinstance(found, str) else found
 
 
 @final
 class Curriculum(Frozen):
     """An intervention curriculum: immutable and JSON-serialisable.
 
+    It is made of a part, an intervention, a plan, a function of the ``Situation``, plain data, or
+    another curriculum.
+
     Attributes:
-        part: What is done in which situation.
-        space: A part of the parameter space that every intervention has to lie in, if any.
+        part: The rule that returns the interventions of an episode.
+        space: The part of the parameter space in which every intervention has to lie, if any.
 
     Example:
         >>> from scm_world.curricula import during, resample, together
@@ -83,19 +75,25 @@ class Curriculum(Frozen):
     """
 
     part: AnyPart
-    space: Subset | None = None
+    space: Annotated[Subset | None, BeforeValidator(_subset)] = None
 
     def __init__(self, part: Any = None, **fields: Any) -> None:
-        given = as_part({} if part is None else part)
-        super().__init__(part=given, **fields)
+        if isinstance(part, Mapping) and part.get("format") == FORMAT:
+            part = Curriculum.from_dict(part)
+        if isinstance(part, Curriculum):
+            part, fields = part.part, {"space": part.space, **fields}
+        super().__init__(part={} if part is None else part, **fields)
 
     def as_dict(self) -> dict[str, Any]:
         """Write it as plain data.
 
         Raises:
-            ModelError: It calls a function that cannot be found again under its name.
+            ModelError: It calls a function that cannot be found again under its name, or has a
+                number that is not finite.
         """
-        check_portable(function for part in self.part.walk() for function in part.functions())
+        check_portable(nested(self, Function))
+        for part in nested(self, Part):
+            Plan(getattr(part, "request", None)).as_dict()
         return {"format": FORMAT, **self.model_dump(mode="json")}
 
     def to_json(self, *, indent: int | None = None) -> str:
@@ -111,7 +109,7 @@ class Curriculum(Frozen):
             trusted: Packages other than this one whose functions may be called.
 
         Raises:
-            ModelError: It is no curriculum, or it calls a function outside of those packages.
+            ModelError: It is not a curriculum, or it calls a function outside of those packages.
         """
         return read_from(cls, data, form=FORMAT, trusted=trusted)
 
@@ -131,35 +129,34 @@ class Curriculum(Frozen):
         Raises:
             UnreadableFile: There is none, or it is something else.
         """
-        advice = "give a file with the text of Curriculum.to_json()"
         try:
             return cls.from_json(read_text(path), trusted=trusted)
-        except ModelError as error:
-            raise UnreadableFile(str(path), "; ".join(error.problems), advice) from None
         except DAMAGED as error:
-            raise UnreadableFile(str(path), str(error), advice) from None
+            said = "; ".join(getattr(error, "problems", (str(error),)))
+            advice = "give a file with the text of Curriculum.to_json()"
+            raise UnreadableFile(str(path), said, advice) from None
 
     def check(self, world: Simulation) -> None:
-        """Look for names that do not exist and regions that are impossible.
+        """Refuse names that do not exist and regions that are impossible.
 
-        Where variables decide which bodies there are, names are looked up at each reset: they may
-        be those of bodies that are not there yet.
+        Where variables decide which bodies exist, names are looked up at each reset: they may
+        be those of bodies that come.
 
         Args:
-            world: Whose episodes begin with the structure that its declaration has.
+            world: The world whose structure episodes begin with.
 
         Raises:
-            InterventionError: With the name.
-            UnknownOption: It has stages, and the task does not say what success is.
+            InterventionError: A name or a region does not fit.
+            UnknownOption: The task does not say what success is, or has no goals.
         """
-        has_stages = any(isinstance(part, Stages) for part in self.part.walk())
-        if has_stages and SUCCESS not in world.model:
+        parts = [*nested(self.part, Part)]
+        if SUCCESS not in world.model and any(part.kind == "stages" for part in parts):
             allowed = (f"a task with {SUCCESS!r}, as success=(function, 'hinge.position', …)",)
             raise UnknownOption("task for a curriculum with stages", world.task.name, allowed)
         may_come = bool(len(world.structures.head))
-        for part in self.part.walk():
+        for part in parts:
             try:
-                part.check(world.compiled)
+                _check(part, world)
             except UnknownVariable:
                 if not may_come:
                     raise
@@ -167,39 +164,40 @@ class Curriculum(Frozen):
             check_subset(self.space, world.model.variables, may_come=may_come)
 
     def plan(self, situation: Situation, besides: Iterable[str] = ()) -> Plan:
-        """Return what is done in an episode.
+        """Return the interventions of an episode.
 
         Args:
             situation: The episode that begins.
             besides: Variables that are left as they are, in any coordinates.
         """
         model, first = situation.model, situation.first
-        with blamed(f"the curriculum, in episode {situation.episode},"):
-            plan = self.part.plan(situation)
         taken = {target for name in besides for target in targets(model, name)}
         return Plan.of(
             {
                 name: acts
-                for name, acts in plan.items()
-                if not (taken and taken.intersection(targets(model, name)))
-                and (first is None or name in first)
+                for name, acts in self.part.plan(situation).items()
+                if taken.isdisjoint(targets(model, name)) and (first is None or name in first)
             }
         )
 
+    def counted(
+        self, stages: Mapping[str, Progress], staged: Collection[str], *, success: bool
+    ) -> dict[str, Progress]:
+        """Return the progress after an episode in which the parts of some keys acted."""
+        found = dict(stages)
+        for part in nested(self.part, Part):
+            if part.key in staged:
+                before = stages.get(part.key, Progress())
+                found[part.key] = progressed(part, before, success=success)
+        return found
 
-def as_curriculum(given: Any) -> Curriculum:
-    """Take a curriculum, or make one of a part, of plain data, or of an intervention.
 
-    Raises:
-        UnknownOption: It is none of these.
-        ModelError: The data is none of a curriculum.
-
-    Example:
-        >>> as_curriculum({"floor_friction": 0.4}).part.kind
-        'do'
-    """
-    if isinstance(given, Curriculum):
-        return given
-    if isinstance(given, Mapping) and given.get("format") == FORMAT:
-        return Curriculum.from_dict(given)
-    return Curriculum(as_part(given))
+def _check(part: Part, world: Simulation) -> None:
+    """Refuse what a part does in the first or in a late episode, where that can be known before."""
+    if part.kind in ("do", "resample", "goal", "interpolate"):
+        for episode in (0, 2**62):
+            memory = Memory(episode=episode, stages={})
+            plan = part.plan(Situation(memory, world.compiled, Noise(0), 0))
+            for name, act in plan.acts():
+                if name not in world.compiled.entity_names:
+                    world.model.accept(name, act)

@@ -1,22 +1,37 @@
-"""Which variables a word or a pattern stands for."""
+"""The variables that patterns and groups name, and where each of them is drawn from."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from fnmatch import fnmatchcase
 from typing import Any
 
-from scm_world.errors import UnknownVariable
-from scm_world.variables import Exogenous, Variable
+from scm_world.errors import InterventionError, UnknownVariable
+from scm_world.variables import (
+    Box,
+    Continuous,
+    Cylinder,
+    Discrete,
+    Distribution,
+    Draw,
+    Exogenous,
+    Normal,
+    Subset,
+    Variable,
+)
+from scm_world.variables.checks import check_draw, check_region
+from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.reserved import PRESET
 from scm_world.world.compiled_task import CompiledTask
 
 LOOKS = ("*color", "light_*", "camera_*")
-"""What is seen and moves nothing."""
+"""Variables that change what is seen, and no motion."""
 
 
-def matching(compiled: CompiledTask, patterns: Iterable[str]) -> tuple[str, ...]:
-    """List the variables that can be set and that patterns or groups name.
+def matching(
+    compiled: CompiledTask, patterns: Iterable[str], among: Collection[str] | None = None
+) -> tuple[str, ...]:
+    """Return the settable variables that patterns or groups name.
 
     A group is a word after ``@``: ``@everything``, ``@goals``, ``@looks``, ``@physics``, and those
     of the task, such as ``@poses``. Where a quantity has several names, groups take the one that
@@ -25,6 +40,7 @@ def matching(compiled: CompiledTask, patterns: Iterable[str]) -> tuple[str, ...]
     Args:
         compiled: The structure.
         patterns: With ``*`` and ``?`` for any letters, or groups.
+        among: The only variables that count; then a pattern may fit nothing.
 
     Raises:
         UnknownVariable: A pattern or a group names nothing that can be set.
@@ -36,26 +52,66 @@ def matching(compiled: CompiledTask, patterns: Iterable[str]) -> tuple[str, ...]
         fits = groups.get(pattern[1:]) if pattern.startswith("@") else None
         if fits is None:
             fits = [name for name in names if fnmatchcase(name, pattern)]
-            if not fits:
+            if not fits and among is None:
                 known = [f"@{group}" for group in groups] if pattern.startswith("@") else names
                 raise UnknownVariable(pattern, known)
         found.update(dict.fromkeys(fits))
-    return tuple(found)
+    return tuple(name for name in found if among is None or name in among)
+
+
+def regions(
+    compiled: CompiledTask,
+    what: Iterable[str],
+    space: SpaceName | Subset | Distribution = "A",
+    besides: Iterable[str] = (),
+    among: Collection[str] | None = None,
+) -> dict[str, SpaceName | Distribution]:
+    """Return the variables that ``resample`` draws, each with its region; see ``matching``.
+
+    A variable that a pattern fits has to have the region; a group leaves out those without.
+
+    Raises:
+        InterventionError: A variable does not have the space, or the region is impossible.
+    """
+    left_out = set(matching(compiled, besides, among))
+    found: dict[str, SpaceName | Distribution] = {}
+    for pattern in what:
+        for name in matching(compiled, (pattern,), among):
+            variable = compiled.model.declared(name)
+            region: Any = space.region(name) if isinstance(space, Subset) else space
+            missing = region in SPACES and variable.space(region) is None
+            if name in left_out or region is None or (missing and pattern.startswith("@")):
+                continue
+            _check(variable, region)
+            found[name] = region
+    return found
+
+
+def _check(variable: Variable, region: Any) -> None:
+    """Refuse a region in which a variable cannot lie."""
+    if variable.dtype != "real" and isinstance(region, Box | Cylinder | Normal | Continuous):
+        raise InterventionError(
+            f"{variable.name!r} is a whole number, and {region!r} has others; draw it from "
+            "Integers(low, high), Categories([…]) or a declared space",
+            variable=variable.name,
+            value=region,
+        )
+    if isinstance(region, Normal | Cylinder | Continuous | Discrete):
+        check_draw(variable, Draw(region))
+    else:
+        check_region(variable, region)
 
 
 def settable(compiled: CompiledTask) -> tuple[str, ...]:
-    """List what ``do`` accepts in a structure, without the actions."""
+    """Return what ``do`` accepts in a structure, without the actions."""
     model, actions = compiled.model, compiled.commanded
     return tuple(n for n in model if model.declared(model.target(n)).settable and n not in actions)
 
 
 def grouped(compiled: CompiledTask) -> dict[str, list[str]]:
-    """List the variables of each group.
+    """Return the variables of each group.
 
     ``physics`` changes how bodies move, and neither where they begin nor how large they are.
-
-    Args:
-        compiled: The structure.
     """
     model, task = compiled.model, compiled.task
     spaced = [v for v in _spaced(compiled) if v.name != PRESET]
@@ -80,15 +136,10 @@ def _spaced(compiled: CompiledTask) -> Iterable[Variable]:
     """List roots and states that have a space, under one name each; bundles, not their parts."""
     model = compiled.model
     for name in settable(compiled):
-        if name in compiled.parts:
-            continue
         variable: Any = model.declared(name)
         quantity = model.declared(model.target(name))
         is_root = isinstance(quantity, Exogenous) or quantity.role == "state"
         has_space = variable.a is not None or variable.b is not None
-        if (
-            is_root
-            and has_space
-            and (name == quantity.name or variable.parts or quantity.a is None)
-        ):
+        is_own_name = name == quantity.name or variable.parts or quantity.a is None
+        if name not in compiled.parts and is_root and has_space and is_own_name:
             yield variable

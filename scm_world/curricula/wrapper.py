@@ -1,144 +1,92 @@
-"""Curricula of environments: a plan for every reset, and what is due within the episode."""
+"""Curricula of environments: a plan for every reset of one environment, and of many."""
 
 from __future__ import annotations
 
 import secrets
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import chain
 from typing import Any, final
 
 import gymnasium
+import numpy as np
+from gymnasium.envs.registration import VectorizeMode
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import AutoresetMode, VectorWrapper
+from pydantic import Field, NonNegativeInt, PositiveInt
 
 from scm_world._arguments import whole_number
-from scm_world.curricula.base import Memory, Situation, state_read
-from scm_world.curricula.combinations import count
-from scm_world.curricula.curriculum import Curriculum, as_curriculum
+from scm_world.curricula.base import Memory, Part, Progress, Situation, nested
+from scm_world.curricula.curriculum import Curriculum
+from scm_world.curricula.parts import over
 from scm_world.env import ScmWorldEnv
 from scm_world.env.arguments import RESETS, reset_options, structure_after
+from scm_world.env.environment import EnvSnapshot
 from scm_world.env.wrappers import unwrapped_env
-from scm_world.errors import ModelError, UnknownOption
-from scm_world.graph import NoiseKey, flatten
-from scm_world.queries.plans import Key, Plan, Schedule
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.graph import NoiseKey
+from scm_world.queries.plans import Plan
 from scm_world.variables import Noise
-from scm_world.world.compiled_task import CompiledTask
+
+Outcome = tuple[tuple[str, ...], bool]
+"""The keys of the parts with stages that acted in an episode, and its success."""
+ADVICE = "give what state() returned, of as many environments"
 
 
 @final
-class CurriculumRunner:
-    """A curriculum at work.
-
-    Args:
-        curriculum: What is done.
-        memory: The state to continue from; the beginning if None.
+class State(Memory):
+    """The state of a curriculum in an environment.
 
     Attributes:
-        curriculum: What is done.
-        memory: The state of the curriculum.
+        noise: Seed and episode, within the noise, of the unfinished or next episode; None before
+            the first reset.
+        begun: The stages at the beginning of the unfinished episode; None if there is none.
+        every: Difference of the numbers of consecutive episodes: n where n environments share them.
+        running: Whether the unfinished episode is under way.
+        staged: The keys of the parts with stages that act in it.
+        outcomes: Of the episodes that are not counted yet, where environments share the stages.
     """
 
-    def __init__(self, curriculum: Any, memory: Memory | None = None) -> None:
-        self.curriculum: Curriculum = as_curriculum(curriculum)
-        self.memory = Memory() if memory is None else memory
-        self._where = Noise(0), 0
-        self._besides: frozenset[str] = frozenset()
-        self._schedule = Schedule()
-        self._fired: dict[Key, int] = {}
-        self._due: list[int] = []
-        self._last = 0
+    noise: tuple[NonNegativeInt, NonNegativeInt] | None
+    begun: dict[str, Progress] | None = None
+    every: PositiveInt = 1
+    running: bool = Field(False, exclude=True)
+    staged: tuple[str, ...] = Field((), exclude=True)
+    outcomes: tuple[Outcome, ...] = Field((), exclude=True)
 
-    def begin(
-        self, env: ScmWorldEnv, seed: int, number: int, do: Mapping[str, Any] | None = None
-    ) -> dict[str, Any]:
-        """Plan an episode, and return the options of its reset.
-
-        Args:
-            env: Before the reset.
-            seed: Of the noise.
-            number: Of the episode within the noise.
-            do: What the caller does at the reset: the curriculum leaves these variables alone, in
-                any coordinates.
+    @classmethod
+    def read(cls, data: Any) -> State:
+        """Return the state that was written as plain data.
 
         Raises:
-            InterventionError: The curriculum names something that does not exist.
+            UnreadableFile: It is something else.
         """
-        mine, world = flatten(do or {}), env.world
-        self._where, self._besides = (Noise(seed), number), frozenset(mine)
-        self._fired, self._due, self._last = {}, [], 0
-        compiled = world.structures.natural(None)
-        if len(world.structures.head):
-            key, held = NoiseKey(self._where[0], number, origin=0), world.structures.head
-            first = self._plan(compiled, frozenset(held)).at_start()
-            acts = env.beginning({**first, **mine})
-            compiled = structure_after(world.structures, acts, held, held.solve(), key) or compiled
-        plan = self._plan(compiled)
-        self._schedule = Schedule([(0, plan)])
-        options: dict[str, Any] = {"do": {**plan.at_start(), **mine}}
-        space = self.curriculum.space
-        return options if space is None else {**options, "space": space}
-
-    def _plan(self, compiled: CompiledTask, first: frozenset[str] | None = None) -> Plan:
-        memory, (noise, number) = self.memory, self._where
-        situation = Situation(memory.episode, memory, compiled, noise, number, first=first)
-        return self.curriculum.plan(situation, self._besides)
-
-    def stepped(self, env: ScmWorldEnv, step: int) -> bool:
-        """Note that so many control steps are over; tell whether anything may be due now.
-
-        Where several control steps have passed, what was due in between is due now.
-        """
-        steps = range(self._last + 1, step + 1) if step > self._last else (step,)
-        self._fired = {key: at for key, at in self._fired.items() if at < step}
-        self._due = [at for at in steps if self._schedule.concerns(env.world, at, self._fired)]
-        self._last = step
-        return bool(self._due)
-
-    def act(self, env: ScmWorldEnv) -> bool:
-        """Do what is due; tell whether that was anything.
-
-        Raises:
-            InterventionError: It was refused; nothing has changed.
-        """
-        world, acted = env.world, False
-        for step in self._due:
-            due = self._schedule.due(world, step, self._fired)
-            if any(name in world.structures.head for name in due):  # names mean what there is then
-                now = world.row, world.noise_key(world.index)
-                found = structure_after(world.structures, due, world.graph, *now)
-                self._schedule = Schedule([(0, self._plan(found or world.compiled))])
-                due = self._schedule.due(world, step, self._fired)
-            if due:
-                env.do(due, space=self.curriculum.space)
-                acted = True
-        return acted
-
-    def ended(self, *, success: bool) -> None:
-        """Take an episode into account that has ended, and count it."""
-        parts = self.curriculum.part.live(self.memory, self.memory.episode)
-        count(parts, self.memory, success=success)
-        self.memory.episode += 1
+        try:
+            return cls(**data)
+        except (TypeError, ValueError) as error:
+            said = "; ".join(getattr(error, "problems", (str(error),)))
+            raise UnreadableFile("the state of a curriculum", said, ADVICE) from None
 
 
 @final
 class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Intervenes on an environment, at its resets and within its episodes.
+    """Intervenes on an environment: gives it a plan at every reset.
 
-    What the caller of ``reset`` asks for in ``options["do"]`` counts more than the curriculum; both
-    are one intervention. All draws come from noises of their own, so that another part of a
-    curriculum changes none of them. Observation and info are those after the interventions; an
-    intervention gives no reward, and the terms of the reward are those of the step. A reset that is
-    refused is no episode: the next one has its number.
+    ``options["do"]`` of ``reset`` counts more than the curriculum; both are one intervention. All
+    draws have noise streams of their own, so that another part of a curriculum changes none of
+    them. Observation and info are those after the interventions; an intervention gives no reward.
+    A reset that is refused is no episode: the next one has its number.
 
     Args:
-        env: Of this package, in any wrappers that do not change what ``do`` means. Of those that
-            change observations, an ``ObservationWrapper`` may be inside; one that remembers
-            earlier observations belongs around this one.
-        curriculum: A ``Curriculum``, a part of one, plain data, or an intervention.
+        env: An environment of this package, in any wrappers that do not change the meaning of
+            ``do``.
+        curriculum: A ``Curriculum``, or what it is made of.
 
     Raises:
-        UnknownOption: It is no environment of this package, or no curriculum; or a wrapper inside
-            would not know of interventions.
+        UnknownOption: It is no environment of this package, or no curriculum.
         InterventionError: The curriculum names something that does not exist. Where bodies come
-            and go, that is said at a reset.
+            and go, a reset raises it.
 
     Example:
         >>> from scm_world.curricula import goals
@@ -150,173 +98,165 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], curriculum: Any) -> None:
-        made = as_curriculum(curriculum)
-        RecordConstructorArgs.__init__(self, curriculum=_plain(made))
+        self.curriculum: Curriculum = Curriculum(curriculum)
+        RecordConstructorArgs.__init__(self, curriculum=_plain(self.curriculum))
         super().__init__(env)
         self._inner = unwrapped_env(env, "CurriculumEnv")
-        _refuse_forgetful(self._layers())
-        made.check(self._inner.world)
-        self._turn = CurriculumRunner(made)
-        self._begun = self._running = self._stepped = self._success = False
-        self._next: tuple[int, Memory] | None = None
-        self._place: tuple[int, int] | None = None
+        self.curriculum.check(self._inner.world)
+        self._state = State(episode=0, stages={}, noise=None)
 
-    def _layers(self) -> Iterator[gymnasium.Wrapper[Any, Any, Any, Any]]:
-        """List the wrappers inside of this one, from the outermost on."""
-        env: Any = self.env
-        while isinstance(env, gymnasium.Wrapper):
-            yield env
-            env = env.env
-
-    @property
-    def curriculum(self) -> Curriculum:
-        """What is done."""
-        return self._turn.curriculum
+    # --- the state between episodes ---------------------------------------------------------------
 
     @property
     def memory(self) -> Memory:
-        """How many episodes there were, and how far the learner has come."""
-        return self._turn.memory
-
-    @property
-    def where(self) -> tuple[int, int] | None:
-        """Seed and episode, within the noise, of the next episode; of the present one in mid-way.
-
-        None before the first reset.
-        """
-        world = self._inner.world
-        if self._place is not None or not self._begun:
-            return self._place
-        return world.noise.seed, world.episode + (not self._running)
-
-    @where.setter
-    def where(self, where: tuple[int, int] | None) -> None:
-        self._place, self._running = where, False
+        """The number of the unfinished or next episode, and how far the learner has come."""
+        return Memory(episode=self._state.episode, stages=self._state.stages)
 
     def state(self) -> dict[str, Any]:
         """Return the state of the curriculum, as plain data.
 
         An episode that is not over begins again.
         """
-        return {**self.memory.as_dict(), "noise": None if self.where is None else [*self.where]}
+        return self._state.model_dump(mode="json")
 
     def resume(self, state: dict[str, Any]) -> None:
-        """Continue where ``state`` was taken, with the next reset, in any process.
+        """Continue from a state, with the next reset, in any process.
 
-        A seed, or an episode, that the reset is given counts more than that of the state.
+        A seed, or an episode, of the reset counts more than that of the state.
 
         Args:
-            state: What ``state`` gave.
+            state: The answer of ``state``.
 
         Raises:
             UnreadableFile: It is something else.
         """
-        memory = Memory.from_dict(state)
-        with state_read("state()"):
-            where = place(state["noise"])
-        self._turn.memory, self.where = memory, where
+        self._state = State.read(state)
+
+    saved = property(state, resume, doc="The state, for vector environments: they set attributes.")
 
     @property
-    def turn(self) -> tuple[int, Memory] | None:
-        """The number of the next episode, and the memory then, if a vector environment set them."""
-        return self._next
+    def shared(self) -> tuple[Outcome, ...]:
+        """The outcomes of the episodes since the stages of all environments were set here."""
+        return self._state.outcomes
 
-    @turn.setter
-    def turn(self, turn: tuple[int, Memory] | None) -> None:
-        self._next = turn or self._next
+    @shared.setter
+    def shared(self, stages: dict[str, Progress]) -> None:
+        self._state = self._state.model_copy(update={"stages": stages, "outcomes": ()})
+
+    def snapshot(self) -> EnvSnapshot:
+        """Save all that decides the future of the episode, the plan included.
+
+        Raises:
+            NotReset: There is no episode yet.
+        """
+        found: EnvSnapshot = self.env.get_wrapper_attr("snapshot")()
+        return replace(found, memory=(self._state, found.memory))
+
+    def restore(self, snapshot: EnvSnapshot) -> None:
+        """Go back to a snapshot, bit for bit.
+
+        Raises:
+            SnapshotMismatch: It is none, or one of another task or backend.
+        """
+        memory = getattr(snapshot, "memory", None)
+        if memory is not None:
+            snapshot = replace(snapshot, memory=memory[1])
+        self.env.get_wrapper_attr("restore")(snapshot)
+        self._state = self._state if memory is None else memory[0]
+
+    # --- episodes ---------------------------------------------------------------------------------
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode, with what is due.
+        """Begin an episode.
 
         Args:
-            seed: Of the noise.
-            options: As without this wrapper; what ``"do"`` sets, the curriculum leaves alone for
-                the whole episode, and ``"episode"`` is the number of the episode for it, too.
+            seed: Seed of the noise.
+            options: As without this wrapper. The curriculum leaves the variables of ``"do"`` alone
+                for the whole episode; ``"episode"`` is the number of the episode for it, too.
 
         Raises:
             InterventionError: An intervention was refused.
         """
         given = reset_options(options, RESETS)
-        self._close()
-        if self._next is not None:
-            self._turn.memory = Memory(self._next[0], self._next[1].stages)
-        elif given.get("episode") is not None:
-            self.memory.episode = whole_number("episode", given["episode"], least=0)
-        world, number = self._inner.world, 0
-        if seed is None and self._place is not None:
-            seed, number = self._place
-            given = {"episode": number, **given}
-        elif seed is None and world.has_begun:
-            number = world.episode + 1
-        elif seed is None:
-            seed = secrets.randbits(63)
-        noise = world.noise.seed if seed is None else whole_number("seed", seed, least=0)
+        world = self._inner.world
+        if self._state.running:
+            stepped = world.index > 0 and bool(self._state.staged)
+            self.over(success=stepped and bool(self._inner.present()[1]["is_success"]))
+        found = self._state
+        place = found.noise or (secrets.randbits(63), 0)
+        if seed is not None:
+            place = whole_number("seed", seed, least=0), 0
+        elif found.noise is None and world.has_begun:
+            place = world.noise.seed, world.episode + 1
         if given.get("episode") is not None:
-            number = given["episode"]
-        mine = self._turn.begin(self._inner, noise, number, given.get("do"))
-        found = self.env.reset(seed=seed, options={**given, **mine})
-        self._next = self._place = None
-        self._begun = self._running = True
-        return found
+            number = whole_number("episode", given["episode"], least=0)
+            place, found = (place[0], number), found.model_copy(update={"episode": number})
+        goes_on = world.has_begun and place == (world.noise.seed, world.episode + 1)
+        if seed is None and not goes_on:
+            seed = place[0]
+            given |= {"episode": place[1]} if place[1] else {}
+        begun = found.stages if found.begun is None else found.begun
+        memory = Memory(episode=found.episode, stages=begun)
+        given["do"], staged = self._plan(memory, *place, Plan(given.get("do")))
+        if self.curriculum.space is not None:
+            given["space"] = self.curriculum.space
+        shown = self.env.reset(seed=seed, options=given)
+        now = {"noise": place, "begun": begun, "staged": staged, "running": True}
+        self._state = found.model_copy(update=now)
+        return shown
 
-    def _close(self) -> None:
-        """Count the episode that ends."""
-        if self._running and self._stepped:
-            self._turn.ended(success=self._success)
-        elif self._running:
-            self.memory.episode += 1
-        self._running = self._stepped = self._success = False
+    def _plan(
+        self, memory: Memory, seed: int, number: int, mine: Plan
+    ) -> tuple[Plan, tuple[str, ...]]:
+        """Return the plan of an episode, and the keys of the parts with stages that act in it."""
+        structures, besides = self._inner.world.structures, mine.at_start()
+        situation = Situation(memory, structures.natural(None), Noise(seed), number)
+        if len(structures.head):
+            held, key = structures.head, NoiseKey(situation.noise, number, origin=0)
+            first = replace(situation, first=frozenset(held))
+            plan = over(first.model, self.curriculum.plan(first, besides), mine)
+            acts = self._inner.beginning(plan)
+            found = structure_after(structures, acts, held, held.solve(), key)
+            situation = replace(situation, compiled=found or situation.compiled)
+        plan = over(situation.model, self.curriculum.plan(situation, besides), mine)
+        return Plan(plan), tuple(sorted(situation.staged))
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Advance one control step, then do what is due.
+        """Advance one control step.
 
         Raises:
             InterventionError: An intervention was refused; the control step is over.
         """
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        over, success = terminated or truncated, bool(info.get("is_success"))
-        if self.stepped(self._inner.world.index, over=over, success=success) and self.act():
-            terms = info["reward_terms"]  # of the step: an intervention earns nothing
-            observation, known = self._inner.present()
-            for layer in reversed([*self._layers()]):
-                if isinstance(layer, gymnasium.ObservationWrapper):
-                    observation = layer.observation(observation)
-            info = {**info, **known, "reward_terms": terms}
-        return observation, reward, terminated, truncated, info
+        found = self.env.step(action)
+        if found[2] or found[3]:
+            self.over(success=bool(found[4].get("is_success")))
+        return found
 
-    def rerun(self, actions: Iterable[Any]) -> None:
+    def over(self, *, success: bool) -> None:
+        """Count the episode that is over; stages count it if it took a step."""
+        now = self._state
+        if now.noise is None or not now.running:
+            return
+        seed, number = now.noise
+        then: dict[str, Any] = {"episode": now.episode + now.every, "noise": (seed, number + 1)}
+        then |= {"begun": None, "staged": (), "running": False}
+        if now.staged and self._inner.world.index > 0:
+            if now.every > 1:
+                then["outcomes"] = (*now.outcomes, (now.staged, success))
+            else:
+                then["stages"] = self.curriculum.counted(now.stages, now.staged, success=success)
+        self._state = now.model_copy(update=then)
+
+    def rerun(self, actions: Any) -> None:
         """Take the steps of an episode again, from its reset on."""
         for action in actions:
             self.step(action)
 
-    def stepped(self, step: int, *, over: bool, success: bool) -> bool:
-        """Note a control step; tell whether the curriculum may act after it."""
-        self._stepped, self._success = True, success
-        if over:
-            self._close()
-        return not over and self._turn.stepped(self._inner, step)
-
-    def act(self) -> bool:
-        """Do what is due, after the plan of the reset; return whether that was anything."""
-        return self._inner.act() | self._turn.act(self._inner)
-
-
-def place(given: Any) -> tuple[int, int] | None:
-    """Read a seed and an episode.
-
-    Raises:
-        ValueError: It is something else.
-    """
-    if given is None:
-        return None
-    seed, episode = given
-    return whole_number("seed", seed, least=0), whole_number("episode", episode, least=0)
-
 
 def _plain(curriculum: Curriculum) -> Any:
-    """Return plain data from which it can be made, so that a specification can be written down."""
+    """Return plain data from which it can be made, so that a specification can be written."""
     try:
         data = curriculum.as_dict()
         Curriculum.from_dict(data)
@@ -325,16 +265,154 @@ def _plain(curriculum: Curriculum) -> Any:
     return data
 
 
-REMEMBER = ("DelayObservation", "NormalizeObservation")
-"""Wrappers of Gymnasium that count how often they are asked."""
+# --- many environments ----------------------------------------------------------------------------
 
 
-def _refuse_forgetful(layers: Iterable[gymnasium.Wrapper[Any, Any, Any, Any]]) -> None:
-    """Refuse wrappers inside whose observations cannot be made again after an intervention."""
-    for layer in layers:
-        name = type(layer).__name__
-        if isinstance(layer, gymnasium.ObservationWrapper) and name not in REMEMBER:
-            continue
-        if name in REMEMBER or layer.observation_space != layer.env.observation_space:
-            allowed = (f"ObservationWrapper; put {name} around the curriculum",)
-            raise UnknownOption("wrapper inside of CurriculumEnv", name, allowed)
+def make_vec(
+    env_id: str,
+    num_envs: int,
+    curriculum: Any,
+    *,
+    autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+    **options: Any,
+) -> CurriculumVectorEnv:
+    """Make several environments under one curriculum.
+
+    Args:
+        env_id: Such as ``"scm_world/Pushing-v0"``.
+        num_envs: Number of environments.
+        curriculum: The curriculum of all of them; see ``CurriculumEnv``.
+        autoreset_mode: When a member that is done is reset, as in Gymnasium.
+        options: Options of the environments; ``threads`` and ``workers``, see ``vector_env``.
+
+    Raises:
+        UnknownOption: There is no such option, or the number is none.
+
+    Example:
+        >>> envs = make_vec("scm_world/Pushing-v0", 2, {"floor_friction": 0.4}, backend="fake")
+        >>> envs.reset(seed=0)[0].shape
+        (2, 56)
+        >>> envs.close()
+    """
+    options.pop("disable_env_checker", None)  # of single environments
+    made = Curriculum(curriculum)
+    envs: Any = gymnasium.make_vec(
+        env_id,
+        whole_number("num_envs", num_envs, least=1),
+        vectorization_mode=VectorizeMode.VECTOR_ENTRY_POINT,
+        autoreset_mode=autoreset_mode,
+        member=partial(_member, made),
+        **options,
+    )
+    return CurriculumVectorEnv(envs, made)
+
+
+def _member(curriculum: Curriculum, **options: Any) -> CurriculumEnv:
+    return CurriculumEnv(ScmWorldEnv(**options), curriculum)
+
+
+@final
+class CurriculumVectorEnv(VectorWrapper):
+    """Environments that each play a part of the episodes of a curriculum.
+
+    Member i of n plays the episodes i, i + n, i + 2 n, …; so ``during(range(1_000), …)`` means a
+    thousand episodes of training, however many environments there are. They share their successes:
+    a stage that is reached holds in each of them from its next episode on. In the autoreset mode
+    ``SAME_STEP`` an episode begins in the very step that ends the last one, before its success is
+    counted: its stage is the one of before.
+
+    Args:
+        env: A vector environment whose members are each in a ``CurriculumEnv``.
+        curriculum: The curriculum of each of them.
+
+    Raises:
+        UnknownOption: A member is in no ``CurriculumEnv``.
+    """
+
+    def __init__(self, env: Any, curriculum: Any) -> None:
+        super().__init__(env)
+        self.curriculum = Curriculum(curriculum)
+        self._is_staged = any(part.kind == "stages" for part in nested(self.curriculum, Part))
+        self._members = env  # Gymnasium declares get_attr for its own kinds only
+        try:
+            self._members.get_attr("saved")
+        except AttributeError:
+            allowed = ("members in a CurriculumEnv; make_vec makes them",)
+            raise UnknownOption("vector environment", type(env).__name__, allowed) from None
+        states = [
+            State(episode=index, stages={}, noise=None, every=self.num_envs).model_dump()
+            for index in range(self.num_envs)
+        ]
+        self._members.set_attr("saved", states)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the environments inside, such as ``do`` or ``get_attr``."""
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    @property
+    def stages(self) -> dict[str, Progress]:
+        """Progress in each part with stages, by its key."""
+        found: dict[str, Progress] = self._members.get_attr("memory")[0].stages
+        return found
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in all of them, or in those of ``options["reset_mask"]``."""
+        found = self.env.reset(seed=seed, options=options)
+        self._share()
+        return found
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Advance all of them one control step."""
+        found = self.env.step(actions)
+        if np.logical_or(found[2], found[3]).any():
+            self._share()
+        return found
+
+    def _share(self) -> None:
+        """Count the episodes that ended, in the order of the members, for all of them."""
+        shared = self._members.get_attr("shared") if self._is_staged else ()
+        if any(shared):
+            stages = self.stages
+            for staged, success in chain(*shared):
+                stages = self.curriculum.counted(stages, staged, success=success)
+            self._members.set_attr("shared", [stages] * self.num_envs)
+
+    def state(self) -> dict[str, Any]:
+        """Return the state of the curriculum, as plain data.
+
+        Episodes that are not over begin again.
+        """
+        return {"members": [*self._members.get_attr("saved")]}
+
+    def resume(self, state: dict[str, Any]) -> None:
+        """Continue from a state, of as many environments; see ``CurriculumEnv.resume``."""
+        members = state.get("members") if isinstance(state, Mapping) else None
+        if not isinstance(members, list | tuple) or len(members) != self.num_envs:
+            said = f"it is not of {self.num_envs} environments"
+            raise UnreadableFile("the state of a curriculum", said, ADVICE)
+        for one in members:
+            State.read(one)
+        self._members.set_attr("saved", [*members])
+
+    def rerun(self, state: dict[str, Any], actions: Any, lengths: Any) -> Any:
+        """Run unfinished episodes again up to where they were, bit for bit.
+
+        Args:
+            state: The answer of ``state``, of as many environments.
+            actions: The actions of each control step since their resets, shape
+                (steps, n, n_actions).
+            lengths: How many of them each member took, shape (n,).
+
+        Returns:
+            The observations.
+        """
+        self.resume(state)
+        self.env.reset()
+        given = np.asarray(actions, dtype=np.float64)
+        for index, length in enumerate(lengths):
+            self._members.call_in([index], "rerun", given[:length, index])
+        return self._members.present()[0]

@@ -10,12 +10,13 @@ from weakref import WeakKeyDictionary
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of, whole_number
-from scm_world._types import Floats, Value, Values
+from scm_world._types import Floats, Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
 from scm_world.env.arguments import (
     RESETS,
@@ -28,7 +29,7 @@ from scm_world.env.arguments import (
     reset_options,
 )
 from scm_world.env.delta import COMMAND, PREFIX, Delta, checked_mode
-from scm_world.env.observer import Goals, Observation, Observer, Observing, observer
+from scm_world.env.observer import Observation, Observer, Observing
 from scm_world.env.pictures import Cameras, has_screen, height_and_width, read_camera
 from scm_world.env.vector import Vector, box
 from scm_world.errors import (
@@ -45,7 +46,8 @@ from scm_world.models.camera import Camera
 from scm_world.queries.plans import Plan
 from scm_world.queries.world import World
 from scm_world.tasks import Task
-from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED, one_number
+from scm_world.tasks.model import REWARD
+from scm_world.tasks.rewards import TERMINATED, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, WorldSnapshot
@@ -59,7 +61,6 @@ if TYPE_CHECKING:
 
 RENDER_MODES = ("rgb_array", "human")
 SINGLE = np.dtype(np.float32)
-REWARD = "reward"
 _GENERATOR = ("_np_random", "_np_random_seed", "spec")
 """What Gymnasium keeps in an environment."""
 
@@ -73,11 +74,13 @@ class EnvSnapshot:
         world: Of its world.
         interventions: What was done so far.
         ended: Whether the episode is over and the next one begins with the next step of a batch.
+        memory: The state of a curriculum around it.
     """
 
     world: WorldSnapshot
     interventions: tuple[tuple[int, dict[str, Any]], ...]
     ended: bool = False
+    memory: Any = None
 
 
 class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -277,9 +280,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._terms = tuple(self.world.task.weights)
         self._version = -1
         self._done: list[tuple[int, dict[str, Any]]] = []
-        self._observers: WeakKeyDictionary[
-            CompiledTask, tuple[Observer, Goals | None, frozenset[str], tuple[str, ...]]
-        ] = WeakKeyDictionary()
+        self._observers: WeakKeyDictionary[CompiledTask, Observer] = WeakKeyDictionary()
         self._largest = None
         if pad is not None:
             self._largest = beginning_structure(self.world, {**self._start, **asked(pad)})
@@ -302,12 +303,13 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     @property
     def layout(self) -> dict[str, slice]:
         """Where each variable stands in the vector that is observed; empty for pictures."""
-        return dict(self._observer.layouts.get("observation", {}))
+        return dict(self._observer.parts["observation"].layout)
 
     @property
     def context_layout(self) -> dict[str, slice]:
         """Where each variable stands in the privileged context; empty without one."""
-        return dict(self._observer.layouts.get("context", {}))
+        parts = self._observer.parts
+        return dict(parts["context"].layout) if "context" in parts else {}
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -341,34 +343,26 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             raise ActionError(f"an action has shape {self._given.shape}, got {given.shape}", action)
         return given
 
+    @property
+    def observed(self) -> tuple[str, ...] | None:
+        """The variables that the observation is made of; None of pictures, which show many."""
+        pictures = self._how.observation_mode == "pixel"
+        return None if pictures else self._observer.names
+
     def _arrange(self, declaration: CompiledTask) -> None:
         """Observe the structure that there is."""
         found = self._observers.get(declaration)
         if found is None:
-            goals = Goals(declaration) if declaration.task.goal.achieved else None
             largest = self._largest or declaration
-            made = observer(self.world, declaration, self._how, goals, largest)
-            counted = [n for n in (FRACTION, SUCCESS, TERMINATED) if n in declaration.model]
-            wanted = () if goals is None else goals.names
-            needed = (*made.names, *wanted, *self._terms, *counted, REWARD)
-            found = made, goals, frozenset(counted), tuple(dict.fromkeys(needed))
+            found = Observer(self.world, declaration, self._how, largest)
             self._observers[declaration] = found
-        self._declaration = declaration
-        self._observer, self._goals, self._counted, self._needed = found
-        self.observation_space = self._observer.space
-
-    @property
-    def observed(self) -> tuple[str, ...] | None:
-        """The variables that the observation is made of; None of pictures, which show many."""
-        if self._how.observation_mode == "pixel":
-            return None
-        goals = self._goals.names if self._how.goal_env and self._goals is not None else ()
-        return (*self._observer.names, *goals)
+        self._declaration, self._observer = declaration, found
+        self.observation_space = found.space
 
     def _look(self) -> Rows:
         """Compute what is needed of the present."""
         self._follow()
-        return self.world.evaluate(self._needed)
+        return self.world.evaluate(self._observer.needed)
 
     def _follow(self) -> None:
         """Observe the structure that there is, if it has changed."""
@@ -384,7 +378,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         self._follow()
         together = now.numbers.ndim == 1 or self._observer.together
-        return self._observer.observe(now) if together else None, self._info(now)
+        return self._observer.observe(now) if together else None, self._observer.info(now)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -418,7 +412,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         for name in self._terms:
             one_number(now, name, (name,))
         self._show()
-        return self._observer.observe(now), self._info(now)
+        return self._observer.observe(now), self._observer.info(now)
 
     def beginning(self, do: Mapping[str, Any] | None) -> dict[str, Any]:
         """Return all that is done at a reset: goal, ``start``, and what the caller asks for."""
@@ -445,12 +439,12 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self.world.advance(self.command(action))
         now = self._look()
         reward = self._scale * one_number(now, REWARD, self._terms)
-        terminated = TERMINATED in self._counted and bool(now[TERMINATED])
+        terminated = TERMINATED in now and bool(now[TERMINATED])
         truncated = self.world.index >= self.limit
-        info = self._info(now)
+        info = self._observer.info(now)
         if self.world.is_planned and not (terminated or truncated) and self.act():
             now = self._look()
-            info = {**self._info(now), "reward_terms": info["reward_terms"]}  # of the step
+            info = {**self._observer.info(now), "reward_terms": info["reward_terms"]}  # of the step
         self._show()
         return self._observer.observe(now), reward, terminated, truncated, info
 
@@ -514,38 +508,21 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             UnknownOption: The observation is no vector, or a value is missing.
         """
-        if not isinstance(self._observer, Vector):
-            raise UnknownOption("observation of values", type(self._observer), ("a vector",))
-        if not isinstance(values, Mapping) or not values.keys() >= {*self._observer.names}:
-            raise UnknownOption("values of an observation", values, self._observer.names)
-        return self._observer.observe_values(values)
+        vector, names = self._observer.parts["observation"], self._observer.names
+        if not isinstance(vector, Vector) or isinstance(self.observation_space, spaces.Dict):
+            raise UnknownOption("observation of values", self.observation_space, ("a vector",))
+        if not isinstance(values, Mapping) or not values.keys() >= {*names}:
+            raise UnknownOption("values of an observation", values, names)
+        return vector.observe_values(values)
 
     def present(self) -> tuple[Observation, dict[str, Any]]:
         """Give the observation and the info of the present, as after an intervention."""
         return self.read(self._look())
 
-    def _info(self, now: Rows) -> dict[str, Any]:
-        """Return the info of one world, or of several as columns."""
-        truth, number = (bool, float) if now.numbers.ndim == 1 else (_truths, np.asarray)
-        info: dict[str, Any] = {}
-        if SUCCESS in self._counted:
-            info["is_success"] = info["success"] = truth(now[SUCCESS])
-        if FRACTION in self._counted:
-            info["fractional_success"] = number(now[FRACTION])
-        if self._goals is not None:
-            info["achieved_goal"], info["desired_goal"] = self._goals.read(now)
-        info["reward_terms"] = {name: number(now[name]) for name in self._terms}
-        return info
-
     @property
     def info_shapes(self) -> dict[str, tuple[int, ...]]:
         """The shape of each entry of ``info``, without ``reward_terms``, which is a dictionary."""
-        goals = () if self._goals is None else self._goals.spaces.items()
-        return {
-            **({"is_success": (), "success": ()} if SUCCESS in self._counted else {}),
-            **({"fractional_success": ()} if FRACTION in self._counted else {}),
-            **{name: space.shape or () for name, space in goals},
-        }
+        return self._observer.info_shapes
 
     def goal_reward(self, achieved: ArrayLike, desired: ArrayLike, info: Any = None) -> Any:
         """Compute the reward of having achieved one goal while another one was desired.
@@ -568,9 +545,10 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             UnknownOption: The task has no goals, or these have another shape.
         """
-        if self._goals is None:
+        goals = self._observer.goals
+        if goals is None:
             raise UnknownOption("task with goals", self.world.task.name, ("one that has goals",))
-        return self._scale * self._goals.reward(achieved, desired)
+        return self._scale * goals.reward(achieved, desired)
 
     # --- pictures ---------------------------------------------------------------------------------
 
@@ -651,11 +629,6 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         if self._viewer is not None:
             self._viewer.close()
         self.world.close()
-
-
-def _truths(values: Value) -> NDArray[np.bool_]:
-    found: NDArray[np.bool_] = values != 0
-    return found
 
 
 ENV_OPTIONS = tuple(inspect.signature(ScmWorldEnv).parameters)[:-1]

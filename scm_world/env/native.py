@@ -13,9 +13,10 @@ from gymnasium.vector import AutoresetMode
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.env.delta import JOINTS
-from scm_world.env.environment import REWARD, ScmWorldEnv
+from scm_world.env.environment import ScmWorldEnv
 from scm_world.env.many import ScmWorldVectorEnv, act, member_shapes
 from scm_world.errors import EngineFailure, FunctionFailure, ScmWorldError
+from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import TERMINATED, one_number
 from scm_world.variables.reserved import CONTROL_INDEX, SENSOR_NOISE
 from scm_world.world.batch import Batch, Mask, located
@@ -35,7 +36,7 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         copy: Likewise.
         threads: Of the backend; as many as there are cores if None. Results do not depend on it.
         member: Makes one of them from the options: a ``ScmWorldEnv``, or one in a
-            ``CurriculumEnv``, whose ``stepped`` and ``act`` are used after each control step.
+            ``CurriculumEnv``, whose ``over`` is called where an episode ends.
         options: Of ``ScmWorldEnv``.
 
     Raises:
@@ -74,11 +75,11 @@ class NativeVectorEnv(ScmWorldVectorEnv):
             inner._ezpickle_kwargs = lead._ezpickle_kwargs
         self._delta = lead._delta
         self._reads = None if self._delta is None else self._delta.reads
-        names = (*lead._needed, *(() if self._reads is None else (self._reads,)))
+        names = (*lead._observer.needed, *(() if self._reads is None else (self._reads,)))
         worlds = [inner.world for inner in self._inner]
         self._batch = Batch(worlds, threads=threads, names=names)
         self._commands = np.empty((count, self._action_size))
-        self._acting: Any = self.envs if hasattr(first, "stepped") else ()
+        self._counting = hasattr(first, "over")
 
     # --- one of them by itself --------------------------------------------------------------------
 
@@ -87,12 +88,12 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         try:
             for index, arguments in given.items():
                 if self._inner[index].world.has_begun:  # else there is nothing to lose
-                    before[index] = self._inner[index].snapshot()
+                    before[index] = self.envs[index].get_wrapper_attr("snapshot")()
                 answers[index], shown = act(self.envs[index], self._shapes, method, arguments)
                 self._write(index, *shown)
         except BaseException as error:
             for row, snapshot in before.items():
-                self._inner[row].restore(snapshot)
+                self.envs[row].get_wrapper_attr("restore")(snapshot)
                 self._write(row, *self._inner[row].present())
             if isinstance(error, ScmWorldError):
                 located(error, index, "environment")
@@ -143,18 +144,16 @@ class NativeVectorEnv(ScmWorldVectorEnv):
             whole = len(members) == self.num_envs
             now = table if whole else Rows(table.mechanisms, table.numbers[members])
             self._take(self._inner[int(members[0])], now, members)
-        for row in rows.tolist():
-            if self._acting or self._inner[row].world.is_planned:
+        ended = self._terminations | self._truncations
+        for row in rows[~ended[rows]].tolist():
+            if self._inner[row].world.is_planned:
                 self._intervene(row)
+        success = self._known.get("is_success", np.zeros(self.num_envs, bool))
+        for row in rows[ended[rows]].tolist() if self._counting else ():
+            self.envs[row].get_wrapper_attr("over")(success=bool(success[row]))
 
     def _take(self, lead: ScmWorldEnv, now: Rows, rows: Integers) -> None:
-        """Write what a step led to in environments of one structure.
-
-        Args:
-            lead: One of them.
-            now: Their values.
-            rows: Which ones they are, shape (m,).
-        """
+        """Write what a step led to in environments of one structure; ``lead`` is one of them."""
         rewards = lead._scale * now[REWARD]
         for row in rows[~np.isfinite(rewards)].tolist():
             self._explain(row)
@@ -191,15 +190,8 @@ class NativeVectorEnv(ScmWorldVectorEnv):
         return self._commands
 
     def _intervene(self, row: int) -> None:
-        """Do what a plan or the curriculum of one environment contains after a control step."""
-        step = self._inner[row].world.index
-        over = bool(self._terminations[row] or self._truncations[row])
-        acts = not over and self._inner[row].world.may_act(step)
-        if self._acting:
-            success: Any = self._known.get("is_success")
-            succeeded = success is not None and bool(success[row])
-            acts |= self._acting[row].stepped(step, over=over, success=succeeded)
-        if not acts:
+        """Do what the plan of one environment contains after a control step."""
+        if not self._inner[row].world.may_act(self._inner[row].world.index):
             return
         terms = self._known["reward_terms"]
         earned = {name: column[row] for name, column in terms.items()}

@@ -16,7 +16,6 @@ from scm_world.env.pictures import Pixels
 from scm_world.env.vector import (
     KEYPOINTS,
     WIDE,
-    Layouts,
     ObservedPart,
     Vector,
     bounds,
@@ -25,9 +24,11 @@ from scm_world.env.vector import (
 )
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.models.camera import Camera
-from scm_world.queries.rollouts import as_names
+from scm_world.queries.episodes import as_names
 from scm_world.tasks import Observed
 from scm_world.tasks.base import finite_numbers
+from scm_world.tasks.model import REWARD
+from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED
 from scm_world.variables import Linear
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
@@ -68,8 +69,10 @@ class Goals:
 
     def read(self, now: Rows) -> tuple[Floats, Floats]:
         """Return what is achieved and what is desired, of one world or of several."""
-        achieved, desired = self._sides
-        return now.numbers.take(achieved, axis=-1), now.numbers.take(desired, axis=-1)
+        numbers, (achieved, desired) = now.numbers, self._sides
+        if numbers.ndim == 1:
+            return numbers.take(achieved), numbers.take(desired)
+        return numbers[:, achieved], numbers[:, desired]
 
     def observe(self, now: Rows) -> dict[str, Floats]:
         """Return both vectors, by name."""
@@ -126,7 +129,7 @@ class Observing:
     pad: Mapping[str, Any] | None = None
 
     @property
-    def form(self) -> dict[str, bool]:
+    def form(self) -> dict[str, Any]:
         """Options of a ``Vector``."""
         return {"normalize": self.normalize_observations, "padded": self.pad is not None}
 
@@ -149,67 +152,93 @@ class Observing:
 
 
 @final
-class DictObserver:
-    """Several observations in a dictionary, with the goals if they are observed too."""
-
-    def __init__(self, parts: dict[str, Vector | Pixels], goals: Goals | None) -> None:
-        self._parts, self._goals = parts, goals
-        self.together = all(part.together for part in parts.values())
-        self.names = tuple(name for part in parts.values() for name in part.names)
-        self.layouts: Layouts = {
-            name: layout for name, part in parts.items() for layout in part.layouts.values()
-        }
-        spaces = {name: part.space for name, part in parts.items()}
-        self.space: gymnasium.Space[Any] = gymnasium.spaces.Dict(
-            spaces | (goals.spaces if goals else {})
-        )
-
-    def observe(self, now: Rows) -> dict[str, NDArray[Any]]:
-        """Return all of them."""
-        found = {name: part.observe(now) for name, part in self._parts.items()}
-        return found if self._goals is None else found | self._goals.observe(now)
-
-
-Observer = Vector | Pixels | DictObserver
-"""Something that looks at a world: it has ``names``, ``space``, ``layouts`` and ``observe``."""
-
-
-def observer(
-    world: Simulation,
-    declaration: CompiledTask,
-    how: Observing,
-    goals: Goals | None,
-    largest: CompiledTask,
-) -> Observer:
-    """Build the observer of a structure.
+class Observer:
+    """What is observed and told of one structure.
 
     Args:
         world: That is observed.
         declaration: Of the structure.
         how: What is asked for.
-        goals: Those of the structure, if it has some.
         largest: Of the structure whose bodies have places in the vector.
+
+    Attributes:
+        goals: Those of the structure, if it has some.
+        parts: What is observed, by name, except goals.
+        space: In which all observations lie.
+        needed: The variables that have to be computed.
+        together: Whether several worlds can be observed in one call.
     """
-    main: Vector | Pixels
-    if how.goal_env:
-        _check_goals(declaration, goals)
-    if how.observation_mode == "pixel":
-        main = Pixels(world, how.cameras, how.image_size)
-    else:
-        main = _vector(world, declaration, how, largest)
-    parts: dict[str, Vector | Pixels] = {"observation": main}
-    if how.context == "privileged":
-        about = _parts(world, largest, _context(largest), sensed=False)
-        parts["context"] = Vector(
-            world,
-            declaration,
-            about,
-            normalize=how.normalize_observations,
-            padded=how.pad is not None,
-        )
-    if len(parts) == 1 and not how.goal_env:
-        return main
-    return DictObserver(parts, goals if how.goal_env else None)
+
+    def __init__(
+        self, world: Simulation, declaration: CompiledTask, how: Observing, largest: CompiledTask
+    ) -> None:
+        self.goals = Goals(declaration) if declaration.task.goal.achieved else None
+        if how.goal_env:
+            _check_goals(declaration, self.goals)
+        self._main: Vector | Pixels
+        if how.observation_mode == "pixel":
+            self._main = Pixels(world, how.cameras, how.image_size)
+        else:
+            self._main = _vector(world, declaration, how, largest)
+        self.parts: dict[str, Vector | Pixels] = {"observation": self._main}
+        if how.context == "privileged":
+            about = _parts(world, largest, _context(largest), sensed=False)
+            self.parts["context"] = Vector(world, declaration, about, **how.form)
+        self._shown = self.goals if how.goal_env else None
+        self._is_plain = len(self.parts) == 1 and self._shown is None
+        self.space: gymnasium.Space[Any] = self._main.space
+        if not self._is_plain:
+            spaces: dict[str, Any] = {name: part.space for name, part in self.parts.items()}
+            shown = {} if self._shown is None else self._shown.spaces
+            self.space = gymnasium.spaces.Dict({**spaces, **shown})
+        where, self._terms = declaration.mechanisms.where, tuple(declaration.task.weights)
+        told = (*self._terms, FRACTION, SUCCESS, TERMINATED)
+        self._columns = {name: where[name].start for name in told if name in where}
+        goals = () if self.goals is None else self.goals.names
+        names = (name for part in self.parts.values() for name in part.names)
+        self.needed = tuple(dict.fromkeys((*names, *goals, *self._columns, REWARD)))
+        self.together = all(part.together for part in self.parts.values())
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The variables that the observation is made of."""
+        goals = () if self._shown is None else self._shown.names
+        return (*(name for part in self.parts.values() for name in part.names), *goals)
+
+    def observe(self, now: Rows) -> Observation:
+        """Return the observation of one world, or of several."""
+        if self._is_plain:
+            return self._main.observe(now)
+        found = {name: part.observe(now) for name, part in self.parts.items()}
+        return found if self._shown is None else found | self._shown.observe(now)
+
+    def info(self, now: Rows) -> dict[str, Any]:
+        """Return the info of one world, or of several as columns."""
+        numbers, columns = now.numbers, self._columns.items()
+        found: dict[str, Any]
+        if numbers.ndim == 1:
+            found = {name: numbers.item(column) for name, column in columns}
+        else:
+            found = {name: numbers[:, column] for name, column in columns}
+        info: dict[str, Any] = {}
+        if SUCCESS in found:
+            info["is_success"] = info["success"] = found[SUCCESS] != 0.0
+        if FRACTION in found:
+            info["fractional_success"] = found[FRACTION]
+        if self.goals is not None:
+            info["achieved_goal"], info["desired_goal"] = self.goals.read(now)
+        info["reward_terms"] = {name: found[name] for name in self._terms}
+        return info
+
+    @property
+    def info_shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shape of each entry of ``info``, without ``reward_terms``, which is a dictionary."""
+        goals = {} if self.goals is None else self.goals.spaces
+        flags = {"is_success": SUCCESS, "success": SUCCESS, "fractional_success": FRACTION}
+        return {
+            **{name: () for name, variable in flags.items() if variable in self._columns},
+            **{name: space.shape or () for name, space in goals.items()},
+        }
 
 
 def _check_goals(declaration: CompiledTask, goals: Goals | None) -> None:
@@ -271,15 +300,7 @@ def _vector(
     if how.context == "observation":
         rest = [name for name in _context(largest) if name not in names]
         parts += _parts(world, largest, rest, sensed=False)
-    padded = how.pad is not None
-    return Vector(
-        world,
-        declaration,
-        parts,
-        normalize=how.normalize_observations,
-        keypoints=view,
-        padded=padded,
-    )
+    return Vector(world, declaration, parts, keypoints=view, **how.form)
 
 
 def _parts(

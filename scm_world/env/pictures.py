@@ -22,7 +22,6 @@ from scm_world.backends.renderer import (
     shapes_of,
     views_of,
 )
-from scm_world.env.vector import Layouts
 from scm_world.errors import UnknownOption
 from scm_world.models import Scene
 from scm_world.models.camera import Camera
@@ -110,7 +109,7 @@ class Pixels:
 
     Attributes:
         names: The variables that have to be computed: none.
-        layouts: Where variables stand in vectors: there are none.
+        layout: Where variables stand in a vector: there is none.
         together: Whether several worlds can be observed in one call.
         space: uint8, shape (n, 3, h, w), with goals (2 n, 3, h, w); under the predecessor's
             conventions (2 n, h, w, 3).
@@ -136,7 +135,7 @@ class Pixels:
         self._given = [fixed.get(camera, camera) for camera in read]
         scene = world.structure.default_scene()
         self._placed = [scene_camera(scene, camera, self._size) for camera in self._given]
-        self.layouts: Layouts = {}
+        self.layout: dict[str, slice] = {}
         one, n = shape_of_pixels(self._placed[0], published=self._published), len(given)
         self._shows_goals = views is not None
         self._goals: NDArray[np.uint8] = np.empty((n, *one), dtype=np.uint8)

@@ -211,7 +211,8 @@ class Member(gymnasium.Wrapper[Any, Any, Any, Any]):
         if method == UNDO:
             self._undo()
             return self._seen, {}
-        self._before = inner.snapshot() if inner.world.has_begun else None
+        snapshot = self.env.get_wrapper_attr("snapshot")
+        self._before = snapshot() if inner.world.has_begun else None
         try:
             answer, (self._seen, info) = act(self.env, self._shapes, method, given)
         except Exception as error:
@@ -222,7 +223,7 @@ class Member(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _undo(self) -> None:
         inner: Any = self.env.unwrapped
         if self._before is not None:
-            inner.restore(self._before)
+            self.env.get_wrapper_attr("restore")(self._before)
             with suppress(ScmWorldError):  # what cannot be read stays as it was seen
                 self._seen, _ = inner.present()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -22,7 +22,7 @@ from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.variables.spaces import Affine, Switch
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
-from scm_world.world.mechanisms import Rows, places
+from scm_world.world.mechanisms import FIRST, Rows, places
 
 # --- bounds ---------------------------------------------------------------------------------------
 
@@ -139,9 +139,6 @@ def keypoints(bodies: tuple[str, ...]) -> View:
 
 # --- vectors --------------------------------------------------------------------------------------
 
-Layouts = Mapping[str, Mapping[str, slice]]
-"""Where each variable stands, for every vector by its name."""
-
 STREAM = "observation"
 """The stream of the noise of the sensors; draws of ``sensor_noise`` itself have another one."""
 
@@ -180,7 +177,7 @@ class Vector:
 
     Attributes:
         names: The variables that have to be computed.
-        layouts: Where each part stands, under the name of the vector.
+        layout: Where each part stands.
         space: In which the observation lies.
     """
 
@@ -196,7 +193,7 @@ class Vector:
     ) -> None:
         self._world, self._keypoints = world, keypoints
         self._slices = _places(parts)
-        self.layouts: Layouts = {"observation": self._slices}
+        self.layout = self._slices
         where = declaration.mechanisms.where
         self.names = tuple(part.name for part in parts if part.name in where)
         self.names += () if keypoints is None else keypoints[0]
@@ -293,12 +290,13 @@ class Vector:
 
     def _scaled(self, numbers: Floats, columns: Integers, shifts: Floats) -> NDArray[np.float32]:
         """Observe columns of the values of one world, shape (width,), or of several."""
-        matrix = numbers if numbers.ndim > 1 else numbers[None]
-        found: NDArray[np.float32] = np.empty((len(matrix), self._size), dtype=np.float32)
-        scale_rows(matrix, np.arange(len(matrix)), columns, shifts, self._scales, found)
+        single = numbers.ndim == 1
+        matrix, rows = (numbers[None], FIRST) if single else (numbers, np.arange(len(numbers)))
+        found: NDArray[np.float32] = np.empty((len(rows), self._size), dtype=np.float32)
+        scale_rows(matrix, rows, columns, shifts, self._scales, found)
         for place in self._turns:
             found[:, place] *= _signs(found[:, place])
-        shown: NDArray[np.float32] = found if numbers.ndim > 1 else found[0]
+        shown: NDArray[np.float32] = found[0] if single else found
         return shown
 
     def _sensed(self, raw: Floats) -> Floats:

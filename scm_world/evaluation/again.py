@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from scm_world._fingerprint import differing, fingerprint
-from scm_world.curricula import Do
 from scm_world.errors import (
     DAMAGED,
     ModelError,
@@ -23,9 +22,9 @@ from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import EvaluationPlace, Setup
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.plans import FORMAT, Plan
 from scm_world.tasks import Task, tasks
 from scm_world.tasks.factories import is_model, refuse_untrusted
-from scm_world.variables.mechanisms import check_trusted
 
 
 def shard_runner_of(
@@ -152,9 +151,8 @@ def _acts(options: Any, trusted: Sequence[str]) -> Any:
     if not isinstance(options, Mapping):
         return options
     if isinstance(options.get("kind"), str):
-        part = Do({"option": options})
-        check_trusted(part.functions(), trusted)
-        return part.request["option"]
+        data = {"format": FORMAT, "do": {"option": [options]}}
+        return Plan.from_dict(data, trusted=trusted)["option"][0]
     return {name: _acts(value, trusted) for name, value in options.items()}
 
 

@@ -10,8 +10,8 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world.curricula import CurriculumRunner, Memory
-from scm_world.curricula.combinations import Stages
+from scm_world.curricula import CurriculumEnv, Part
+from scm_world.curricula.base import nested
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption, UnknownVariable
 from scm_world.evaluation.players import Player
@@ -100,8 +100,8 @@ class Fingerprint:
         return self._sum.hexdigest()
 
 
-def turn_of(protocol: Protocol, env: ScmWorldEnv) -> CurriculumRunner:
-    """Prepare a protocol for an environment.
+def under(protocol: Protocol, env: ScmWorldEnv) -> CurriculumEnv:
+    """Return an environment under a protocol.
 
     Raises:
         UnknownOption: It depends on what happened in other episodes, or acts after their end.
@@ -110,19 +110,18 @@ def turn_of(protocol: Protocol, env: ScmWorldEnv) -> CurriculumRunner:
     if protocol.step >= env.world.max_episode_length:
         allowed = (f"control steps from 0 to {env.world.max_episode_length - 1}",)
         raise UnknownOption(f"step of protocol {protocol.name}", protocol.step, allowed)
-    if any(isinstance(part, Stages) for part in protocol.part.walk()):
+    if any(part.kind == "stages" for part in nested(protocol.part, Part)):
         allowed = ("parts without stages: an episode must not depend on others",)
         raise UnknownOption(f"act of protocol {protocol.name}", "stages", allowed)
-    turn = CurriculumRunner(protocol.curriculum())
     try:
-        turn.curriculum.check(env.world)
+        found = CurriculumEnv(env, protocol.curriculum())
         if isinstance(protocol.space, Subset) and not env.world.structures.head:
             for pattern in protocol.space.unused(env.world.model):
                 raise UnknownVariable(pattern, env.world.model)
     except ScmWorldError as error:
         place = {"protocol": protocol.name, "task": env.world.task.name}
         raise EvaluationError(place, str(error)) from error
-    return turn
+    return found
 
 
 @final
@@ -135,7 +134,7 @@ class EpisodeRunner:
 
     def __init__(self, env: ScmWorldEnv) -> None:
         self.env = env
-        self._turns: dict[str, tuple[Protocol, CurriculumRunner]] = {}
+        self._under: dict[str, tuple[Protocol, CurriculumEnv]] = {}
 
     def play(
         self,
@@ -165,7 +164,7 @@ class EpisodeRunner:
         named = (who[0], engine, protocol.name, seed, episode)
         place = dict(zip(("agent", "engine", "protocol", "seed", "episode"), named, strict=True))
         with _placed(place, env):
-            turn, observation = self.begin(protocol, seed=seed, episode=episode)
+            acting, observation = self.begin(protocol, seed=seed, episode=episode)
             drawn = _drawn(env, 0)
             player.begin(env)
             mark = Fingerprint(env)
@@ -176,15 +175,14 @@ class EpisodeRunner:
                     watch(env)
                 action = player.act(observation).copy()  # a policy may return one array again
                 mark.act(action)
-                observation, reward, terminated, truncated, info = env.step(action)
+                observation, reward, terminated, truncated, info = acting.step(action)
                 over = terminated or truncated
                 total += reward
                 steps += 1
                 if info.get(FRACTION) is not None:
                     fractions.append(info[FRACTION])
-                if not over and turn.stepped(env, env.world.index) and turn.act(env):
+                if env.interventions[-1:] and env.interventions[-1][0] == env.world.index:
                     drawn |= _drawn(env, env.world.index)
-                    observation = env.observe()
                 mark.look()
             if watch is not None:
                 watch(env)
@@ -204,34 +202,31 @@ class EpisodeRunner:
             UnknownOption: It depends on what happened in other episodes, or acts after their end.
             EvaluationError: What it does is impossible, with the place.
         """
-        self._turn(protocol)
+        self._env(protocol)
         place = {"engine": self.env.world.backend.name, "protocol": protocol.name}
         with _placed({**place, "seed": seed, "episode": 0}, self.env):
             self.begin(protocol, seed=seed, episode=0)
 
-    def begin(self, protocol: Protocol, *, seed: int, episode: int) -> tuple[CurriculumRunner, Any]:
-        """Begin an episode, with what a protocol does at its reset.
+    def begin(self, protocol: Protocol, *, seed: int, episode: int) -> tuple[CurriculumEnv, Any]:
+        """Begin an episode, with the interventions of a protocol at its reset.
 
         Returns:
-            What acts within the episode, and the observation.
+            The environment under the protocol, and the observation.
 
         Raises:
-            UnknownOption: The protocol does not fit; see ``turn_of``.
+            UnknownOption: The protocol does not fit; see ``under``.
             EvaluationError: It names something that does not exist, or a region that is
                 impossible.
-            InterventionError: What it does was refused.
+            InterventionError: An intervention was refused.
         """
-        turn = self._turn(protocol)
-        turn.memory.episode = episode
-        options = {"episode": episode, **turn.begin(self.env, seed, episode)}
-        return turn, self.env.reset(seed=seed, options=options)[0]
+        found = self._env(protocol)
+        return found, found.reset(seed=seed, options={"episode": episode})[0]
 
-    def _turn(self, protocol: Protocol) -> CurriculumRunner:
-        kept, found = self._turns.get(protocol.name, (None, None))
+    def _env(self, protocol: Protocol) -> CurriculumEnv:
+        kept, found = self._under.get(protocol.name, (None, None))
         if found is None or kept != protocol:
-            found = turn_of(protocol, self.env)
-            self._turns[protocol.name] = protocol, found
-        found.memory = Memory()
+            found = under(protocol, self.env)
+            self._under[protocol.name] = protocol, found
         return found
 
     def close(self) -> None:

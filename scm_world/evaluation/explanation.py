@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any, Literal, final
+from typing import Any, final
 
 import numpy as np
-from pydantic import PrivateAttr
 
 from scm_world._arguments import one_of
-from scm_world.curricula.base import AnyPart, Part, Situation
+from scm_world.curricula import Part, Situation, follow
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.again import shard_runner_of
@@ -27,43 +26,29 @@ VERSUS = ("A", "default")
 SAME = "it would have been the same"
 
 
-@final
-class Instead(Part):
-    """Do what a part does, but one thing differently.
+def _instead(of: Part, name: str, versus: str, found: set[str]) -> Part:
+    """Return a part that does what another does, but to one variable.
 
-    Attributes:
-        of: The part.
-        name: Of the variable.
+    Args:
+        of: The other part.
+        name: Name of the variable.
         versus: ``"A"``: it is drawn from the training space, with the same noise; ``"default"``:
             it is left as it is.
+        found: The name is added once the part sets the variable.
     """
 
-    kind: Literal["instead"] = "instead"
-    of: AnyPart
-    name: str
-    versus: Literal["A", "default"]
-    _found: set[str] = PrivateAttr(default_factory=set)
-
-    @property
-    def found(self) -> set[str]:
-        """The name, once the part has set the variable."""
-        return self._found
-
-    def parts(self) -> tuple[Part, ...]:
-        """Give the part."""
-        return (self.of,)
-
-    def acts(self, situation: Situation) -> Mapping[str, Any]:
-        """Replace what is done to the variable, or leave it out."""
-        plan = self.of.plan(situation)
-        if self.name not in plan:
+    def acts(situation: Situation) -> Mapping[str, Any]:
+        plan = of.plan(situation)
+        if name not in plan:
             return plan
-        self._found.add(self.name)
-        rest = {name: acts for name, acts in plan.items() if name != self.name}
-        if self.versus == "default":
+        found.add(name)
+        rest = {other: acts for other, acts in plan.items() if other != name}
+        if versus == "default":
             return rest
-        streams = ((act.time, getattr(act, "stream", None)) for act in plan[self.name])
-        return {**rest, self.name: [Draw("A", stream=one, time=time) for time, one in streams]}
+        streams = ((act.time, getattr(act, "stream", None)) for act in plan[name])
+        return {**rest, name: [Draw("A", stream=one, time=time) for time, one in streams]}
+
+    return follow(acts)
 
 
 @final
@@ -191,7 +176,8 @@ def why(
         usual = runner.env.world.values()  # without interventions
         against: dict[str, Any] = {n: versus or _versus(runner, usual, n, row) for n in row.drawn}
         for done, (name, how) in enumerate(against.items()):
-            part = Instead(of=done_there.part, name=name, versus=how)
+            is_set: set[str] = set()
+            part = _instead(done_there.part, name, how, is_set)
             seen: list[float] = []
 
             def look(env: ScmWorldEnv, name: str = name, seen: list[float] = seen) -> None:
@@ -220,7 +206,7 @@ def why(
                     then.scores[metric],
                     *(None if success is None else bool(success) for success in ends),
                 )
-                if reason := _no_answer(would, row, then, part.found, runner.env.world):
+                if reason := _no_answer(would, row, then, is_set, runner.env.world):
                     left_out[name] = reason
                 else:
                     found.append(would)

@@ -18,18 +18,12 @@ from numpy.typing import NDArray
 from scm_world._arguments import load
 from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
-from scm_world.env.arguments import action_scale
-from scm_world.env.delta import PREFIX as RELATIVE_MODE
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile, blamed
-from scm_world.evaluation.recording_files import Recorded, from_parquet
 from scm_world.output.reading import LARGEST_TABLE, read_bytes
 from scm_world.policies import MlpPolicy, PolicyAbout, file_of, load_policy, load_sb2
 from scm_world.policies.cards import FORM
 from scm_world.policies.scripted import NAMED, OpenLoopPolicy, Policy
 from scm_world.policies.zoo import PREFIX as ZOO
-from scm_world.queries.episode_files import load_episode
-from scm_world.queries.episodes import Episode
-from scm_world.queries.twins import Twins
 from scm_world.variables import Function
 from scm_world.world import Simulation
 
@@ -41,7 +35,7 @@ Actor = Callable[[Any], Any]
 """Gives an action for an observation, within one episode."""
 
 PACKAGE, SB3 = "scm_world", "stable_baselines3"
-SUFFIXES = (".safetensors", ".zip", ".npz", ".parquet")
+SUFFIXES = (".safetensors", ".zip")
 _ADVICE = "give the path of a policy"
 _FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 
@@ -68,10 +62,8 @@ FORMS = (
     "a function of the observation, such as one that runs an ONNX network",
     "a WorldPolicy",
     "an object with the method predict",
-    "an array of actions",
-    "an episode",
-    "a file (.safetensors, .zip of Stable-Baselines 2 or 3, .npz of an episode, .parquet of a "
-    "recording)",
+    "an array of actions, such as those of an episode",
+    "a file (.safetensors, .zip of Stable-Baselines 2 or 3)",
     "the folder of a training run",
     "'zoo:name'",
     "'module:function'",
@@ -285,36 +277,9 @@ def _itself(policy: Policy) -> Policy:
     return policy
 
 
-def _open_loop(
-    actions: Actions, name: str, given: Mapping[str, Any] | None, env: ScmWorldEnv
-) -> Actor:
-    """Play actions one after another and hold the last one.
-
-    Where the environment has the same kind of actions they are played bit for bit; where it has
-    other units they are converted, which rounds them to 64-bit floats.
-
-    Args:
-        actions: Shape (steps, n).
-        name: Of the policy.
-        given: Options of the environment of the actions; None: those of this one.
-        env: Where an episode has begun.
-    """
+def _open_loop(actions: Actions, name: str, env: ScmWorldEnv) -> Actor:
+    """Play actions of the environment one after another, and hold the last one."""
     checked(actions[0], env, name)
-    for option, wanted in (given or {}).items():
-        there = env.action_mode if option == "action_mode" else env.made_with[option]
-        if option != "normalize_actions" and there != wanted:
-            raise UnknownOption(f"{option} for {name!r}", there, (repr(wanted),))
-    normalized = bool(env.made_with["normalize_actions"])
-    if given is not None and given["normalize_actions"] != normalized:
-        if env.action_mode.startswith(RELATIVE_MODE):
-            allowed = f"normalize_actions={not normalized}, as the relative actions given"
-            raise UnknownOption(f"environment for {name!r}", env.action_mode, (allowed,))
-        actions = np.asarray(actions, dtype=np.float64)
-        if normalized:
-            actions = np.array([env.as_action(command) for command in actions])
-        else:
-            middle, half = action_scale(env.world)
-            actions = middle + half * actions
     rows = chain(actions, repeat(actions[-1]))
     return lambda _: next(rows)
 
@@ -328,10 +293,9 @@ def as_player(policy: Any, *, trusted: Sequence[str] | None = None) -> Player:
     Args:
         policy: A function of the observation; an object with ``predict`` as Stable-Baselines3 has
             it; the name of a policy of this package; a ``WorldPolicy``; actions, shape (n,) or
-            (steps, n); an episode of ``World.rollout`` or of a recording; the path of a policy
-            file, of an ONNX network, an archive of Stable-Baselines 2, a saved episode or a
-            recording (``"runs.parquet#3"`` for its fourth episode); the folder of a training run;
-            an archive of Stable-Baselines3, if ``"stable_baselines3"`` is among ``trusted``;
+            (steps, n), in the units of the environment; the path of a policy file or of an archive
+            of Stable-Baselines 2; the folder of a training run; an archive of Stable-Baselines3,
+            if ``"stable_baselines3"`` is among ``trusted``;
             ``"zoo:pushing"``, one that comes with this package; or
             ``"package.module:function"``.
         trusted: Packages whose functions may be named. None: any, as the caller named it.
@@ -354,8 +318,6 @@ def as_player(policy: Any, *, trusted: Sequence[str] | None = None) -> Player:
         made = _of_text(str(policy), trusted)
     elif isinstance(policy, np.ndarray | list | tuple):
         made = _of_actions(policy, {"kind": "actions", "name": "actions"})
-    elif isinstance(policy, Episode | Recorded):
-        made = _of_episode(policy, {"kind": "actions", "name": "episode"})
     elif callable(policy) or hasattr(policy, "predict"):
         made = _of_object(policy, _description(policy))
     else:
@@ -439,7 +401,7 @@ def player_from(about: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Pla
     if kind not in ("zoo", "file"):
         raise UnknownOption(f"policy to make again from {kind!r}", name, (advice,))
     text = name if kind == "zoo" else str(about["path"])
-    path = file_of(text.partition("#")[0])
+    path = file_of(text)
     if _sha256(path, advice) != about["sha256"]:
         raise UnreadableFile(str(path), "it is another file than the one that acted", advice)
     return as_player(text, trusted=trusted)
@@ -450,31 +412,25 @@ def _of_text(text: str, trusted: Sequence[str] | None) -> Player:
     if text in NAMES:
         about = {"kind": "named", "name": text, **ours}
         return Player(about, partial(_of_world, partial(_named, text), text))
-    part, _, number = text.partition("#")
     if text.startswith(ZOO):
         path, about = file_of(text), {"kind": "zoo", "name": text, **ours}
     elif Path(text).is_dir():
         path = file_of(text)
         about = {"kind": "file", "name": Path(text).resolve().name, "path": str(path)}
-    elif Path(part).suffix in SUFFIXES:
-        path, about = Path(part), {"kind": "file", "name": Path(text).name, "path": text}
+    elif Path(text).suffix in SUFFIXES:
+        path, about = Path(text), {"kind": "file", "name": Path(text).name, "path": text}
     elif ":" in text:
         about = {"kind": "function", "name": text, **_library(text)}
         return _of_object(_resolved(text, trusted), about)
     else:
         raise UnknownOption("policy", text, FORMS)
     about["sha256"] = _sha256(path, _ADVICE)
-    match path.suffix:
-        case ".safetensors":
-            return _of_network(load_policy(path), about)
-        case ".zip":
-            found = _archived(path, trusted or ())
-            if isinstance(found, MlpPolicy):
-                return _of_network(found, about)
-            return Player({**about, **_library(SB3)}, partial(_model, found))
-        case ".npz":
-            return _of_episode(load_episode(path, trusted=trusted or ()), about)
-    return _of_episode(_recorded(path, number, trusted or ()), about)
+    if path.suffix == ".safetensors":
+        return _of_network(load_policy(path), about)
+    found = _archived(path, trusted or ())
+    if isinstance(found, MlpPolicy):
+        return _of_network(found, about)
+    return Player({**about, **_library(SB3)}, partial(_model, found))
 
 
 def _archived(path: Path, trusted: Sequence[str]) -> Any:
@@ -508,33 +464,7 @@ def _archived(path: Path, trusted: Sequence[str]) -> Any:
         raise UnreadableFile(str(path), f"it cannot be loaded ({error})", advice) from error
 
 
-def _recorded(path: Path, number: str, trusted: Sequence[str]) -> Recorded:
-    _, found = from_parquet(read_bytes(path, LARGEST_TABLE), str(path), trusted)
-    if not number and len(found) != 1:
-        advice = f"say which one: {path}#0 to #{len(found) - 1}"
-        raise UnreadableFile(str(path), f"it has {len(found)} episodes", advice)
-    if number and not (number.isdecimal() and int(number) < len(found)):
-        raise UnknownOption("episode of a recording", number, (f"0 to {len(found) - 1}",))
-    return found[int(number or 0)]
-
-
-def _of_episode(episode: Episode | Recorded, about: About) -> Player:
-    """Play the actions of an episode of ``World.rollout``, or of a recording.
-
-    Raises:
-        UnknownOption: It is an episode of equations, whose actions are not those of a robot.
-    """
-    if isinstance(episode, Episode):
-        if not isinstance(episode.twins, Twins):
-            raise UnknownOption("policy", episode, ("an episode of a world, not of equations",))
-        mode = episode.twins.options["action_mode"]
-        return _of_actions(
-            episode.actions, about, {"action_mode": mode, "normalize_actions": False}
-        )
-    return _of_actions(episode.actions, about, episode.action_options)
-
-
-def _of_actions(actions: Any, about: About, given: Mapping[str, Any] | None = None) -> Player:
+def _of_actions(actions: Any, about: About) -> Player:
     try:
         rows = np.atleast_2d(np.asarray(actions, dtype=getattr(actions, "dtype", np.float64)))
     except (TypeError, ValueError):
@@ -544,8 +474,7 @@ def _of_actions(actions: Any, about: About, given: Mapping[str, Any] | None = No
     for row in rows:
         checked(row, None, about["name"])
     about = {"sha256": hashlib.sha256(rows.tobytes()).hexdigest(), **about}
-    start = partial(_open_loop, rows, about["name"], given)
-    return Player(about, start)
+    return Player(about, partial(_open_loop, rows, about["name"]))
 
 
 def _of_network(policy: MlpPolicy, about: About) -> Player:

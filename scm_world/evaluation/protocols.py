@@ -17,10 +17,10 @@ from fnmatch import fnmatchcase
 from typing import Any, final
 
 from scm_world._arguments import whole_number
-from scm_world.curricula import Curriculum, as_curriculum, at_step, together
+from scm_world.curricula import Curriculum, at_step, goals, resample, together
 from scm_world.curricula.base import AnyPart, Part, as_part, words
 from scm_world.curricula.curriculum import read_from
-from scm_world.curricula.parts import NewGoal, Resample
+from scm_world.curricula.targets import regions
 from scm_world.errors import UnknownOption
 from scm_world.tasks import Task, tasks
 from scm_world.variables import Distribution, Subset
@@ -84,12 +84,12 @@ class Protocol(Frozen):
         """What is done, as a part of a curriculum."""
         if self.act is not None:
             return self.act if self.step == 0 else at_step(self.step, self.act)
-        drawn = Resample(self.varies, space=self.space) if self.varies else as_part({})
+        drawn = resample(self.varies, space=self.space) if self.varies else as_part({})
         return at_step(self.step, drawn)
 
     def curriculum(self) -> Curriculum:
         """Give it as a curriculum, for an environment."""
-        return as_curriculum(self.part)
+        return Curriculum(self.part)
 
     def at(self, step: int) -> Protocol:
         """Give the protocol that does the same within the episodes, after so many steps."""
@@ -310,7 +310,7 @@ def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:
     found = [Protocol("P0", doc="nothing varies")]
     spaces: tuple[SpaceName, ...] = () if len(world.structures.head) else ("A", "B")
     for space in spaces:
-        names = Resample("@everything", space=space).targets(declaration)
+        names = regions(declaration, ["@everything"], space)
         if names:
             doc = f"everything that has a space {space}"
             found.append(Protocol(space, tuple(names), space, doc=doc))
@@ -329,14 +329,14 @@ def _protocol(roles: Roles, name: str, what: str, space: SpaceName) -> Protocol:
     if not words:
         return Protocol(name, space=space, doc="the default task")
     if words == ["all"]:
-        act = Resample("@published", space=space, exclusive=True)
+        act = resample("@published", space, exclusive=True)
         return Protocol(name, space=space, act=act, doc=f"everything from {space}")
     called = {**WORDS, **roles.words}
     doc = f"{', '.join(called[word] for word in words)} from {space}"
     named = [FRICTION if w == "friction" else getattr(roles, w) for w in words]
     if None not in named:
         return Protocol(name, named, space, doc=doc)
-    shape = NewGoal(space=space, besides=roles.kept)
+    shape = goals(space, besides=roles.kept)
     others = [pattern for pattern in named if pattern is not None]
-    act_: Part = together(shape, Resample(others, space=space)) if others else shape
+    act_: Part = together(shape, resample(others, space)) if others else shape
     return Protocol(name, space=space, act=act_, doc=doc)

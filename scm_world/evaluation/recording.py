@@ -39,9 +39,9 @@ from scm_world.evaluation.recording_files import (
 from scm_world.output.durable import said, write_durably
 from scm_world.output.reading import LARGEST_TABLE, read_bytes
 from scm_world.output.remote import Location, located
+from scm_world.queries.episodes import as_names
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
-from scm_world.queries.rollouts import as_names
 from scm_world.tasks import Task
 from scm_world.tasks.factories import refuse_untrusted
 

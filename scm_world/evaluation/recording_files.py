@@ -26,7 +26,6 @@ from scm_world.env.arguments import asked
 from scm_world.env.observer import Observation
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.output.reading import read_table
-from scm_world.policies.cards import RELATIVE, USUAL
 from scm_world.queries.plans import Plan
 from scm_world.tasks import Task, tasks
 from scm_world.tasks.factories import load_factory
@@ -92,12 +91,6 @@ class Recorded:
 
     def __hash__(self) -> int:
         return hash((self.seed, self.number, len(self)))
-
-    @property
-    def action_options(self) -> dict[str, Any]:
-        """Options of the environment that define the actions."""
-        names = ("action_mode", "normalize_actions", *RELATIVE)
-        return {name: self.environment.get(name, USUAL[name]) for name in names}
 
     def plans(self) -> list[list[Any]]:
         """Return the interventions as plain data.

@@ -23,13 +23,14 @@ UNIT = 8.0 * np.finfo(np.float64).eps
 
 def _components(values: ArrayLike) -> tuple[Floats, Floats, Floats, Floats]:
     """Split quaternions; a last axis that is not four long is a ValueError."""
-    x, y, z, w = np.moveaxis(np.asarray(values, dtype=np.float64), -1, 0)
+    given = np.asarray(values, dtype=np.float64)
+    x, y, z, w = (given[..., i] for i in range(given.shape[-1]))
     return x, y, z, w
 
 
 def _squared_norm(quaternion: Floats) -> Floats:
-    squared: Floats = np.sum(quaternion * quaternion, axis=-1, keepdims=True)
-    if np.any(squared == 0.0):
+    squared: Floats = (quaternion * quaternion).sum(axis=-1, keepdims=True)
+    if (squared == 0.0).any():
         raise ValueError("a quaternion of length zero names no rotation")
     return squared
 
@@ -77,7 +78,7 @@ def rotation_matrix(quaternion: ArrayLike) -> Floats:
 def from_rotation_vector(vector: ArrayLike) -> Floats:
     """Return the unit quaternion with w >= 0 of axis times angle, shape (..., 3) [rad]."""
     given = np.asarray(vector, dtype=np.float64)
-    angle = np.sqrt(np.sum(given * given, axis=-1, keepdims=True))
+    angle = np.sqrt((given * given).sum(axis=-1, keepdims=True))
     imaginary = 0.5 * np.sinc(angle / (2.0 * np.pi)) * given
     return canonical(np.concatenate((imaginary, np.cos(0.5 * angle)), axis=-1))
 
@@ -89,7 +90,7 @@ def to_rotation_vector(quaternion: ArrayLike) -> Floats:
     """
     unit = canonical(quaternion)
     imaginary, real = unit[..., :3], unit[..., 3:]
-    length = np.sqrt(np.sum(imaginary * imaginary, axis=-1, keepdims=True))
+    length = np.sqrt((imaginary * imaginary).sum(axis=-1, keepdims=True))
     stretch = np.full_like(length, 2.0)  # the limit of angle / sin(angle / 2) at zero
     np.divide(2.0 * np.arctan2(length, real), length, out=stretch, where=length > 0.0)
     vector: Floats = stretch * imaginary

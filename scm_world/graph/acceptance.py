@@ -48,8 +48,9 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
         InterventionError: What is wrong with it.
     """
     name, said = variable.name, ""
-    refuse_time(name, value)
     kind = type(value)  # the classes of interventions are final
+    if kind is tuple or kind in ACTS:
+        refuse_time(name, value)
     if kind is Hard or kind not in ACTS:
         number = coerce(variable, _plain(variable, value) if kind is Hard else value)
         bounds = variable.bounds

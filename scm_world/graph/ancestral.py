@@ -1,12 +1,12 @@
-"""Ancestral graphs: what hidden causes leave of a graph, and what can be learned of it.
+"""Ancestral graphs: the graphs of observed variables with hidden common causes.
 
 A graph of p observed variables has directed edges and pairs with a hidden common cause (an ADMG).
 Its maximal ancestral graph (MAG) joins the pairs that no set of observed variables separates, and
 its partial ancestral graph (PAG) keeps the marks that all MAGs with these independences share.
 
 A graph with edge marks is a matrix of shape (p, p): at [i, j] the mark at i of the edge between i
-and j: ``HEAD`` if i is no cause of j, ``TAIL`` if it is one, ``CIRCLE`` if either can be, 0 where
-is no edge. These are the numbers of causal-learn. Through time a matrix has shape (lags + 1, p, p):
+and j: ``HEAD`` if i does not cause j, ``TAIL`` if it does, ``CIRCLE`` if either can be, 0 without
+an edge. These are the numbers of causal-learn. Through time a matrix has shape (lags + 1, p, p):
 at [lag, i, j] the mark at i, so many control steps before j; the later end of such an edge is a
 head.
 
@@ -32,7 +32,7 @@ from scm_world.graph.equivalence import Bools, is_acyclic, meets, reaches
 Marks = NDArray[np.int8]
 HEAD, TAIL, CIRCLE = 1, -1, 2
 SIGNS = {HEAD: "<>", TAIL: "--", CIRCLE: "oo"}
-"""Of a mark, on the left and on the right of an edge."""
+"""The sign of a mark on the left and on the right of an edge."""
 
 
 def mag(directed: Bools, confounded: Bools) -> Marks:
@@ -69,8 +69,8 @@ def pag(given: Marks, tiers: Sequence[int] | None = None) -> Marks:
     """Return the partial ancestral graph of a maximal ancestral one.
 
     Args:
-        given: Of ``mag``.
-        tiers: Of each variable; none acts on one of a lower tier. No order is known if None.
+        given: A result of ``mag``.
+        tiers: The tier of each variable, which acts on none of a lower tier; or None.
     """
     joined = given != 0
     apart = ~joined & ~np.eye(len(given), dtype=bool)
@@ -216,7 +216,7 @@ def edge_words(names: Sequence[str], marks: Marks) -> tuple[str, ...]:
     """Write the edges of a graph with marks, ``@-1`` for a control step before.
 
     Args:
-        names: Of the p variables.
+        names: Names of the p variables.
         marks: Shape (p, p) or (lags + 1, p, p).
 
     Example:

@@ -165,7 +165,7 @@ def extension(graph: Bools) -> Bools | None:
     here = np.ones(len(graph), dtype=bool)
     while here.any():
         free = left & left.T
-        # A sink: nothing leads out, and what has no direction at it is next to all its neighbors.
+        # A sink has no edge out, and its undirected neighbors are adjacent to all its neighbors.
         strangers = (meets(free, _apart(left)) & skeleton(left)).any(axis=1)
         sinks = np.flatnonzero(here & ~(left & ~left.T).any(axis=1) & ~strangers)
         if not len(sinks):

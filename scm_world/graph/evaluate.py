@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -15,7 +15,6 @@ from scm_world.variables import (
     Categories,
     Derived,
     Distribution,
-    Draw,
     Exogenous,
     Fixed,
     Hard,
@@ -75,10 +74,9 @@ class NoiseKey:
         """Draw a value of a variable, shape ``(count, *shape)`` or ``shape``."""
         if stream is None and self.given is not None and name in self.given:
             return self.given[name]
-        own = name if stream is None else f"{stream}/{name}"
         drawn = self.noise.draw(
             source,
-            f"{own}#{self.attempt}" if self.attempt and name not in self.kept else own,
+            self.stream(name, stream, self.attempt),
             shape,
             values,
             episode=self.episode,
@@ -87,14 +85,14 @@ class NoiseKey:
         )
         return drawn if self.count is not None else drawn[0]
 
+    def stream(self, name: str, stream: str | None, attempt: int) -> str:
+        """Return the name of the stream that an attempt to draw a variable takes its noise from."""
+        own = name if stream is None else f"{stream}/{name}"
+        return f"{own}#{attempt}" if attempt and name not in self.kept else own
+
 
 def earlier(name: str, lag: int) -> str:
-    """Name the value of so many control steps ago, where values of one step ago have plain names.
-
-    Example:
-        >>> earlier("x", 1), earlier("x", 3)
-        ('x', 'x@-3')
-    """
+    """Name the value of so many control steps ago; that of one step ago has the plain name."""
     return name if lag == 1 else f"{name}@-{lag}"
 
 
@@ -115,12 +113,9 @@ class AppliedIntervention:
 
 def source_of(act: AppliedIntervention) -> Distribution:
     """Return the distribution that a draw is taken from."""
-    draw = act.intervention
-    if not isinstance(draw, Draw):
-        raise TypeError(f"{draw!r} draws nothing")
-    if not isinstance(draw.source, str):
-        return draw.source
-    space = act.requested.space(draw.source)
+    draw: Any = act.intervention
+    named = isinstance(draw.source, str)
+    space = act.requested.space(draw.source) if named else draw.source
     if space is None:
         raise ModelError([f"{act.requested.name!r} has no space {draw.source}"])
     return space
@@ -129,23 +124,16 @@ def source_of(act: AppliedIntervention) -> Distribution:
 def noise_of(
     variable: Variable, mechanism: Derived | Mechanism, key: NoiseKey | None, values: Values
 ) -> dict[str, Value]:
-    """Give the noise that the function of a variable takes, as its argument; none if it has none.
-
-    Args:
-        variable: The variable.
-        mechanism: Its own declaration, or what an intervention has put in the place.
-        key: Where noise is drawn; the noise is zero if None.
-        values: Of the variables that a distribution follows.
-    """
+    """Return the noise argument of a variable's own or given function; zero without a key."""
     own = variable if isinstance(variable, Derived) else None
     source = mechanism.noise
     if isinstance(mechanism, Mechanism):
-        if not mechanism.equation.takes_noise:
-            return {}
-        source = mechanism.noise or (own.noise if own is not None else None)
+        takes = mechanism.equation.takes_noise
+        source = (source or getattr(own, "noise", None)) if takes else None
     if source is None:
         return {}
-    shape = variable.shape if own is None or own.noise_shape is None else own.noise_shape
+    shape = getattr(own, "noise_shape", None)
+    shape = variable.shape if shape is None else shape
     if key is None:
         return {"noise": np.zeros(shape)}
     return {"noise": key.natural(source, variable.name, shape, values)}
@@ -153,19 +141,19 @@ def noise_of(
 
 def _check_kind(variable: Variable, value: Value) -> None:
     """Refuse what a function gives that is NaN, no whole number, or none of the categories."""
-    bounds = variable.bounds
+    bounds, said = variable.bounds, ""
     if value.dtype.kind == "f" and np.isnan(value).any():
         rows = f" in {int(np.isnan(value).sum())} of {value.size} numbers" if value.ndim else ""
-        raise FunctionFailure(f"the function of {variable.name!r} gives NaN{rows}")
-    if variable.dtype == "integer" and value.dtype.kind == "f" and (np.rint(value) != value).any():
+        said = f"NaN{rows}"
+    elif variable.dtype == "integer" and value.dtype.kind == "f":
         wrong = value[np.rint(value) != value].ravel().tolist()[:3]
-        said = f"the function of {variable.name!r} gives {wrong}, and the variable is an integer"
-        raise FunctionFailure(f"{said}: round them in the function")
-    if isinstance(bounds, Categories) and not bounds.contains(value):
+        more = "and the variable is an integer: round them in the function"
+        said = f"{wrong}, {more}" if wrong else ""
+    elif isinstance(bounds, Categories) and not bounds.contains(value):
         wrong = np.setdiff1d(value, bounds.members).tolist()[:3]
-        allowed = bounds.describe(variable.shape, {})
-        said = f"the function of {variable.name!r} gives {wrong}, which are none of {allowed}"
-        raise FunctionFailure(said)
+        said = f"{wrong}, which are none of {bounds.describe(variable.shape, {})}"
+    if said:
+        raise FunctionFailure(f"the function of {variable.name!r} gives {said}")
 
 
 def first_value(variable: Variable) -> Value:
@@ -290,11 +278,8 @@ class Evaluator:
                 return key.natural(variable.distribution, variable.name, variable.shape, values)
             case Fixed():
                 return variable.array(variable.value)
-            case Derived():
+            case Derived() | Measured() if variable.mechanism is not None:
                 return self._derive(variable, values, previous, key)
-            case Measured() if variable.mechanism is not None:
-                arguments = self._arguments(variable.all_parents, values, previous)
-                return self._called(variable, arguments, {})
             case _:
                 if variable.name not in values:
                     raise ModelError(
@@ -303,47 +288,38 @@ class Evaluator:
                 return values[variable.name]
 
     def _derive(
-        self, variable: Derived, values: Values, previous: Values, key: NoiseKey | None
+        self, variable: Derived | Measured, values: Values, previous: Values, key: NoiseKey | None
     ) -> Value:
-        arguments = self._arguments(variable.all_parents, values, previous)
-        given = {} if variable.noise is None else noise_of(variable, variable, key, values)
-        value = self._called(variable, arguments, given)
-        shape = value.shape[value.ndim - len(variable.shape) :]
-        if value.dtype.kind not in "biuf" or shape != variable.shape:
-            wanted = f"numbers of shape {variable.shape}" if variable.shape else "a number"
-            raise FunctionFailure(
-                f"the function of {variable.name!r} gives {value!r}, not {wanted}"
-            )
-        _check_kind(variable, value)
-        return value
-
-    def _called(self, variable: Any, arguments: list[Value], given: Mapping[str, Any]) -> Value:
         """Call the function of a variable."""
-        function = self._bound(variable)
+        arguments = self._arguments(variable.all_parents, values, previous)
+        own = variable if isinstance(variable, Derived) else None
+        noise = {} if own is None or own.noise is None else noise_of(own, own, key, values)
         try:
-            return np.asarray(function(*arguments, **given))
+            value = np.asarray(self._bound(variable)(*arguments, **noise))
         except ScmWorldError:
             raise
         except Exception as error:
             problem = f"the function of {variable.name!r} raised {in_one_line(error)}"
             raise FunctionFailure(problem) from error
+        if own is None:
+            return value
+        shape = value.shape[value.ndim - len(own.shape) :]
+        if value.dtype.kind not in "biuf" or shape != own.shape:
+            wanted = f"numbers of shape {own.shape}" if own.shape else "a number"
+            raise FunctionFailure(f"the function of {own.name!r} gives {value!r}, not {wanted}")
+        _check_kind(own, value)
+        return value
 
     def _arguments(
         self, parents: Iterable[Parent], values: Values, previous: Values
-    ) -> list[Value]:
-        found = []
+    ) -> Iterator[Value]:
         for parent in parents:
-            name = parent.name
-            if parent.lag == 0:
-                found.append(values[name])
+            name = parent.name if parent.lag < 2 else earlier(parent.name, parent.lag)
+            known = previous if parent.lag else values
+            if parent.lag and name not in known:
+                yield first_value(self._declared[parent.name])
             else:
-                key = name if parent.lag == 1 else earlier(name, parent.lag)
-                found.append(previous[key] if key in previous else self.first(name))
-        return found
-
-    def first(self, name: str) -> Value:
-        """Return the value that lagged children see before the first step."""
-        return first_value(self._declared[name])
+                yield known[name]
 
     def _bound(self, variable: Any, *, inverse: bool = False) -> Callable[..., Any]:
         key = f"{variable.name}|inverse" if inverse else variable.name

@@ -43,12 +43,21 @@ def to_digraph(source: SCM | nx.DiGraph) -> nx.MultiDiGraph:
         >>> to_digraph(model.do({"weight": 1.0})).edges
         OutMultiEdgeView([])
     """
-    return _of_model(source) if isinstance(source, SCM) else _of_networkx(source)
-
-
-def _of_model(model: SCM) -> nx.MultiDiGraph:
     graph = nx.MultiDiGraph()
-    for variable in (model[name] for name in model):
+    if not isinstance(source, SCM):
+        if not isinstance(source, nx.Graph):
+            raise UnknownOption("graph", source, ("a model (SCM)", "a directed graph of networkx"))
+        if not source.is_directed():
+            raise ModelError(["the edges of the graph have no direction"])
+        graph.add_nodes_from(source.nodes(data=True))
+        for cause, effect, data in source.edges(data=True):
+            lag = data.get("lag", 0)
+            if not isinstance(lag, int) or lag < 0:
+                said = f"the lag {lag!r} of {cause!r} → {effect!r} is not a whole number"
+                raise ModelError([said])
+            graph.add_edge(cause, effect, lag, **{**data, "lag": lag})
+        return graph
+    for variable in (source[name] for name in source):
         given: Any = variable
         spaces = {"bounds": variable.bounds, "a": variable.a, "b": variable.b}
         about = {
@@ -61,24 +70,9 @@ def _of_model(model: SCM) -> nx.MultiDiGraph:
             "doc": " ".join(variable.doc.split()),
         }
         graph.add_node(variable.name, **{key: text for key, text in about.items() if text})
-    for edge in sorted(model.edges, key=lambda edge: edge.key):
+    for edge in sorted(source.edges, key=lambda edge: edge.key):
         when = {} if edge.when is None else {"when": edge.when}
         graph.add_edge(edge.cause, edge.effect, edge.lag, lag=edge.lag, **when)
-    return graph
-
-
-def _of_networkx(source: nx.DiGraph) -> nx.MultiDiGraph:
-    if not isinstance(source, nx.Graph):
-        raise UnknownOption("graph", source, ("a model (SCM)", "a directed graph of networkx"))
-    if not source.is_directed():
-        raise ModelError(["the edges of the graph have no direction"])
-    graph = nx.MultiDiGraph()
-    graph.add_nodes_from(source.nodes(data=True))
-    for cause, effect, data in source.edges(data=True):
-        lag = data.get("lag", 0)
-        if not isinstance(lag, int) or lag < 0:
-            raise ModelError([f"the lag {lag!r} of {cause!r} → {effect!r} is not a whole number"])
-        graph.add_edge(cause, effect, lag, **{**data, "lag": lag})
     return graph
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from scm_world._arguments import typed
 from scm_world._fingerprint import differing, fingerprint
-from scm_world.errors import DAMAGED, InterventionError, ModelError, UnknownOption
+from scm_world.errors import DAMAGED, InterventionError, ModelError
 from scm_world.graph.scm import SCM
 from scm_world.variables import AnyVariable, Function, Intervention, Mechanism, Variable
 from scm_world.variables.mechanisms import check_portable, check_trusted
@@ -22,16 +22,9 @@ _VARIABLES: TypeAdapter[Any] = TypeAdapter(list[AnyVariable])
 _INTERVENTIONS: TypeAdapter[Any] = TypeAdapter(dict[str, Intervention])
 
 
-def _plain(data: Any) -> Any:
-    """Write infinities as text: JSON has no number for them."""
-    match data:
-        case dict():
-            return {key: _plain(part) for key, part in data.items()}
-        case list():
-            return [_plain(part) for part in data]
-        case float() if math.isinf(data):
-            return "Infinity" if data > 0 else "-Infinity"
-    return data
+def _plain(adapter: TypeAdapter[Any], data: Any) -> Any:
+    """Return plain data, with infinities as text: JSON has no number for them."""
+    return json.loads(json.dumps(adapter.dump_python(data, mode="json")), parse_constant=str)
 
 
 def _functions(
@@ -51,21 +44,19 @@ def _hashes(model: SCM) -> dict[str, str]:
     return {name: part for name, part in found.items() if not name.startswith(plain)}
 
 
+@typed
 def to_dict(model: SCM) -> dict[str, Any]:
     """Return a model as plain data.
 
     Raises:
         ModelError: A mechanism is a lambda or another function without a name.
-        UnknownOption: It is not a model.
     """
-    if not isinstance(model, SCM):
-        raise UnknownOption("model", model, ("an SCM, such as world.model",))
     check_portable(_functions(model.variables, model.interventions))
     return {
         "format": FORMAT,
         "functions": _hashes(model),
-        "variables": _plain(_VARIABLES.dump_python(list(model.variables), mode="json")),
-        "interventions": _plain(_INTERVENTIONS.dump_python(dict(model.interventions), mode="json")),
+        "variables": _plain(_VARIABLES, list(model.variables)),
+        "interventions": _plain(_INTERVENTIONS, dict(model.interventions)),
     }
 
 

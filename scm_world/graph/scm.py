@@ -24,7 +24,14 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph.acceptance import accepted, settable_causes
-from scm_world.graph.evaluate import AppliedIntervention, Evaluator, NoiseKey, earlier, source_of
+from scm_world.graph.evaluate import (
+    AppliedIntervention,
+    Evaluator,
+    NoiseKey,
+    earlier,
+    first_value,
+    source_of,
+)
 from scm_world.graph.structure import Edge, EdgeIndex, checked
 from scm_world.variables import (
     SOFT,
@@ -87,13 +94,6 @@ def flatten(
     if twice is None:
         raise_all(problems)
     return flat
-
-
-def _keeps_mechanism(act: AppliedIntervention, variable: Variable) -> bool:
-    """Return whether a variable follows its own function under an intervention."""
-    done = act.intervention
-    own = isinstance(done, Mechanism) and done.function is getattr(variable, "mechanism", None)
-    return own or isinstance(done, SOFT)
 
 
 class SCM:
@@ -412,7 +412,7 @@ class SCM:
     ) -> dict[str, Value]:
         """Compute every variable from the exogenous ones, shape ``(..., *shape)`` each.
 
-        Every value has the batch axes that lead in what is known, or in what the key draws.
+        Every value has the leading batch axes of the known values, or of the draws of the key.
 
         Args:
             known: Values of exogenous and measured variables and of actions; batch axes may lead.
@@ -484,10 +484,13 @@ class SCM:
             )
         for name in self._order if only is None else only:
             act, variable = self._acts.get(name), self._declared[name]
-            if act is not None and not _keeps_mechanism(act, variable):
+            done = None if act is None else act.intervention
+            mechanism = getattr(variable, "mechanism", None)
+            own = isinstance(done, Mechanism) and done.function is mechanism
+            if act is not None and not own and not isinstance(done, SOFT):
                 found = self._evaluator.evaluate(name, act, values, {}, key)
             elif name in self._temporal and isinstance(variable, Derived | Measured):
-                found = values.get(name, self._evaluator.first(name))
+                found = values.get(name, first_value(variable))
             else:
                 drawn = key if getattr(variable, "per", "step") == "episode" else None
                 found = self._evaluator.evaluate(name, act, values, {}, drawn)

@@ -8,7 +8,7 @@ from typing import Any
 import networkx as nx
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable
 from scm_world.graph.ancestral import window
 from scm_world.graph.exchange import to_digraph
@@ -18,21 +18,20 @@ Node = str | tuple[str, int]
 """A variable now, or a variable at an earlier slice: ``("tool_block.mass", -1)``."""
 
 
-def unrolled(model: SCM, steps: int) -> nx.DiGraph:
-    """Return the graph of some control steps, with nodes ``(name, -steps + 1)`` to ``(name, 0)``.
-
-    A parameter keeps its value from one step to the next: an edge with ``persists=True``.
-    """
-    return slices_of(to_digraph(model), whole_number("steps", steps, least=1))
-
-
 def _longest_lag(graph: nx.MultiDiGraph) -> int:
     return max((lag for *_, lag in graph.edges(keys=True)), default=0)
 
 
-def slices_of(graph: nx.MultiDiGraph, steps: int) -> nx.DiGraph:
-    """Unroll a graph of ``to_digraph``; nodes are ``(name, -steps + 1)`` to ``(name, 0)``."""
-    made = nx.DiGraph()
+def unrolled(source: SCM | nx.DiGraph, steps: int) -> nx.DiGraph:
+    """Return the graph of some control steps, with nodes ``(name, -steps + 1)`` to ``(name, 0)``.
+
+    A parameter keeps its value from one step to the next: an edge with ``persists=True``.
+
+    Args:
+        source: A model, or any directed networkx graph; the attribute ``lag`` of an edge counts.
+        steps: The number of control steps, at least 1.
+    """
+    graph, made, steps = to_digraph(source), nx.DiGraph(), whole_number("steps", steps, least=1)
     for slice_ in range(1 - steps, 1):
         made.add_nodes_from(
             ((name, slice_), {**data, "variable": name, "slice": slice_})
@@ -61,7 +60,7 @@ def window_of(graph: nx.MultiDiGraph) -> nx.DiGraph:
     """Return the present and as many slices before it as the longest lag, with their common past.
 
     Two nodes are d-separated exactly where they are in a graph unrolled without end: this is its
-    latent projection. Nodes are those of ``slices_of``; ``("past", 1)``, … are unobserved.
+    latent projection. Nodes are those of ``unrolled``; ``("past", 1)``, … are unobserved.
 
     Source:
         Verma and Pearl, *Equivalence and synthesis of causal models*, UAI 1990, for projections;
@@ -76,7 +75,7 @@ def window_of(graph: nx.MultiDiGraph) -> nx.DiGraph:
     _, shared = window(edges, np.zeros_like(edges), past)
     nodes = [(name, slice_) for slice_ in range(-past, 1) for name in graph]
     pairs = nx.Graph((nodes[i], nodes[j]) for i, j in np.argwhere(np.triu(shared)).tolist())
-    made = slices_of(graph, past + 1)
+    made = unrolled(graph, past + 1)
     for number, effects in enumerate(sorted(map(sorted, nx.find_cliques(pairs))), start=1):
         made.add_node(("past", number), observed="no")
         made.add_edges_from((("past", number), effect) for effect in effects)
@@ -119,6 +118,7 @@ def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
     return made
 
 
+@typed
 def episode_outcome(
     model: SCM, outcomes: Iterable[str], *, starts: Iterable[str] = (), contact: bool = True
 ) -> nx.DiGraph:
@@ -142,7 +142,6 @@ def episode_outcome(
         >>> sorted(episode_outcome(model, ["speed"], starts=["speed"]).edges)
         [('mass', 'speed'), ('speed@0', 'speed')]
     """
-    _check_model(model)
     parameters = [name for name in model if model.declared(name).role == "parameter"]
     edges = [edge for edge in model.edges if contact or edge.when != "contact"]
     follow = nx.DiGraph((edge.cause, edge.effect) for edge in edges)
@@ -165,18 +164,14 @@ def episode_outcome(
     return graph
 
 
-def _check_model(model: Any) -> None:
-    if not isinstance(model, SCM):
-        raise UnknownOption("model", model, ("an SCM, such as world.model",))
-
-
+@typed
 def d_separated(
     model: SCM, x: Iterable[Node], y: Iterable[Node], given: Iterable[Node] = ()
 ) -> bool:
     """Return whether ``given`` blocks every path between ``x`` and ``y``.
 
     In a model with lagged edges a plain name means the present slice and ``(name, -1)`` the one
-    before. What a common past connects, however long ago, is connected.
+    before. A common past connects two nodes, however long ago it was.
 
     Raises:
         UnknownVariable: A node is not in the model.
@@ -185,13 +180,10 @@ def d_separated(
     Source:
         Pearl, *Causality*, 2nd ed., section 1.2.3; computed by networkx.
     """
-    _check_model(model)
     graph = window_of(to_digraph(model))
 
     def nodes(chosen: Iterable[Node]) -> set[Any]:
         found: set[Any] = set()
-        if not isinstance(chosen, Iterable):
-            raise UnknownOption("nodes", chosen, ("names of variables",))
         for node in (chosen,) if isinstance(chosen, str) else chosen:
             full = (node, 0) if isinstance(node, str) else node
             if full not in graph or not -1 <= full[1] <= 0:

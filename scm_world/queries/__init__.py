@@ -10,7 +10,6 @@ from scm_world.queries.episodes import Episode
 from scm_world.queries.estimates import Effect
 from scm_world.queries.identification import Identification, estimate, identify, nature_graph
 from scm_world.queries.laboratory import Laboratory
-from scm_world.queries.live import LiveEpisode
 from scm_world.queries.outcomes import Outcome
 from scm_world.queries.plans import Plan, do
 from scm_world.queries.questions import SCM
@@ -32,7 +31,6 @@ __all__ = [
     "EpisodeDifference",
     "Identification",
     "Laboratory",
-    "LiveEpisode",
     "Outcome",
     "Plan",
     "Random",

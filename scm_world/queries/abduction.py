@@ -24,10 +24,16 @@ import numpy as np
 from scm_world._arguments import real_number, whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world._types import Integers as Numbers
-from scm_world.errors import ImpossibleObservation, InterventionError, ModelError, UnknownOption
+from scm_world.errors import (
+    ImpossibleObservation,
+    InterventionError,
+    ModelError,
+    UnknownOption,
+    blamed,
+)
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier, first_value
-from scm_world.queries.equations import Layout
+from scm_world.queries.equations import CompiledModel
 from scm_world.queries.inversion import Found, density_of, noise_given, noise_shape, proposed
 from scm_world.queries.observations import Observations, observations, per
 from scm_world.queries.plans import Plan, at_once, numbered
@@ -208,7 +214,7 @@ class _Abduction:
         self.model, self._tolerance = model, tolerance
         own = np.random.SeedSequence((whole_number("seed", seed, least=0), 1))  # not that of data
         self._noise = Noise(int(own.generate_state(1)[0]))
-        self._together = Layout(model).is_vectorised
+        self._together = CompiledModel(model).is_vectorised
         self._seen, self._rows, self._size = seen, seen.rows, seen.rows * self.n
         if self._size * seen.steps > MOST:
             said = f"{seen.rows} units of {seen.steps} instants with {self.n} draws are too many"
@@ -320,7 +326,8 @@ class _Abduction:
             except ModelError:
                 if source.parents():
                     raise
-                log = np.zeros(self._size)
+                inside = getattr(source, "contains", lambda _: True)
+                log = np.array([0.0 if inside(each) else -np.inf for each in value])
             # without causes the density is the same for all draws
             return Found(value, log if source.parents() else np.where(np.isfinite(log), 0.0, log))
         parents: list[Value] = []
@@ -334,11 +341,13 @@ class _Abduction:
             function: Any, parents: list[Value], noise: Values, shape: tuple[int, ...]
         ) -> Value:
             def called(key: NoiseKey, parents: Mapping[Any, Value], noise: Values) -> Value:
-                try:
-                    with np.errstate(all="ignore"):
-                        return np.asarray(function(*parents.values(), **noise), dtype=float)
-                except (ArithmeticError, ValueError):  # not defined there, as the logarithm of 0
-                    return np.full(shape if key.count is None else (key.count, *shape), np.nan)
+                whole = shape if key.count is None else (key.count, *shape)
+                with blamed(f"a function of {name!r}"), np.errstate(all="ignore"):
+                    try:
+                        found = np.asarray(function(*parents.values(), **noise), dtype=float)
+                    except (ArithmeticError, ValueError):  # not defined, as the logarithm of 0
+                        found = np.array(np.nan)
+                    return np.broadcast_to(found, whole)
 
             return self._each(called, step, {}, dict(enumerate(parents)), noise)
 

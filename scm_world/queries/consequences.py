@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import nullcontext
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
 from scm_world._arguments import one_of, whole_number
 from scm_world._types import Value
-from scm_world.policies.scripted import as_policy
+from scm_world.errors import UnknownOption
 from scm_world.queries.experiments.effects import gap
-from scm_world.queries.questions import SCM
-from scm_world.queries.twins import asked
+from scm_world.queries.questions import SCM, Questions
 from scm_world.queries.world import World
 from scm_world.variables.kinds import SPACES, SpaceName
 
@@ -99,7 +98,7 @@ def consequences(
 ) -> Consequences:
     """Intervene at the start of an episode, and compare it with the same one without that.
 
-    The idle action is taken in both; noise is the same. A world is afterwards as it was.
+    The idle action is taken in both; noise is the same. The system itself is left alone.
 
     Args:
         system: A world, or equations.
@@ -118,50 +117,39 @@ def consequences(
         ((), True)
     """
     one_of("space", space, (None, *SPACES))
-    stepped: Any = asked(system)[1]
-    steps = whole_number("steps", steps, least=0) if system.graph.is_temporal else 0
-    with system.unchanged() if isinstance(system, World) else nullcontext():
-        return _compared(stepped, request, steps, seed, space)
-
-
-def _compared(
-    stepped: Any, request: Mapping[str, Any], steps: int, seed: int, space: SpaceName | None
-) -> Consequences:
-    """Run both episodes in one system, from one snapshot."""
-    is_world = isinstance(stepped, World)
-    stepped.reset(seed=seed)
-    start, before = stepped.snapshot(), stepped.values()
-    scenes = [stepped.scene()] if is_world else []
-    action = as_policy(None, stepped)(stepped)
-    audit = stepped.do(request, space=space) if is_world else stepped.do(request)
-    right_after, models = stepped.values(), [stepped.model]
-    for _ in range(steps):
-        stepped.step(action)
-    after = stepped.values()
-    scenes += [stepped.scene()] if is_world else []
-    stepped.restore(start)
-    for _ in range(steps):
-        stepped.step(action)
-    without = stepped.values()
-    models.append(stepped.model)
-    targets = {models[0].target(name) for name in audit.targets}
+    if not isinstance(system, Questions):
+        raise UnknownOption("system", system, ("a World", "an SCM"))
+    given: Any = system
+    steps = whole_number("steps", steps, least=0) if given.graph.is_temporal else 0
+    with closing(given.live(seed=seed)) as plain, closing(plain.split()) as other:
+        world, before = other.world, plain.world.values()
+        is_world = isinstance(given, World)
+        scenes = [world.scene()] if is_world else []
+        audit = world.do(request, **({"space": space} if is_world else {}))
+        right_after, model = world.values(), plain.world.model
+        for _ in range(steps):
+            other.step(plain.step())
+        after, without = world.values(), plain.world.values()
+        scenes += [world.scene()] if is_world else []
+        engine = world.engine if is_world else ""
+    targets = {model.target(name) for name in audit.targets}
     follow = {
         name
-        for model in models  # the intervention may change which bodies there are
-        for target in targets & {*model}
-        for name in model.descendants(target)
+        for one in (model, world.model)  # the intervention may change which bodies there are
+        for target in targets & {*one}
+        for name in one.descendants(target)
     }
     rows: dict[str, Consequence] = {}
-    for name in models[1]:
-        if any(name not in found for found in (before, right_after, after, without)):
+    for name in model:
+        if any(name not in found for found in (right_after, after)):
             continue
         if name in targets and name not in follow:
             continue
         difference = gap(after[name], without[name])
         moved = difference > 0.0 or gap(right_after[name], before[name]) > 0.0
-        variable = models[1].declared(name)
+        variable = model.declared(name)
         if variable.dtype == "categorical":
             difference = float(difference > 0.0)
         values = before[name], right_after[name], after[name], without[name]
         rows[name] = Consequence(variable.unit, name in follow, moved, *values, difference)
-    return Consequences(audit, steps, rows, tuple(scenes), stepped.engine if is_world else "")
+    return Consequences(audit, steps, rows, tuple(scenes), engine)

@@ -12,9 +12,8 @@ import numpy as np
 from scm_world._arguments import real_number, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.queries.episodes import Episode
+from scm_world.queries.episodes import Episode, as_names
 from scm_world.queries.outcomes import Outcome, as_outcome, is_category, read
-from scm_world.queries.rollouts import as_names
 from scm_world.variables import Natural
 
 
@@ -113,7 +112,7 @@ def _divergence(first: Episode, second: Episode, name: str, tolerance: float) ->
     one, other = np.asarray(first[name], float), np.asarray(second[name], float)
     if one.shape != other.shape:
         return Divergence(0, float("inf"), 0, np.asarray(np.inf))
-    if any(is_category(world, Outcome(name)) for _, world in first.trace.declarations):
+    if any(is_category(world, Outcome(name)) for _, world in first.declarations):
         one, other = (one != other).astype(float), np.zeros_like(one)
     sizes = np.abs(one - other).reshape(len(one), -1).max(axis=1, initial=0.0)
     differs, at = sizes > tolerance, int(np.argmax(sizes))
@@ -186,7 +185,7 @@ def but_for(
     if isinstance(over, Mapping):
         contrasts = dict(over)
     else:
-        done = dict.fromkeys(name for start, plan in episode.layers if start <= at for name in plan)
+        done = episode.plan
         contrasts = dict.fromkeys(done if over is None else as_names(over), Natural())
         for name in contrasts:
             if name not in done:

@@ -25,16 +25,15 @@ from scm_world.graph import SCM, from_dict, to_dict
 from scm_world.output.durable import write_durably
 from scm_world.output.reading import read_arrays
 from scm_world.policies.scripted import Sequence as Given
-from scm_world.queries.episodes import Episode
+from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.plans import Plan, Schedule
-from scm_world.queries.rollouts import Trace, Unit
-from scm_world.queries.twins import AnyTwins, EquationTwins, Twins, twins_of
+from scm_world.queries.plans import Plan
+from scm_world.queries.twins import Twins, asked
 from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.variables import Subset
 from scm_world.world import Simulation
 
-FORMAT = "scm_world/episode/3"
+FORMAT = "scm_world/episode/4"
 _ADVICE = "give a file that save_episode wrote"
 
 
@@ -65,41 +64,25 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
 
 
 def _about(episode: Episode) -> dict[str, Any]:
-    return {
-        "format": FORMAT,
-        **(_equations if isinstance(episode.twins, EquationTwins) else _world)(episode.twins),
-        "seed": episode.seed,
-        "number": episode.number,
-        "layers": [[start, plan.as_dict()] for start, plan in episode.layers],
-        "instants": _hashes(episode.trace),
-    }
+    with episode.twins.twin() as twin:
+        is_world = isinstance(twin, Simulation)
+        return {
+            "format": FORMAT,
+            "fingerprint": fingerprint(twin if is_world else twin.model, libraries=False),
+            **(_world(episode.twins) if is_world else {"equations": _written(twin.model)}),
+            "seed": episode.seed,
+            "number": episode.number,
+            "plan": episode.plan.as_dict(),
+            "instants": _hashes(episode),
+            "versions": versions(twin.engine if is_world else ""),
+        }
 
 
 def _world(twins: Twins) -> dict[str, Any]:
     task, options = twins.task, dict(twins.options)
     if isinstance(options.get("variables_space"), Subset):
         options["variables_space"] = options["variables_space"].model_dump(mode="json")
-    with twins.twin() as world:
-        engine = world.engine
-        system = fingerprint(world, libraries=False)
-    return {
-        "fingerprint": system,
-        "task": task.name,
-        "arguments": _arguments(task),
-        "options": options,
-        "versions": versions(engine),
-    }
-
-
-def _equations(twins: EquationTwins) -> dict[str, Any]:
-    return {
-        "fingerprint": fingerprint(twins.layout.model, libraries=False),
-        "task": None,
-        "arguments": None,
-        "equations": _written(twins.layout.model),
-        "options": {},
-        "versions": versions(),
-    }
+    return {"task": task.name, "arguments": _arguments(task), "options": options}
 
 
 def _written(model: SCM) -> dict[str, Any] | None:
@@ -111,28 +94,25 @@ def _written(model: SCM) -> dict[str, Any] | None:
 
 
 def _arguments(task: Task) -> dict[str, Any] | None:
-    """Write down what a task was made with; None where it can only be given again as a world.
-
-    Raises:
-        ModelError: It is a registered task, and what it was made with cannot be written.
-    """
+    """Write down what a task was made with; None where it can only be given again as a world."""
     registered = task.name in tasks()
     problem = f"give the arguments of {task.name!r} by name, so that they can be saved"
     if task.is_named:
         try:
-            found: dict[str, Any] = json.loads(json.dumps(_plain(task.given), allow_nan=False))
+            written = json.dumps(task.given, allow_nan=False, default=lambda value: value.tolist())
+            found: dict[str, Any] = json.loads(written)
             return found
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, AttributeError) as error:
             problem = f"an argument of {task.name!r} cannot be written: {error}"
     if registered:
         raise ModelError([problem])
     return None
 
 
-def _hashes(trace: Trace) -> list[str]:
+def _hashes(episode: Episode) -> list[str]:
     """Sum up the state of each instant, and the parameters that are others than before."""
-    statics, last, found = dict(trace.statics), dict[str, Any](), list[str]()
-    for step, vector in enumerate(trace.vectors):
+    statics, last, found = dict(episode.statics), dict[str, Any](), list[str]()
+    for step, vector in enumerate(episode.vectors):
         mark = hashlib.blake2b(vector.tobytes(), digest_size=8)
         now = statics.get(step, last)
         for name in sorted(now):
@@ -141,14 +121,6 @@ def _hashes(trace: Trace) -> list[str]:
         last = now
         found.append(mark.hexdigest())
     return found
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(part) for key, part in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(part) for part in value]
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
 def load_episode(
@@ -177,14 +149,12 @@ def load_episode(
         if about["format"] != FORMAT:
             raise UnreadableFile(str(file), f"its format is {about['format']!r}", _ADVICE)
         twins = _twins(about, world, file, trusted)
-        schedule = Schedule(
-            (int(start), Plan.from_dict(plan, trusted=trusted)) for start, plan in about["layers"]
-        )
+        plan = Plan.from_dict(about["plan"], trusted=trusted)
         given = Given(list(actions))
-        unit = Unit(about["seed"], about["number"], schedule, given, len(actions))
+        unit = Unit(about["seed"], about["number"], plan, given, len(actions))
         with twins.twin() as twin:
-            trace = unit.run(twin)
-        pairs = enumerate(zip(_hashes(trace), about["instants"], strict=True))
+            episode = unit.run(twin, twins)
+        pairs = enumerate(zip(_hashes(episode), about["instants"], strict=True))
         other = next((step for step, (now, then) in pairs if now != then), None)
         made = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
     except DAMAGED as error:
@@ -194,35 +164,28 @@ def load_episode(
     if other is not None:
         said = f"{file} happens otherwise from control step {other} on; it was made with {made}"
         raise SnapshotMismatch(said)
-    return Episode(twins, unit, trace)
+    return episode
 
 
 def _twins(
     about: dict[str, Any], world: Simulation | SCM | None, file: Path, trusted: Sequence[str]
-) -> AnyTwins:
-    """Return where the episode is run again.
-
-    Raises:
-        SnapshotMismatch: The world or model that is given is another one.
-    """
-    if "equations" in about:
-        written = about["equations"]
-        if world is None and written is None:
+) -> Twins:
+    """Return where the episode is run again; refuse a world or a model that is another one."""
+    kind, system = (SCM, world) if "equations" in about else (Simulation, world)
+    if world is None and kind is Simulation:
+        system = _made(about)
+    elif world is None:
+        if about["equations"] is None:
             problem = f"{file} holds no model, since a function of it has no name"
             raise ModelError([f"{problem}; pass it: load_episode(path, world=model)"])
-        system: Any = from_dict(written, trusted=trusted) if world is None else world
-        is_kind = isinstance(system, SCM)
-    else:
-        system = _made(about) if world is None else world
-        is_kind = isinstance(system, Simulation)
-    now = fingerprint(system, libraries=False) if is_kind else {}
-    changed = differing(about["fingerprint"], now) if is_kind else ["kinds of system"]
+        system = from_dict(about["equations"], trusted=trusted)
+    changed = ["kinds of system"]
+    if isinstance(system, kind):
+        changed = differing(about["fingerprint"], fingerprint(system, libraries=False))
     if changed:
         problem = f"{file} happened in another system, or one that was changed since"
         raise SnapshotMismatch(f"{problem}: {', '.join(changed)} differ")
-    if isinstance(system, SCM):
-        return EquationTwins(system)
-    return twins_of(world) if isinstance(world, Simulation) else Twins(system)
+    return asked(system)[0]
 
 
 def _made(about: dict[str, Any]) -> Simulation:

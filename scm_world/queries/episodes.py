@@ -1,93 +1,446 @@
-"""Recorded episodes and their counterfactuals."""
+"""Episodes: how they run, what they record, and their counterfactuals."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
-from typing import Any, final
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from typing import Any, Self, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import real_numbers, whole_number
 from scm_world._types import Floats, Value
-from scm_world.errors import UnknownOption, UnknownVariable
+from scm_world.backends.base import ContactPoint
+from scm_world.errors import (
+    ActionError,
+    InterventionError,
+    UnknownOption,
+    UnknownVariable,
+    blamed,
+)
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Scene
+from scm_world.policies.scripted import Policy, as_policy
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.equations import System
-from scm_world.queries.parallel import Result, run_units
-from scm_world.queries.plans import Layer, Plan, Schedule
-from scm_world.queries.rollouts import (
-    ALL,
-    EVERY,
-    Running,
-    Trace,
-    Unit,
-    as_names,
-    run,
-)
-from scm_world.queries.twins import AnyTwins, EquationTwins
-from scm_world.world import Audit
+from scm_world.queries.local import contacts_of
+from scm_world.queries.plans import Key, Plan, at_once
+from scm_world.variables import Draw, Natural
+from scm_world.world import Audit, Simulation
+
+EVERY = 10
+"""Control steps from one snapshot to the next."""
+
+ALL = "*"
+"""Stands for every variable."""
+
+Pairs = frozenset[tuple[str, str]]
+"""Pairs of bodies."""
+
+
+def as_names(record: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of variables; a text is one name."""
+    if not isinstance(record, Iterable):
+        raise UnknownOption("names", record, ("a name", "names of variables"))
+    return (record,) if isinstance(record, str) else tuple(record)
 
 
 @final
-class Episode:
-    """One unit of the world: its noise, its interventions and its states.
-
-    Replays and counterfactuals are bit-identical.
-
-    Args:
-        twins: Twins of the world that it happened in.
-        unit: What was run.
-        trace: What was recorded.
+@dataclass(frozen=True)
+class Unit:
+    """An episode to run: everything that decides its outcome.
 
     Attributes:
         seed: Of the noise.
         number: Of the episode within that noise.
-        schedule: Plans, each with the control step from which it counts.
-        steps: How many control steps it has.
+        plan: What is done, and when.
+        policy: Who acts; see ``rollout``.
+        steps: How many control steps the episode has.
+        names: Variables to record at every instant; ``ALL`` for all.
+        first: The control step from which it continues; 0 for a new episode.
+        past: What was before that; None for a new episode.
+        start: The world at that instant, before anything is done then; None for a new episode.
+        contacts: Whether to record which bodies touch, where there are bodies.
+        listens: Whether to do so in each physics step, which is slower.
     """
 
-    def __init__(self, twins: AnyTwins, unit: Unit, trace: Trace) -> None:
-        self.twins: Any = twins
-        self.seed, self.number = unit.seed, unit.number
-        self.schedule: Any = unit.schedule
-        self.steps = unit.steps
-        self.trace = trace
-        self._all: Trace | None = None
+    seed: int
+    number: int
+    plan: Plan
+    policy: Any
+    steps: int
+    names: tuple[str, ...] = ()
+    first: int = 0
+    past: Any = None
+    start: Any = None
+    contacts: bool = False
+    listens: bool = False
+
+    def run(self, world: System, twins: Any = None) -> Episode:
+        """Run it in a twin; questions to the episode run on ``twins``."""
+        episode = Episode.of(twins, self, world)
+        episode.begin()
+        run(episode, self.first, self.steps)
+        return episode.ended()
+
+    def result(self, world: System, twins: Any = None) -> Episode | Exception:
+        """Run it in a twin; return the episode, or the exception that stopped it."""
+        try:
+            return self.run(world, twins)
+        except Exception as error:
+            return error
+
+
+def run(running: Any, first: int, steps: int) -> None:
+    """Run one or several episodes from an instant to another: the only rollout loop of queries.
+
+    They are at the instant ``first``, after what is done then, and recorded up to it.
+    """
+    for step in range(first, steps + 1):
+        if first < step < steps:
+            running.intervene(step)
+        running.record(step)
+        if step < steps:
+            running.act(step)
+
+
+@final
+@dataclass(eq=False, repr=False)
+class Episode:
+    """One unit of a system: its noise, its interventions and its states.
+
+    ``world.rollout`` returns one that is over. ``world.live`` returns one that is under way: it is
+    run by hand with ``step`` and ``do``, on a twin of the world, and ``split`` branches it.
+    Replays and counterfactuals are bit-identical.
+
+    Attributes:
+        twins: Twins of the system that it happens in.
+        unit: What is run.
+        world: The twin at the present instant, while the episode is under way; change it through
+            the episode only.
+        vectors: State of each instant, after what was done then.
+        statics: From when which values of parameters held.
+        declarations: From when which structure there was.
+        taken: What the policy asked for, shape (n_actions,) each.
+        snapshots: Of some instants, after what was done then.
+        fired: When events happened.
+        audits: What interventions did, by control step.
+        values: Of the variables that were asked for, at each instant.
+        touching: Pairs of bodies that touch at each instant, where asked for.
+        touched: Pairs that touched in any physics step of each control step, where asked for.
+
+    Example:
+        >>> from scm_world.queries import World
+        >>> live = World("pushing", backend="fake").live("random", seed=1)
+        >>> print(live.do({"joint_damping": 0.05}))
+        joint_damping = 0.05, engine reports 0.05
+        >>> for _ in range(3):
+        ...     action = live.step()
+        >>> twin = live.split({"floor_friction": 0.4}, at=1)
+        >>> twin.steps, [*twin.held]
+        (1, ['joint_damping', 'floor_friction'])
+        >>> live.episode().counterfactual({}) == live.episode()
+        True
+    """
+
+    twins: Any
+    unit: Unit
+    world: Any = None
+    vectors: list[Floats] = field(default_factory=list)
+    statics: list[tuple[int, dict[str, Value]]] = field(default_factory=list)
+    declarations: list[tuple[int, Any]] = field(default_factory=list)
+    taken: list[Floats] = field(default_factory=list)
+    snapshots: dict[int, Any] = field(default_factory=dict)
+    fired: dict[Key, int] = field(default_factory=dict)
+    audits: dict[int, Audit] = field(default_factory=dict)
+    values: dict[str, list[Value]] = field(default_factory=dict)
+    touching: list[Pairs] = field(default_factory=list)
+    touched: list[Pairs] = field(default_factory=list)
+    _policy: Any = field(default=None, init=False)
+    _version: int = field(default=-1, init=False)
+    _lease: ExitStack = field(default_factory=ExitStack, init=False)
+    _arrival: Floats | None = field(default=None, init=False)  # the present, before what is done
+    _settled: Plan = field(default=Plan(), init=False)  # without what is done at the present
+    _all: Episode | None = field(default=None, init=False)
+
+    @classmethod
+    def of(cls, twins: Any, unit: Unit, world: System) -> Self:
+        """Return an episode under way in a world, with the past of its unit."""
+        made = cls(twins, unit) if unit.past is None else unit.past.until(unit.first)
+        made.twins, made.unit, made.world = twins, unit, world
+        made.policy, made._settled = unit.policy, unit.plan
+        return made
+
+    @classmethod
+    def live(cls, twins: Any, unit: Unit) -> Self:
+        """Return an episode under way in a twin that it has until ``close``."""
+        with ExitStack() as lease:
+            world = lease.enter_context(twins.twin())
+            made = cls.of(twins, replace(unit, steps=sys.maxsize), world)
+            made._lease = lease.pop_all()
+        return made
+
+    def until(self, step: int) -> Self:
+        """Copy what was before an instant, for an episode that differs from there on."""
+        return replace(
+            self,
+            world=None,
+            vectors=self.vectors[:step],
+            statics=[pair for pair in self.statics if pair[0] < step],
+            declarations=[pair for pair in self.declarations if pair[0] < step],
+            taken=self.taken[:step],
+            snapshots={at: kept for at, kept in self.snapshots.items() if at < step},
+            fired={key: at for key, at in self.fired.items() if at < step},
+            audits={at: audit for at, audit in self.audits.items() if at < step},
+            values={name: values[:step] for name, values in self.values.items()},
+            touching=[],
+            touched=[],
+        )
+
+    # --- under way ----------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Go to the first instant and do what is due then."""
+        if self.unit.start is None:
+            self.world.reset(seed=self.unit.seed, episode=self.unit.number)
+        else:
+            self.world.restore(self.unit.start)
+        self.intervene(self.unit.first)
+
+    def intervene(self, step: int) -> None:
+        """Do what is due at an instant."""
+        due = self.unit.plan.due(self.world, step, self.fired)
+        if due:
+            self.audits[step] = self.world.do(due)
+
+    def record(self, step: int) -> None:
+        """Record an instant, and of some a snapshot."""
+        self.note(step)
+        if step % EVERY == 0 and step < self.unit.steps:
+            self.snapshots[step] = self.world.snapshot()
+
+    def note(self, step: int) -> None:
+        """Record the state, what else was asked for, and parameters that have changed."""
+        world, names = self.world, self.unit.names
+        if world.version != self._version:
+            self._version = world.version
+            now = world.row if world.static_names else {}
+            self.statics.append((step, {name: np.array(now[name]) for name in world.static_names}))
+            if not self.declarations or self.declarations[-1][1].plan != world.compiled.plan:
+                self.declarations.append((step, world.compiled))
+        self.vectors.append(world.vector.copy())
+        if names:
+            there = tuple(name for name in names if name in world.model)
+            found = world.values() if names == (ALL,) else world.evaluate(there)
+            for name in found if names == (ALL,) else there:
+                self.values.setdefault(name, []).append(np.array(found[name]))
+        if self.unit.contacts and isinstance(world, Simulation):
+            self.touching.append(_pairs(c for c in world.backend.contacts() if c.force > 0.0))
+
+    def act(self, step: int, action: Any = None) -> None:
+        """Take a control step, with the action of the policy if none is given."""
+        policy = self.policy if action is None else lambda _: action
+        chosen = _chosen(policy, self.world)
+        if self.unit.listens and isinstance(self.world, Simulation):
+            steps = contacts_of(self.world, chosen)
+            self.touched.append(_pairs(contact for step in steps for contact in step))
+        else:
+            self.world.step(chosen)
+        self.taken.append(chosen)
+
+    def ended(self) -> Self:
+        """Leave the world; the episode is over."""
+        self.world = self._policy = None
+        return self
+
+    # --- by hand ------------------------------------------------------------------------------
+
+    def _under_way(self) -> Any:
+        if self.world is None:
+            raise UnknownOption("episode", "one that is over", ("one that world.live() began",))
+        return self.world
+
+    @property
+    def policy(self) -> Any:
+        """What acts in an episode under way; see ``rollout``. It can be replaced at any time."""
+        return self._policy
+
+    @policy.setter
+    def policy(self, given: Any) -> None:
+        self._policy = as_policy(given, self.world)
+
+    @property
+    def held(self) -> dict[str, Any]:
+        """What is in force now: interventions that hold a variable, and open windows, by name."""
+        step, world = self.steps, self._under_way()
+        found = dict(world.graph.interventions)
+        for name, acts in self.plan.items():
+            held = [act for act in acts if act.time is not None and act.time.holds(step)]
+            found.update({name: held[-1]} if held else {})
+        return found
+
+    def do(self, request: Mapping[str, Any]) -> Audit | None:
+        """Intervene at the present instant of an episode under way; see ``World.do``.
+
+        Args:
+            request: By variable, a value, an intervention, or one with a time from now on, such as
+                ``Hard(0.3, during=(5, 10))``. The numbers are control steps of the episode.
+
+        Returns:
+            What it did; None if nothing is done before a later control step.
+
+        Raises:
+            InterventionError: The request was refused; nothing has changed.
+        """
+        world, step = self._under_way(), self.steps
+        model = world.model
+        more = Plan().then(request, model, at=step)
+        due = more.due(world, step, {})
+        audit = world.do(due) if due else None
+        if audit is not None:
+            self.audits[step] = audit
+            drawn = {name: one.requested for name, one in audit.targets.items()}
+            parts = {  # the world has given each draw at one instant a noise of its own
+                name: tuple(_drawn(act, due.get(name), drawn.get(name)) for act in acts)
+                for name, acts in more.items()
+            }
+            more = Plan.of(parts)
+        self.unit = replace(self.unit, plan=self.plan.then(more, model, at=step, done=True))
+        return audit
+
+    def step(self, action: Any = None) -> Floats:
+        """Take a control step, and do what is due at the instant that it leads to.
+
+        Args:
+            action: Shape (n_actions,); that of the policy if None.
+
+        Returns:
+            The action that was asked for.
+
+        Raises:
+            ActionError: It is no action; nothing has changed.
+            EngineFailure: The backend lost the state; begin another episode.
+            InterventionError: What was due at that instant was refused. The step is taken, and the
+                variables that it concerned are released.
+        """
+        world, step = self._under_way(), self.steps
+        try:
+            self.record(step)
+            self.act(step, action)
+        except Exception:
+            before = self.until(step)
+            self.vectors, self.values, self._version = before.vectors, before.values, -1
+            self.statics, self.declarations = before.statics, before.declarations
+            raise
+        self._arrival, self._settled = world.vector.copy(), self.plan
+        try:
+            self.intervene(step + 1)
+        except InterventionError:
+            due = self.plan.due(world, step + 1, dict(self.fired))
+            self.do({str(name): Natural() for name in due})
+            raise
+        return self.taken[-1]
+
+    def split(self, do: Mapping[str, Any] | None = None, *, at: int | None = None) -> Self:
+        """Return a counterfactual twin of an episode under way: the same noise, past and plan.
+
+        Stepped with the same actions, it goes as ``episode().counterfactual(do, at=at)``.
+
+        Args:
+            do: The intervention; without a time it takes place at that instant.
+            at: Number of the control step; the present one if None.
+
+        Raises:
+            InterventionError: The intervention was refused.
+            UnknownOption: There is no such control step.
+        """
+        now, last = self._under_way(), self.steps
+        place = last if at is None else _instant(at, last)
+        other = self.live(self.twins, replace(self.unit, first=place, past=self))
+        other.policy, world = self.policy, other.world
+        try:
+            if place == last:
+                world.restore(now.snapshot())
+                other._arrival, other._settled = self._arrival, self._settled
+                other.audits, other.fired = dict(self.audits), dict(self.fired)
+                if do:
+                    other.do(do)
+            else:
+                self.episode()._arrive(world, place)
+                other._arrival = world.vector.copy() if place else None
+                plan = self.plan.then(do, world.model, at=place)
+                other.unit = replace(other.unit, plan=plan)
+                other.intervene(place)
+        except BaseException:
+            other.close()
+            raise
+        return other
+
+    def episode(self) -> Self:
+        """Return what has happened so far, without what was done at the present instant.
+
+        Raises:
+            UnknownOption: No control step has been taken.
+        """
+        if self.world is None:
+            return self
+        if self._arrival is None:
+            raise UnknownOption("number of steps", 0, ("1 or more: call step() first",))
+        found = self.until(self.steps).ended()
+        found.vectors.append(self._arrival)
+        found.unit = replace(
+            self.unit,
+            plan=self._settled,
+            policy=Given(found.taken),
+            steps=self.steps,
+            first=0,
+            past=None,
+        )
+        return found
+
+    def close(self) -> None:
+        """Give the twin back. The episode can still be read; closing twice is harmless."""
+        self._lease.close()
 
     # --- reading ------------------------------------------------------------------------------
 
     @property
-    def layers(self) -> tuple[Layer, ...]:
-        """Plans, each with the control step from which it counts."""
-        return tuple(self.schedule.layers)
+    def seed(self) -> int:
+        """The seed of the noise."""
+        return self.unit.seed
+
+    @property
+    def number(self) -> int:
+        """The number of the episode within that noise."""
+        return self.unit.number
 
     @property
     def plan(self) -> Plan:
-        """What was done from the beginning."""
-        return self.layers[0][1] if self.layers else Plan()
+        """What was done, and when."""
+        return self.unit.plan
+
+    @property
+    def steps(self) -> int:
+        """How many control steps are over."""
+        return len(self.taken)
 
     @property
     def actions(self) -> Floats:
         """What the policy asked for, shape (steps, n_actions)."""
-        n = self.trace.declarations[0][1].n_actions
-        return np.array(self.trace.actions).reshape(self.steps, n)
-
-    @property
-    def audits(self) -> Mapping[int, Audit]:
-        """What each intervention did, by control step."""
-        return dict(self.trace.audits)
+        compiled = self.declarations[0][1] if self.declarations else self.world.compiled
+        return np.array(self.taken).reshape(self.steps, compiled.n_actions)
 
     @property
     def events(self) -> Mapping[str, int]:
         """At which control step events happened that variables waited for, by variable."""
-        return {name: step for (_, name, _), step in self.trace.fired.items()}
+        return {name: step for (name, *_), step in self.fired.items()}
 
     @property
     def names(self) -> tuple[str, ...]:
         """All variables of the structure at the end."""
-        return tuple(self.trace.declarations[-1][1].model)
+        return tuple(self.declarations[-1][1].model)
 
     def __len__(self) -> int:
         return self.steps
@@ -97,47 +450,56 @@ class Episode:
 
         Instant t is the one at which the action of step t is chosen, after what was done then; the
         last one is the end. What is not there at every instant, since bodies came or went, is
-        given as far as it is there.
+        given as far as it is there. An episode under way has the instants before the present.
 
         Raises:
             UnknownVariable: No variable has this name.
         """
-        if name in self.trace.values:
-            return np.array(self.trace.values[name])
-        declarations = self.trace.declarations
-        if len(declarations) == 1 and name in declarations[0][1].slices:
-            return np.asarray(declarations[0][1].read(name, np.array(self.trace.vectors)))
-        if all(name in values for _, values in self.trace.statics):
-            return self._parameter(name)
-        if not any(name in declaration.model for _, declaration in declarations):
+        if name in self.values:
+            return np.array(self.values[name])
+        compiled = [declaration for _, declaration in self.declarations]
+        if len(compiled) == 1 and name in compiled[0].slices:
+            return np.asarray(compiled[0].read(name, np.array(self.vectors)))
+        if all(name in values for _, values in self.statics):
+            steps = [step for step, _ in self.statics] + [len(self.vectors)]
+            return np.repeat([values[name] for _, values in self.statics], np.diff(steps), axis=0)
+        if not any(name in declaration.model for declaration in compiled):
             raise UnknownVariable(name, self.names)
         return np.array(self.replay().values[name])
-
-    def _parameter(self, name: str) -> Value:
-        steps = [step for step, _ in self.trace.statics] + [self.steps + 1]
-        lengths = np.diff(steps)
-        return np.repeat([values[name] for _, values in self.trace.statics], lengths, axis=0)
 
     def final(self, name: str) -> Value:
         """Give a variable at the end; see ``__getitem__``."""
         return np.asarray(self[name][-1])
 
-    def replay(self) -> Trace:
+    def replay(self) -> Self:
         """Replay the episode, and record every variable and every contact."""
         if self._all is None:
+            unit = replace(self._again(), names=(ALL,), contacts=True)
             with self.twins.twin() as world:
-                self._all = replace(self._again(), names=(ALL,), contacts=True).run(world)
+                self._all = unit.run(world, self.twins)
         return self._all
 
     def __eq__(self, other: object) -> bool:
         """Tell whether all states, parameters and actions are the same, bit for bit."""
-        return isinstance(other, Episode) and _same(self.trace, other.trace)
+        if not isinstance(other, Episode) or len(self.vectors) != len(other.vectors):
+            return False
+        pairs = zip((*self.vectors, *self.taken), (*other.vectors, *other.taken), strict=True)
+        if not all(a.tobytes() == b.tobytes() for a, b in pairs):
+            return False
+        return all(
+            mine.keys() == its.keys() and all(np.array_equal(mine[n], its[n]) for n in mine)
+            for step in range(len(self.vectors))
+            for mine, its in [(self._parameters(step), other._parameters(step))]
+            if mine is not its
+        )
 
     __hash__ = None  # type: ignore[assignment] # compared by content
 
     def __repr__(self) -> str:
-        held = ", ".join(f"{name} from {at}" for at, plan in self.layers for name in plan)
-        return f"Episode({self.steps} steps, seed {self.seed}, number {self.number}, do({held}))"
+        return f"Episode({self.steps} steps, seed {self.seed}, number {self.number}, {self.plan})"
+
+    def _parameters(self, step: int) -> dict[str, Value]:
+        return next(values for at, values in reversed(self.statics) if at <= step)
 
     def scene(self, step: int) -> tuple[Scene, tuple[Camera, ...]]:
         """Describe an instant of a world for pictures, without running it again.
@@ -153,14 +515,13 @@ class Episode:
         """
         if whole_number("step", step, least=0) > self.steps:
             raise UnknownOption("step", step, (f"0 to {self.steps}",))
-        if isinstance(self.twins, EquationTwins):
+        compiled = next(c for at, c in reversed(self.declarations) if at <= step)
+        if not hasattr(compiled, "describe"):
             raise UnknownOption("picture", "an episode of equations", ("one of a world",))
-        values = _at(self.trace, step)
-        compiled = next(c for at, c in reversed(self.trace.declarations) if at <= step)
-        state = compiled.empty_state(np.array(self.trace.vectors[step]))
+        values, state = self._parameters(step), compiled.empty_state(np.array(self.vectors[step]))
         return compiled.describe(values, state), compiled.composition.cameras(values)
 
-    # --- counterfactuals -----------------------------------------------------------------
+    # --- counterfactuals ----------------------------------------------------------------------
 
     def counterfactual(
         self,
@@ -169,7 +530,7 @@ class Episode:
         at: int = 0,
         actions: Any = "replay",
         record: Iterable[str] = (),
-    ) -> Episode:
+    ) -> Self:
         """Restore an instant, intervene, and continue with the same noise.
 
         Args:
@@ -185,69 +546,7 @@ class Episode:
             InterventionError: The intervention was refused.
             UnknownOption: There is no such control step.
         """
-        unit = self._unit(do, self._instant(at), actions, as_names(record))
-        with self.twins.twin() as world:
-            trace = unit.run(world, lambda twin: self._arrive(twin, unit.first))
-        return Episode(self.twins, unit, trace)
-
-    def _instant(self, at: Any) -> int:
-        last = max(self.steps - 1, 0)
-        if isinstance(at, bool) or not isinstance(at, int | np.integer) or not 0 <= at <= last:
-            raise UnknownOption("at", at, (f"a control step from 0 to {last}",))
-        return int(at)
-
-    def _unit(
-        self, do: Mapping[str, Any] | None, at: int, actions: Any, names: tuple[str, ...]
-    ) -> Unit:
-        """Return the unit that continues from an instant."""
-        before = [d.model for step, d in self.trace.declarations if step < max(at, 1)]
-        whole = tuple(name for name in names if all(name in model for model in before))
-        past = self.trace.until(at)
-        past.values = {name: list(self[name][:at]) for name in whole}
-        again, is_replay = self._again(), isinstance(actions, str) and actions == "replay"
-        return replace(
-            again,
-            schedule=Schedule([*self.layers, (at, Plan(do))]),
-            policy=again.policy if is_replay else actions,
-            names=whole,
-            first=at,
-            past=past,
-        )
-
-    def _again(self) -> Unit:
-        """Return the unit that repeats this episode."""
-        past = Given(self.trace.actions)
-        return Unit(self.seed, self.number, self.schedule, past, self.steps)
-
-    def _arrive(self, world: System, at: int) -> None:
-        """Bring a twin to an instant, before anything is done then that the past does not know."""
-        if at == 0:
-            world.reset(seed=self.seed, episode=self.number)
-            return
-        near = self._near(world, at)  # snapshots are taken after what was done: an earlier one
-        world.restore(self.trace.snapshots[near])
-        self._go_through(world, near, at)
-
-    def _near(self, world: System, at: int) -> int:
-        """Find the last snapshot before an instant; take those that were not taken on the way."""
-        near = max((step for step in self.trace.snapshots if step < at), default=-1)
-        if near < (at - 1) // EVERY * EVERY:
-            if near < 0:
-                near = 0
-                Running(self._again(), world).begin()
-            else:
-                world.restore(self.trace.snapshots[near])
-            found = self._go_through(world, near, at).snapshots
-            self.trace.snapshots = {**self.trace.snapshots, **found}
-            near = max(step for step in self.trace.snapshots if step < at)
-        return near
-
-    def _go_through(self, world: System, first: int, last: int) -> Trace:
-        """Replay from an instant, after its interventions."""
-        running = Running(replace(self._again(), steps=last), world)
-        running.trace.fired = dict(self.trace.fired)
-        run(running, first, last)
-        return running.trace
+        return self.worlds([{} if do is None else do], at=at, actions=actions, record=record)[0]
 
     def worlds(
         self,
@@ -257,7 +556,7 @@ class Episode:
         actions: Any = "replay",
         record: Iterable[str] = (),
         workers: int | None = None,
-    ) -> tuple[Episode, ...]:
+    ) -> tuple[Self, ...]:
         """Run counterfactuals with the same noise, one for each intervention.
 
         Args:
@@ -267,7 +566,7 @@ class Episode:
             record: Variables to write down on the way.
             workers: Threads, see ``Setting``; the result does not depend on how many.
         """
-        at, names = self._instant(at), as_names(record)
+        at, names = _instant(at, max(self.steps - 1, 0)), as_names(record)
         if not isinstance(dos, Iterable) or isinstance(dos, Mapping):
             raise UnknownOption("dos", dos, ("a list of interventions",))
         given = list(dos)
@@ -278,27 +577,83 @@ class Episode:
                 start = world.snapshot()
         units = [replace(self._unit(do, at, actions, names), start=start) for do in given]
 
-        def finish(place: int, result: Result) -> Episode:
+        def finish(_: int, result: Any) -> Any:
             if isinstance(result, Exception):
                 raise result
-            return Episode(self.twins, units[place], result)
+            return result
 
-        return tuple(run_units(self.twins, units, finish, workers))
+        return tuple(self.twins.run(units, finish, workers))
+
+    def _unit(
+        self, do: Mapping[str, Any] | None, at: int, actions: Any, names: tuple[str, ...]
+    ) -> Unit:
+        """Return the unit that continues from an instant."""
+        before = [d.model for step, d in self.declarations if step < max(at, 1)]
+        whole = tuple(name for name in names if all(name in model for model in before))
+        past = self.until(at)
+        past.values = {name: list(self[name][:at]) for name in whole}
+        again, is_replay = self._again(), isinstance(actions, str) and actions == "replay"
+        return replace(
+            again,
+            plan=self.plan.then(do, before[-1], at=at),
+            policy=again.policy if is_replay else actions,
+            names=whole,
+            first=at,
+            past=past,
+        )
+
+    def _again(self) -> Unit:
+        """Return the unit that repeats this episode."""
+        return Unit(self.seed, self.number, self.plan, Given(self.taken), self.steps)
+
+    def _arrive(self, world: System, at: int) -> None:
+        """Bring a twin to an instant, before anything is done then that the past does not know."""
+        if at == 0:
+            world.reset(seed=self.seed, episode=self.number)
+            return
+        running = Episode.of(None, replace(self._again(), steps=at), world)
+        running.fired = dict(self.fired)
+        near = max((step for step in self.snapshots if step < at), default=None)
+        if near is None:
+            running.begin()
+        else:
+            world.restore(self.snapshots[near])  # it was taken after what was done then
+        run(running, near or 0, at)
+        self.snapshots = {**self.snapshots, **running.snapshots}
 
 
-def _same(one: Trace, other: Trace) -> bool:
-    if len(one.vectors) != len(other.vectors):
-        return False
-    vectors = zip((*one.vectors, *one.actions), (*other.vectors, *other.actions), strict=True)
-    if not all(a.tobytes() == b.tobytes() for a, b in vectors):
-        return False
-    return all(
-        mine.keys() == its.keys() and all(np.array_equal(mine[n], its[n]) for n in mine)
-        for step in range(len(one.vectors))
-        for mine, its in [(_at(one, step), _at(other, step))]
-        if mine is not its
-    )
+def _instant(at: Any, last: int) -> int:
+    if isinstance(at, bool) or not isinstance(at, int | np.integer) or not 0 <= at <= last:
+        raise UnknownOption("at", at, (f"a control step from 0 to {last}",))
+    return int(at)
 
 
-def _at(trace: Trace, step: int) -> dict[str, Value]:
-    return next(values for at, values in reversed(trace.statics) if at <= step)
+def _chosen(policy: Policy, world: System) -> Floats:
+    """Ask a policy for an action; refuse one that does something else to the world."""
+    before = world.version, world.index
+    with blamed(lambda: who(policy, world)):
+        given = policy(world)
+    if (world.version, world.index) != before:
+        raise ActionError("a policy acts through its action only; put the rest into a plan", given)
+    try:
+        return np.array(real_numbers(given))
+    except (TypeError, ValueError):
+        raise ActionError("an action is finite numbers", given) from None
+
+
+def who(policy: Any, world: System) -> str:
+    """Name a policy and the control step in which it is asked."""
+    named = policy if hasattr(policy, "__qualname__") else type(policy)
+    return f"in control step {world.index}, the policy {named.__qualname__!r}"
+
+
+def _pairs(contacts: Iterable[ContactPoint]) -> Pairs:
+    found = (tuple(sorted(contact.bodies)) for contact in contacts)
+    return frozenset((one, other) for one, other in found)
+
+
+def _drawn(act: Any, due: Any, requested: Any) -> Any:
+    """Return a draw with the noise that it had now; any other intervention as it is."""
+    if isinstance(act, Draw) and isinstance(requested, Draw) and at_once(act) == due:
+        return act.model_copy(update={"stream": requested.stream})
+    return act

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import copy
+import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
-from typing import Any, final
+from typing import Any, Self, final
 
+import gymnasium
 import numpy as np
 
 from scm_world._arguments import real_numbers, whole_number
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.variables import Noise
+from scm_world.variables import Draw, Noise
 from scm_world.world import Audit, Simulation
 from scm_world.world.audit import Applied
 from scm_world.world.compiled_task import ActionVector, slices_of
@@ -23,8 +26,8 @@ from scm_world.world.interventions import same
 
 @final
 @dataclass(frozen=True, eq=False)
-class Layout(ActionVector):
-    """Where the variables of a model stand in one row of numbers.
+class CompiledModel(ActionVector):
+    """Where the variables of a model stand in one row of numbers; see ``CompiledTask``.
 
     Attributes:
         model: With the interventions that hold in every episode.
@@ -38,16 +41,10 @@ class Layout(ActionVector):
         """Place of each variable."""
         return slices_of(self.model, self.model)
 
-    @cached_property
-    def size(self) -> int:
-        """How many numbers there are."""
-        return max((where.stop for where in self.slices.values()), default=0)
-
-    def idle(self) -> dict[str, Value]:
-        """Give the value of each action that is nearest to zero."""
-        found = np.clip(np.zeros(self.n_actions), *self.action_bounds)
-        shapes = {name: self.model.declared(name).shape for name in self.actions}
-        return {name: found[where].reshape(shapes[name]) for name, where in self.actions.items()}
+    @property
+    def commanded(self) -> Mapping[str, slice]:
+        """Where each action stands; equations have no bundles of actions."""
+        return self.actions
 
     @cached_property
     def is_vectorised(self) -> bool:
@@ -66,6 +63,12 @@ class Layout(ActionVector):
         except Exception:  # functions may raise anything for a shape that they do not take
             return False
 
+    def split(self, action: Floats) -> dict[str, Value]:
+        """Return the part of each action variable in vectors of all, shape (..., n_actions)."""
+        shapes = {name: self.model.declared(name).shape for name in self.actions}
+        lead = action.shape[:-1]
+        return {n: action[..., at].reshape((*lead, *shapes[n])) for n, at in self.actions.items()}
+
     def read(self, name: str, vectors: Floats) -> Value:
         """Give a variable in many rows, shape (..., size): an array of shape (..., *shape)."""
         variable = self.model.declared(name)
@@ -76,23 +79,8 @@ class Layout(ActionVector):
         return {"model": self.model}
 
 
-@final
-@dataclass(frozen=True)
-class Saved:
-    """An instant of ``Equations``; it decides what follows."""
-
-    models: tuple[SCM, ...]
-    values: Values
-    before: Values
-    action: Values
-    index: int
-    seed: int
-    episode: int
-
-
-@final
 class Equations:
-    """A causal model that is stepped: it has the methods of a ``World`` that queries use.
+    """A causal model that is stepped: it has the methods of a ``Simulation`` that queries use.
 
     Instant 0 of a model with lagged edges is the one that its first step looks back at (see
     ``SCM.begin``); instant t + 1 is drawn with the noise of step t. A model without lagged edges
@@ -103,33 +91,36 @@ class Equations:
     has a leading axis.
 
     Args:
-        layout: Of the model.
+        compiled: The model.
         groups: For each of several episodes the number of its group; those of a group have the
             same interventions. None for one episode.
         vectorised: Whether to solve one episode as a batch of one, so that it has the bits that
-            it has among others; what ``layout`` says if None.
+            it has among others; what ``compiled`` says if None.
     """
 
     static_names: tuple[str, ...] = ()
+    engine = "equations"
 
     def __init__(
         self,
-        layout: Layout,
+        compiled: CompiledModel,
         groups: Sequence[int] | None = None,
         *,
         vectorised: bool | None = None,
     ) -> None:
-        self.compiled, self.model = layout, layout.model
-        vectorised = layout.is_vectorised if vectorised is None else vectorised
+        self.compiled, self.model = compiled, compiled.model
+        vectorised = compiled.is_vectorised if vectorised is None else vectorised
         self._groups = np.zeros(1, dtype=int) if groups is None else np.asarray(groups)
         self._is_one = groups is None
         self._count = len(self._groups) if vectorised else None
-        self.version, self.index = 0, 0
+        self.version, self.index, self.has_begun = 0, 0, False
         self.noise, self.episode = Noise(0), 0
-        self._models: list[SCM] = []
+        self._models: tuple[SCM, ...] = (self.model,)
         self._before: Values = {}
         self._action: Values = {}
+        self._drawn: Mapping[str, int] = {}  # how often, at this instant
         self._solved: dict[str, Value] | None = None
+        self._order: tuple[str, ...] | None = None
 
     # --- what a world reports -------------------------------------------------------------------
 
@@ -143,24 +134,23 @@ class Equations:
         """Upper end of all actions, shape (n_actions,)."""
         return self.compiled.action_bounds[1]
 
+    @property
+    def action_space(self) -> gymnasium.spaces.Box:
+        """The space of actions."""
+        return gymnasium.spaces.Box(self.action_low, self.action_high, dtype=np.float64)
+
+    @property
+    def observation_space(self) -> gymnasium.spaces.Dict:
+        """The space of all variables by name; nothing is clipped."""
+        shapes = {name: self.model.declared(name).shape for name in self.model}
+        box = gymnasium.spaces.Box
+        return gymnasium.spaces.Dict(
+            {name: box(-np.inf, np.inf, shape, np.float64) for name, shape in shapes.items()}
+        )
+
     def idle(self) -> Floats:
         """Give the action that is nearest to zero, shape (n_actions,)."""
         return np.clip(np.zeros(self.compiled.n_actions), *self.compiled.action_bounds)
-
-    def length(self, steps: int | None) -> int:
-        """Check the number of control steps of an episode.
-
-        Raises:
-            ModelError: It is None, and the model has lagged edges.
-            UnknownOption: It is no whole number, or the model has no lagged edges and it is not 0.
-        """
-        if self.model.is_temporal:
-            if steps is None:
-                raise ModelError(["the model has lagged edges: say how many steps an episode has"])
-            return whole_number("steps", steps, least=1)
-        if steps is not None and whole_number("steps", steps, least=0):
-            raise UnknownOption("steps", steps, ("0: the model has no lagged edges",))
-        return 0
 
     @property
     def graph(self) -> SCM:
@@ -194,14 +184,29 @@ class Equations:
 
     # --- what a world does --------------------------------------------------------------------
 
-    def reset(self, *, seed: int, episode: int = 0) -> None:
-        """Begin an episode, or several: ``episode`` is then the number of the first one."""
-        self.noise = Noise(seed)
-        self.episode = whole_number("episode", episode, least=0)
-        self._models = [self.model] * (int(self._groups.max()) + 1)
-        self.index, self._before = 0, {}
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        episode: int = 0,
+        do: Mapping[str, Any] | None = None,
+    ) -> Audit | None:
+        """Begin an episode, or several: ``episode`` is then the number of the first one.
+
+        Without a seed the next episode of the same noise begins; see ``Simulation.reset``.
+        """
+        if seed is not None:
+            self.noise, self.episode = Noise(seed), whole_number("episode", episode, least=0)
+        elif not self.has_begun:
+            self.noise, self.episode = Noise(secrets.randbits(63)), 0
+        else:
+            self.episode += 1
+        self.has_begun = True
+        self._models = (self.model,) * (int(self._groups.max()) + 1)
+        self.index, self._before, self._drawn = 0, {}, {}
         self._action = self._split(self.idle())
         self._changed()
+        return self.do(do) if do else None
 
     def do(self, request: Mapping[Any, Any]) -> Audit:
         """Intervene now.
@@ -215,16 +220,23 @@ class Equations:
         Raises:
             InterventionError: The request was refused; everything is as before.
         """
-        by_group = {0: request} if self._is_one else request
-        models = {group: self._models[group].do(acts) for group, acts in by_group.items()}
-        earlier = self._now() if self._is_one else {}
-        for group, model in models.items():
-            self._models[group] = model
-        self._changed()
         if not self._is_one:
+            models = [
+                model.do(request[group]) if group in request else model
+                for group, model in enumerate(self._models)
+            ]
+            self._models = tuple(models)
+            self._changed()
             return Audit(lambda: ({}, {}, {}, (), (), ()))
-        flat, now = flatten(request), self._now()
-        waiting = self._action if self.model.is_temporal else {}
+        flat, drawn = flatten(request), dict(self._drawn)
+        for name, act in flat.items():
+            if isinstance(act, Draw) and act.stream is None and act.of is None:
+                times = drawn[name] = drawn.get(name, -1) + 1
+                flat[name] = act.model_copy(update={"stream": f"draw {times}"}) if times else act
+        model, earlier = self.graph.do(flat), self._now()
+        self._models, self._drawn = (model,), drawn
+        self._changed()
+        now, waiting = self._now(), self._action if self.model.is_temporal else {}
         targets = {
             name: Applied(name, act, None if name in waiting else self[name], None)
             for name, act in flat.items()
@@ -257,43 +269,33 @@ class Equations:
             now = model.remembered(now, self._before)
         self._before, self._action = now, {name: now[name] for name in self.compiled.actions}
         self.index += 1
-        self._solved = None
+        self._drawn, self._solved = {}, None
 
-    def snapshot(self) -> Saved:
-        """Save everything that decides what follows."""
-        models, noise = tuple(self._models), self.noise
-        return Saved(
-            models, self._now(), self._before, self._action, self.index, noise.seed, self.episode
-        )
+    def snapshot(self) -> Self:
+        """Return a copy of everything that decides what follows."""
+        self._now()
+        return copy.copy(self)
 
-    def restore(self, saved: Any) -> None:
+    def restore(self, snapshot: Any) -> None:
         """Go back to a snapshot, bit for bit.
 
         Raises:
-            SnapshotMismatch: It is none of equations.
+            SnapshotMismatch: It is none of these equations.
         """
-        if not isinstance(saved, Saved):
-            raise SnapshotMismatch(f"{saved!r} is no snapshot of equations")
-        self._models, self._before, self._action = list(saved.models), saved.before, saved.action
-        self.index, self.noise, self.episode = saved.index, Noise(saved.seed), saved.episode
-        self._changed()
-        self._solved = dict(saved.values)
+        if not isinstance(snapshot, Equations) or snapshot.model != self.model:
+            raise SnapshotMismatch(f"{snapshot!r} is no snapshot of these equations")
+        vars(self).update(vars(snapshot), version=self.version + 1)
 
     # --- solving ------------------------------------------------------------------------------
 
     def _changed(self) -> None:
         self.version += 1
-        self._solved = None
-        self._order: tuple[str, ...] | None = None
+        self._solved = self._order = None
 
     def _split(self, action: Floats) -> dict[str, Value]:
         """Give every action variable its part of a vector of all, for each episode."""
-        lead, found = () if self._count is None else (self._count,), dict[str, Value]()
-        for name, where in self.compiled.actions.items():
-            shape = self.model.declared(name).shape
-            part = action[..., where].reshape((*action.shape[:-1], *shape))
-            found[name] = np.broadcast_to(part, (*lead, *shape))
-        return found
+        lead = () if self._count is None else (self._count,)
+        return self.compiled.split(np.broadcast_to(action, (*lead, action.shape[-1])))
 
     def _now(self) -> dict[str, Value]:
         """Solve the present instant, if that has not been done."""
@@ -342,15 +344,14 @@ class Equations:
 
     def _in_order(self) -> tuple[str, ...]:
         """Return an order in which every group can be computed under its interventions."""
+        if self._order is None and len(self._models) == 1:
+            self._order = self.graph.structure.order
         if self._order is None:
-            models = dict.fromkeys(map(id, (self.model, *self._models)))
-            kept = [m for m in (self.model, *self._models) if models.pop(id(m), 0) is None]
-            if len(self._models) == 1:
-                self._order = self._models[0].structure.order
-                return self._order
             sorter: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(self.model, ()))
-            for edge in (edge for model in kept for edge in model.edges if not edge.lag):
-                sorter.add(edge.effect, edge.cause)
+            for model in {id(m): m for m in (self.model, *self._models)}.values():
+                for edge in model.edges:
+                    if not edge.lag:
+                        sorter.add(edge.effect, edge.cause)
             try:
                 self._order = tuple(sorter.static_order())
             except CycleError as error:
@@ -361,3 +362,16 @@ class Equations:
 
 System = Simulation | Equations
 """What runs an episode."""
+
+
+def length(system: System, steps: int | None) -> int:
+    """Return the number of control steps of an episode; that of the task if None."""
+    if isinstance(system, Simulation):
+        return whole_number("steps", system.max_episode_length if steps is None else steps, least=1)
+    if system.model.is_temporal:
+        if steps is None:
+            raise ModelError(["the model has lagged edges: say how many steps an episode has"])
+        return whole_number("steps", steps, least=1)
+    if steps is not None and whole_number("steps", steps, least=0):
+        raise UnknownOption("steps", steps, ("0: the model has no lagged edges",))
+    return 0

@@ -15,8 +15,8 @@ from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM, episode_outcome
 from scm_world.graph.evaluate import AppliedIntervention, source_of
 from scm_world.graph.views import to_dag
+from scm_world.queries.episodes import as_names
 from scm_world.queries.plans import Plan
-from scm_world.queries.rollouts import as_names
 from scm_world.variables import Draw, Mechanism
 
 

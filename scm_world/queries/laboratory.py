@@ -15,9 +15,10 @@ from scm_world._arguments import one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
 from scm_world.errors import Forbidden, UnknownOption
+from scm_world.queries.episodes import as_names
+from scm_world.queries.equations import length
 from scm_world.queries.outcomes import Outcome, as_outcomes, column
 from scm_world.queries.plans import Plan
-from scm_world.queries.rollouts import as_names, length
 from scm_world.queries.samples import Samples, Setting, refuse_late, sample
 from scm_world.queries.tables import read_protocol
 from scm_world.queries.twins import twins_of

@@ -34,15 +34,14 @@ from scm_world.world import Simulation
 
 FORMAT = "scm_world/plan/2"
 
+Key = tuple[str, Contact | Reaches, int]
+"""Variable, event that is waited for, and the control step from which it is."""
+
 _PARTS: TypeAdapter[dict[str, tuple[Any, ...]]] = TypeAdapter(dict[str, tuple[Intervention, ...]])
 
 
 def as_act(value: Any) -> Any:
-    """Make a plain value a hard intervention, and the name of a space a draw from it.
-
-    Raises:
-        UnknownOption: It is neither numbers nor an intervention.
-    """
+    """Make a plain value a hard intervention, and the name of a space a draw from it."""
     if isinstance(value, ACTS) or (isinstance(value, dict) and "kind" in value):  # from a file
         return value
     if isinstance(value, dict):
@@ -75,7 +74,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             (``at=``, ``during=``, ``every=``, ``when=``); a tuple or list where there are several.
 
     Raises:
-        UnknownOption: Something is no intervention.
+        UnknownOption: Something is no intervention, or a name is not text.
 
     Example:
         >>> plan = Plan({"tool_block": {"mass": 0.05}, "floor_friction": Hard(0.2, at=10)})
@@ -94,6 +93,10 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             self._parts: dict[str, tuple[Any, ...]] = request._parts
         else:
             flat = flatten({} if request is None else request)
+            for name in flat:
+                if not isinstance(name, str):
+                    allowed = ("text, such as 'tool_block.mass'",)
+                    raise UnknownOption("name of a variable", name, allowed)
             self._parts = {name: _several(value) for name, value in flat.items()}
 
     @classmethod
@@ -150,15 +153,121 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         for name, acts in self._parts.items():
             yield from ((name, at_once(act)) for act in acts)
 
+    # --- in an episode ------------------------------------------------------------------------
+
+    def then(
+        self, request: Mapping[str, Any] | None, model: SCM, *, at: int, done: bool = False
+    ) -> Plan:
+        """Return the plan that does this too, from a control step on.
+
+        From then on it alone counts for the quantities that it names. What has no time is done at
+        that step, events are waited for from there on, and windows of before end there.
+
+        Args:
+            request: Interventions; their times count from the beginning of the episode.
+            model: Knows which names are coordinates of one quantity.
+            at: The control step.
+            done: Whether this plan has acted at that step already: then what it did stands where
+                the request has nothing for that step.
+
+        Raises:
+            InterventionError: An intervention is due before that step.
+        """
+        more = {n: tuple(_since(n, act, at) for act in acts) for n, acts in Plan(request).items()}
+        mine = {target for name in more for target in targets(model, name)}
+        now = {
+            target
+            for name, acts in more.items()
+            if any(act.time is None or act.time.start == at for act in acts)
+            for target in targets(model, name)
+        }
+        parts: dict[str, tuple[Any, ...]] = {}
+        for name, acts in self._parts.items():
+            its, kept = targets(model, name), acts
+            if mine.issuperset(its):
+                end = at + 1 if done and not now.issuperset(its) else at
+                kept = tuple(part for act in acts for part in _until(act, end))
+            if kept:
+                parts[name] = kept
+        return Plan.of(parts | {n: (*parts.get(n, ()), *acts) for n, acts in more.items()})
+
+    @property
+    def waits(self) -> bool:
+        """Whether anything waits for an event."""
+        return any(act.time.when is not None for _, act in self.timed())
+
+    def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[str, Intervention]:
+        """Return what is to be done at the beginning of a control step, without times.
+
+        Events are looked for in the world; those of now are added to ``fired``.
+        """
+        found: dict[str, Intervention] = {}
+        ended: dict[str, Intervention] = {}
+        for name, act in self._possible(world, step, fired):
+            time = act.time
+            if time is not None and time.when is not None:
+                if _key(name, time) not in fired and not happens(time.when, world):
+                    continue
+                fired[_key(name, time)] = step
+            elif time is not None and time.during is not None:
+                if _is_state(name, world) and not isinstance(act, Hard | Mechanism):
+                    raise InterventionError(
+                        f"do({name}): a state is held at a value or by a Mechanism, not by {act!r}",
+                        variable=name,
+                        value=act,
+                    )
+                if step == time.during[1]:
+                    held = (act for act in self._parts[name] if act.time and act.time.holds(step))
+                    ended[name] = at_once(next(held, Natural()))  # a window around it, or nothing
+                    continue
+            found[name] = at_once(act)
+        if not ended:
+            return found
+        done = {target for name in found for target in targets(world.model, name)}
+        over = {n: act for n, act in ended.items() if not done.issuperset(targets(world.model, n))}
+        return {**over, **found}
+
+    def concerns(self, world: System, step: int, fired: Mapping[Key, int]) -> bool:
+        """Return whether anything may be due at a control step, without a look at the present."""
+        return any(True for _ in self._possible(world, step, fired))
+
+    def _possible(
+        self, world: System, step: int, fired: Mapping[Key, int]
+    ) -> Iterator[tuple[str, Any]]:
+        """List what is due at a control step, or waits for an event."""
+        for name, acts in self._parts.items():
+            for act in acts:
+                time = act.time
+                if time is None:
+                    is_possible = step == 0
+                elif time.when is not None:
+                    start, stop = time.during or (0, None)
+                    is_open = start < step and (stop is None or step < stop)
+                    is_possible = is_open and fired.get(_key(name, time), step) == step
+                elif time.during is not None:
+                    at_end = step in time.during  # a state is put there at every step between
+                    is_possible = time.holds(step) if _is_state(name, world) else at_end
+                elif time.every is not None:
+                    is_possible = step >= time.start and (step - time.start) % time.every == 0
+                else:
+                    is_possible = step == time.at
+                if is_possible:
+                    yield name, act
+
     # --- files --------------------------------------------------------------------------------
 
     def as_dict(self) -> dict[str, Any]:
         """Write the plan as plain data.
 
         Raises:
-            ModelError: It has a function that cannot be found again under its name.
+            ModelError: It has a function that cannot be found again under its name, or a number
+                that is not finite.
         """
         check_portable(self._functions())
+        infinite = [(name, act) for name, act in self.acts() if not _is_finite(act)]
+        if infinite:
+            said = "has a number that is not finite, which JSON does not have"
+            raise ModelError([f"do({name}): {act!r} {said}" for name, act in infinite])
         return {"format": FORMAT, "do": _PARTS.dump_python(self._parts, mode="json")}
 
     def to_json(self) -> str:
@@ -218,10 +327,13 @@ def _short(act: Any) -> str:
 
 
 def _several(value: Any) -> tuple[Any, ...]:
-    is_list = isinstance(value, list | tuple) and len(value) > 0
-    if is_list and all(isinstance(act, ACTS) for act in value):
-        return tuple(value)
+    if isinstance(value, list | tuple) and any(isinstance(act, ACTS) for act in value):
+        return tuple(map(as_act, value))
     return (as_act(value),)
+
+
+def _is_finite(act: Any) -> bool:
+    return bool(np.isfinite(getattr(act, "value", getattr(act, "by", 0.0))).all())
 
 
 def has_times(request: Any) -> bool:
@@ -253,156 +365,46 @@ def numbered(model: SCM, request: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-# --- which interventions are due when -----------------------------------------------------------
-
-Layer = tuple[int, Plan]
-"""The control step from which a plan counts, and the plan."""
-Key = tuple[int, str, int]
-"""Layer, variable and number of an intervention that waits for an event."""
-
-
-@final
-class Schedule:
-    """Plans over one another: from its first step on, a later one counts for what it names.
-
-    Args:
-        layers: In the order of their making.
-
-    Raises:
-        InterventionError: An intervention is due before its plan begins.
-    """
-
-    def __init__(self, layers: Iterable[Layer] = ()) -> None:
-        self.layers = tuple(layers)
-        for start, plan in self.layers:
-            for name, act in plan.timed():
-                time = act.time
-                if time.every is None and time.when is None and time.start < start:
-                    raise InterventionError(
-                        f"do({name}): control step {time.start} is over; the plan begins at "
-                        f"{start}",
-                        variable=name,
-                        value=act,
-                    )
-        self._starts = frozenset(start for start, plan in self.layers if len(plan))
-        self._all, self._later = (
-            [
-                ((number, name, index), act)
-                for number, (_, plan) in enumerate(self.layers)
-                for name, acts in plan.items()
-                for index, act in enumerate(acts)
-                if act.time is not None or with_untimed
-            ]
-            for with_untimed in (True, False)
-        )
-
-    @property
-    def waits(self) -> bool:
-        """Whether anything waits for an event."""
-        return any(act.time.when is not None for _, act in self._later)
-
-    def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[str, Intervention]:
-        """Return what is to be done at the beginning of a control step, without times.
-
-        Args:
-            world: As it is then; events are looked for in it.
-            step: Number of the control step.
-            fired: When events happened; those of now are added.
-        """
-        found: dict[str, Intervention] = {}
-        ended: dict[str, Intervention] = {}
-        for key, act in self._possible(world, step, fired):
-            name, time = key[1], act.time
-            if time is not None and time.when is not None and key not in fired:
-                if not happens(time.when, world):
-                    continue
-                fired[key] = step
-            if time is not None and time.during is not None:
-                if _is_state(name, world) and not isinstance(act, Hard | Mechanism):
-                    raise InterventionError(
-                        f"do({name}): a state is held at a value or by a Mechanism, not by {act!r}",
-                        variable=name,
-                        value=act,
-                    )
-                if step == time.during[1]:
-                    ended[name] = self._still_held(key, step)
-                    continue
-            found[name] = at_once(act)
-        return {**ended, **found}
-
-    def concerns(self, world: System, step: int, fired: Mapping[Key, int]) -> bool:
-        """Tell whether anything may be due at a control step, without a look at the present.
-
-        Args:
-            world: In the structure that there is then.
-            step: Number of the control step.
-            fired: When events happened.
-        """
-        return any(True for _ in self._possible(world, step, fired))
-
-    def _possible(
-        self, world: System, step: int, fired: Mapping[Key, int]
-    ) -> Iterator[tuple[Key, Any]]:
-        """List what is due at a control step, or waits for an event."""
-        for key, act in self._all if step in self._starts else self._later:
-            (number, name, _), time = key, act.time
-            start = self.layers[number][0]
-            if time is None:
-                is_possible = step == start
-            elif time.when is not None:
-                is_possible = step > start and fired.get(key, step) == step
-            elif time.during is not None:
-                at_end = step in time.during  # a state is put there at every step between
-                is_possible = time.holds(step) if _is_state(name, world) else at_end
-            elif time.every is not None:
-                since = step - time.start
-                is_possible = step >= start and since >= 0 and since % time.every == 0
-            else:
-                is_possible = step == time.at
-            if is_possible and self._counts(number, name, step, world):
-                yield key, act
-
-    def _counts(self, number: int, name: str, step: int, world: System) -> bool:
-        """Tell whether no later plan has taken over all quantities that a name sets."""
-        model = world.model
-        later = [plan for start, plan in self.layers[number + 1 :] if start <= step]
-        if not later or self.layers[number][0] > step:
-            return self.layers[number][0] <= step
-        taken = {target for plan in later for one in plan for target in targets(model, one)}
-        return not taken.issuperset(targets(model, name))
-
-    def _still_held(self, key: Key, step: int) -> Intervention:
-        """Return what holds where a window ends: one around it, or the variable's mechanism."""
-        for act in self.layers[key[0]][1][key[1]]:
-            if act.time is not None and act.time.holds(step):
-                held: Intervention = at_once(act)
-                return held
-        return Natural()
-
-
-UNPLANNED = Schedule()
-
-
-@final
-class GroupedSchedules:
-    """Schedules of groups of episodes that ``Equations`` solve together.
-
-    Args:
-        schedules: Of each group.
-    """
-
-    def __init__(self, schedules: Iterable[Schedule]) -> None:
-        self._schedules = tuple(schedules)
-
-    def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[int, Any]:
-        """Return the interventions of each group in which some are due."""
-        dues = (schedule.due(world, step, fired) for schedule in self._schedules)
-        return {group: due for group, due in enumerate(dues) if due}
-
-
 def targets(model: SCM, name: str) -> tuple[str, ...]:
     """Return the quantities that a name sets; itself where the model does not have it."""
     return model.targets(name) if name in model else (name,)
+
+
+def _key(name: str, time: Any) -> Key:
+    return name, time.when, 0 if time.during is None else time.during[0]
+
+
+def _until(act: Any, end: int) -> list[Any]:
+    """Return what an intervention has done before another one replaces it at a control step."""
+    time = act.time
+    if time is None:
+        return [act] if end else []
+    start, stop = time.during or (time.at or 0, None)
+    if start >= end:
+        return []
+    if time.when is not None or time.during is not None:
+        last = end if stop is None else min(end, stop)
+        return [retimed(act, when=time.when, during=(start, last))]
+    return [retimed(act, at=step) for step in range(start, end, time.every or end)]
+
+
+def _since(name: str, act: Any, start: int) -> Any:
+    """Return an intervention of a request that begins at a control step; refuse an earlier one."""
+    time = act.time
+    if time is None:
+        return retimed(act, at=start) if start else act
+    if time.when is not None:
+        first, stop = time.during or (0, None)
+        return retimed(act, when=time.when, during=(max(first, start), stop)) if start else act
+    if time.start >= start:
+        return act
+    if time.every is None:
+        raise InterventionError(
+            f"do({name}): control step {time.start} is over; the plan begins at {start}",
+            variable=name,
+            value=act,
+        )
+    return retimed(act, at=start + (time.start - start) % time.every, every=time.every)
 
 
 def _is_state(name: str, world: System) -> bool:
@@ -410,11 +412,7 @@ def _is_state(name: str, world: System) -> bool:
 
 
 def happens(event: Contact | Reaches, world: System) -> bool:
-    """Tell whether an event is there now.
-
-    Raises:
-        UnknownOption: There is no such body or number; equations have no bodies at all.
-    """
+    """Return whether an event is there now; refuse unknown bodies and components."""
     if isinstance(event, Reaches):
         numbers = np.ravel(world[event.name])
         if event.component >= len(numbers):

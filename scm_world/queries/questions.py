@@ -13,16 +13,14 @@ from scm_world._types import Floats, Integers
 from scm_world.errors import UnknownOption
 from scm_world.graph import scm as graph
 from scm_world.queries.abduction import Counterfactuals, counterfactuals
-from scm_world.queries.episodes import Episode
-from scm_world.queries.equations import Equations, System
+from scm_world.queries.episodes import Episode, Unit, as_names
+from scm_world.queries.equations import CompiledModel, Equations, System, length
 from scm_world.queries.estimates import Effect, effect_of
-from scm_world.queries.live import LiveEpisode
 from scm_world.queries.outcomes import Outcome, as_outcome, is_category, usual_outcomes
-from scm_world.queries.plans import Plan, Schedule, numbered
+from scm_world.queries.plans import Plan, numbered
 from scm_world.queries.progress import Progress, part
-from scm_world.queries.rollouts import Unit, as_names, length
 from scm_world.queries.samples import Samples, Setting, sample
-from scm_world.queries.twins import AnyTwins, EquationTwins
+from scm_world.queries.twins import Twins, twins_of
 from scm_world.variables import Variable
 
 
@@ -32,7 +30,7 @@ class Questions(ABC):
     __slots__ = ()
 
     @abstractmethod
-    def _asked(self) -> tuple[AnyTwins, System]:
+    def _asked(self) -> tuple[Twins, System]:
         """Return where episodes are run, and a system that knows what is declared."""
 
     @abstractmethod
@@ -74,11 +72,11 @@ class Questions(ABC):
             InterventionError: An intervention was refused.
             ActionError: The policy is none, or gave no action.
         """
-        twins, schedule = self._asked()[0], Schedule([(0, self._with(do))])
+        twins, plan = self._asked()[0], self._with(do)
         with twins.twin() as world:
             names = as_names(record)
-            unit = Unit(seed, episode, schedule, policy, length(world, steps), names)
-            return Episode(twins, unit, unit.run(world))
+            unit = Unit(seed, episode, plan, policy, length(world, steps), names)
+            return unit.run(world, twins)
 
     def live(
         self,
@@ -87,14 +85,13 @@ class Questions(ABC):
         seed: int = 0,
         episode: int = 0,
         do: Mapping[str, Any] | None = None,
-    ) -> LiveEpisode:
+    ) -> Episode:
         """Begin an episode that is run by hand: ``step``, ``do``, ``split``, ``episode``.
 
         Arguments and errors are those of ``rollout``; the policy acts where ``step`` is given no
         action.
         """
-        schedule = Schedule([(0, self._with(do))])
-        made = LiveEpisode(self._asked()[0], Unit(seed, episode, schedule, policy, 1))
+        made = Episode.live(self._asked()[0], Unit(seed, episode, self._with(do), policy, 1))
         made.begin()
         return made
 
@@ -341,8 +338,8 @@ class SCM(Questions, graph.SCM):
         np.float64(0.981)
     """
 
-    __slots__ = ("_twins",)
-    _twins: EquationTwins
+    __slots__ = ("_system",)
+    _system: Equations
 
     def __init__(self, variables: Iterable[Variable] | graph.SCM) -> None:
         if isinstance(variables, graph.SCM):
@@ -423,16 +420,21 @@ class SCM(Questions, graph.SCM):
     def __exit__(self, *_: object) -> None:
         pass
 
-    def _asked(self) -> tuple[AnyTwins, System]:
-        if not hasattr(self, "_twins"):
-            self._twins = EquationTwins(self)
-        return self._twins, Equations(self._twins.layout)
+    def _asked(self) -> tuple[Twins, System]:
+        if not hasattr(self, "_system"):
+            self._system = Equations(CompiledModel(self))
+        return twins_of(self._system), self._system
 
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
-        plan = do if isinstance(do, Plan) else Plan(numbered(self, {} if do is None else do))
-        if not self.is_temporal:
-            for name, act in plan.timed():
-                if act.time.start != 0:
-                    allowed = ("none, or at=0: a model without lagged edges has one instant",)
-                    raise UnknownOption(f"time of an intervention on {name}", act, allowed)
-        return plan
+        return planned(self, do)
+
+
+def planned(model: graph.SCM, do: Mapping[str, Any] | None) -> Plan:
+    """Read an intervention on equations; labels of categories become their numbers."""
+    plan = do if isinstance(do, Plan) else Plan(numbered(model, {} if do is None else do))
+    if not model.is_temporal:
+        for name, act in plan.timed():
+            if act.time.start != 0:
+                allowed = ("none, or at=0: a model without lagged edges has one instant",)
+                raise UnknownOption(f"time of an intervention on {name}", act, allowed)
+    return plan

@@ -14,8 +14,8 @@ import numpy as np
 from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.queries.episodes import Episode
-from scm_world.queries.equations import Equations, System
+from scm_world.queries.episodes import Episode, Unit, as_names
+from scm_world.queries.equations import Equations, System, length
 from scm_world.queries.outcomes import (
     ORDERLESS,
     Outcome,
@@ -25,11 +25,9 @@ from scm_world.queries.outcomes import (
     is_category,
     read,
 )
-from scm_world.queries.parallel import Result, paths, run_units
-from scm_world.queries.plans import Plan, Schedule
+from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
-from scm_world.queries.rollouts import Unit, as_names, length
-from scm_world.queries.twins import AnyTwins, EquationTwins
+from scm_world.queries.twins import Result, Twins
 from scm_world.world.interventions import merged
 
 STEPS = 25
@@ -83,17 +81,16 @@ class Setting:
         for name in acts:
             if name in nature and name not in acts.at_start():
                 acts = acts.do({name: (*nature[name], *acts[name])})  # until then nature counts
-        schedule = Schedule([(0, Plan(merged(world.model, nature, acts)))])
-        steps = length(world, self.steps)
-        return Unit(self.seed, number, schedule, self.policy, steps, as_names(names))
+        plan, steps = Plan(merged(world.model, nature, acts)), length(world, self.steps)
+        return Unit(self.seed, number, plan, self.policy, steps, as_names(names))
 
     def episode(
-        self, twins: AnyTwins, world: System, do: Mapping[str, Any] | None, number: int, names: Any
+        self, twins: Twins, world: System, do: Mapping[str, Any] | None, number: int, names: Any
     ) -> Episode:
         """Run the episode of ``unit``."""
         unit = self.unit(world, do, number, names)
         with twins.twin() as twin:
-            return Episode(twins, unit, unit.run(twin))
+            return unit.run(twin, twins)
 
 
 @final
@@ -163,7 +160,7 @@ def refuse_late(plan: Plan, steps: int) -> None:
 
 
 def sample(
-    twins: AnyTwins,
+    twins: Twins,
     system: System,
     do: Mapping[str, Any] | None,
     n: int,
@@ -188,30 +185,27 @@ def sample(
     refuse_late(Plan(do), unit.steps)
     units = [replace(unit, number=number) for number in range(first, first + count)]
     if each:
-        schedule: Any = unit.schedule
-        own = [Schedule([(0, schedule.layers[0][1].do(more))]) for more in each]
-        units = [replace(one, schedule=its) for one, its in zip(units, own, strict=True)]
+        units = [replace(u, plan=u.plan.do(more)) for u, more in zip(units, each, strict=True)]
     told = 0
 
     def finish(place: int, result: Result) -> list[Floats]:
         nonlocal told
         if isinstance(result, Exception):
             raise result
-        episode = Episode(twins, units[place], result)
-        row = [read(outcome, episode) for outcome in wanted]
+        row = [read(outcome, result) for outcome in wanted]
         told += 1
         if progress is not None:
             progress(told, count)
         return row
 
-    if isinstance(twins, EquationTwins) and all(isinstance(one, Outcome) for one in wanted):
-        vectors = paths(twins, units)
-        read_off = (one.of_many(twins.layout.read(one.name, vectors)) for one in wanted)
+    if twins.model is not None and all(isinstance(one, Outcome) for one in wanted):
+        vectors = twins.paths(units)
+        read_off = (one.of_many(twins.model.read(one.name, vectors)) for one in wanted)
         found = [as_numbers(v, one) for v, one in zip(read_off, wanted, strict=True)]
         if progress is not None:
             progress(count, count)
     else:
-        rows = run_units(twins, units, finish, setting.workers)
+        rows = twins.run(units, finish, setting.workers)
         try:
             found = [np.array([row[i] for row in rows]) for i in range(len(wanted))]
         except ValueError:

@@ -20,14 +20,8 @@ Row = tuple[dict[str, Any], int]
 def read_protocol(protocol: Iterable[Mapping[str, Any]], model: SCM) -> list[Row]:
     """Read a table of settings.
 
-    Args:
-        protocol: Rows. Columns are variables, or components ``name[i]`` of them (all of them then),
-            and ``n``, the number of episodes, which is 1 without it.
-        model: Knows the shapes of the variables.
-
-    Raises:
-        UnknownOption: A cell is no number, or a component is missing.
-        UnknownVariable: A column is no variable.
+    Its columns are variables, or components ``name[i]`` of them (all of them then), and ``n``, the
+    number of episodes, which is 1 without it.
     """
     rows = list(protocol) if isinstance(protocol, Iterable) else [protocol]
     for number, row in enumerate(rows):
@@ -39,34 +33,32 @@ def read_protocol(protocol: Iterable[Mapping[str, Any]], model: SCM) -> list[Row
 
 def _row(cells: dict[str, Any], model: SCM, number: int) -> Row:
     n = cells.pop("n", None)
-    n = 1 if n in (None, "") else n
-    try:
-        count = int(n) if float(n) == int(n) else 0
-    except (TypeError, ValueError, OverflowError):
-        count = 0
-    if count < 1:
+    count = 1 if n in (None, "") else _number(n, f"n of row {number}")
+    if not np.isfinite(count) or count < 1 or count != int(count):
         raise UnknownOption(f"n of row {number}", n, ("a whole number from 1 on",))
     whole: dict[str, Any] = {}
     for column, cell in cells.items():
         if cell is None or (isinstance(cell, str) and not cell.strip()):
             continue
-        try:
-            value = float(cell) if isinstance(cell, str) else cell
-        except ValueError:
-            raise UnknownOption(
-                f"{column} of row {number}", cell, ("a number", "nothing")
-            ) from None
+        value = _number(cell, f"{column} of row {number}") if isinstance(cell, str) else cell
         match = _COMPONENT.fullmatch(column)
         variable = model.declared(column if match is None else match[1])
         if match is None:
             whole[column] = value
-        else:
-            size, place = int(np.prod(variable.shape)), int(match[2])
-            if place >= size:
-                raise UnknownOption(f"column of row {number}", column, (f"0 to {size - 1}",))
-            whole.setdefault(variable.name, [None] * size)[place] = value
+            continue
+        size, place = int(np.prod(variable.shape)), int(match[2])
+        if place >= size:
+            raise UnknownOption(f"column of row {number}", column, (f"0 to {size - 1}",))
+        whole.setdefault(variable.name, [None] * size)[place] = value
     for name, value in whole.items():
         if isinstance(value, list) and None in value:
             allowed = (f"all of {name}[0…{len(value) - 1}]",)
             raise UnknownOption(f"columns of {name}", value, allowed)
-    return whole, count
+    return whole, int(count)
+
+
+def _number(cell: Any, where: str) -> float:
+    try:
+        return float(cell)
+    except (TypeError, ValueError):
+        raise UnknownOption(where, cell, ("a number", "nothing")) from None

@@ -1,46 +1,89 @@
-"""Copies of a world on which questions are run."""
+"""Copies of a system on which questions are run, one episode at a time or many together.
+
+Many run in a batch where the backend has one; else in processes, threads, or one by one. Results
+do not depend on which.
+"""
 
 from __future__ import annotations
 
 import copy
+import math
 import multiprocessing
+import pickle
 import threading
 import weakref
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-from typing import Any, final
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager, suppress
+from dataclasses import replace
+from typing import Any, TypeVar, final
 from weakref import WeakKeyDictionary
 
+import numpy as np
+
+from scm_world._arguments import whole_number
+from scm_world._types import Floats
 from scm_world.backends.base import EngineBatch
-from scm_world.errors import UnknownOption
+from scm_world.errors import EngineFailure, UnknownOption, blamed
 from scm_world.graph import SCM
-from scm_world.queries.equations import Equations, Layout
+from scm_world.policies.scripted import OpenLoopPolicy, as_policy
+from scm_world.queries.episodes import ALL, Episode, Unit, run, who
+from scm_world.queries.equations import CompiledModel, Equations, System
+from scm_world.queries.plans import Plan
+from scm_world.work.processes import cores
 from scm_world.world import Simulation
 from scm_world.world.batch import Batch
+from scm_world.world.mechanisms import Mechanisms, Rows
 from scm_world.world.structures import StructureCache
+
+R = TypeVar("R")
+
+Result = Episode | Exception
+"""What becomes of a unit: its episode, or the exception that stopped it."""
+
+MOST = 64
+"""Worlds that are stepped together, at most."""
+
+LEAST = 4
+"""Fewer are not worth it."""
+
+PRICE = 32
+"""Control steps of one thread that it costs to make a world."""
+
+PAYS = 10_000
+"""Control steps that pay for the start of processes."""
+
+GOES_ON = 200
+"""Control steps that are worth sending to processes that are there."""
+
+SHARE = 4
+"""Jobs for each process, so that none waits long for the last one."""
 
 
 @final
 class Twins:
-    """Twins of one world: same task, options and backend, but none of its present.
+    """Twins of one system: same task, options and backend, or equations; none of its present.
 
     Args:
-        world: Is never touched.
+        system: A world or equations; never touched.
 
     Attributes:
-        task: Of the world.
-        options: Further arguments of a twin.
+        model: Of equations, what is stepped; None of a world.
+        task: Of a world.
+        options: Of a world: further arguments of a twin.
         batches: Whether the backend steps many worlds in one call.
     """
 
-    def __init__(self, world: Simulation) -> None:
-        self._build, (self._kind, self.task, self.options, _), *_ = world.__reduce__()
-        self.batches = world.backend.batch is not EngineBatch
+    def __init__(self, system: System) -> None:
+        self.model = system.compiled if isinstance(system, Equations) else None
+        if isinstance(system, Simulation):
+            self._build, (self._kind, self.task, self.options, _), *_ = system.__reduce__()
+            self.batches = system.backend.batch is not EngineBatch
         self._clear()
 
     def _clear(self) -> None:
-        self._free: list[Simulation] = []
+        self._free: list[Any] = []
         self._lock = threading.Lock()
         self._members: list[Simulation] = []  # of batches
         self._batching = threading.RLock()
@@ -56,27 +99,28 @@ class Twins:
         self.__dict__.update(state)
         self._clear()
 
+    def _make(self, family: StructureCache | None = None) -> Any:
+        if self.model is not None:
+            return Equations(self.model)
+        task = copy.copy(self.task) if family is None else family
+        return self._build(self._kind, task, dict(self.options), None)
+
     @contextmanager
-    def twin(self) -> Iterator[Simulation]:
+    def twin(self) -> Iterator[Any]:
         """Lend a twin; it may be given back in any state."""
         with self._lock:
-            world = self._free.pop() if self._free else self._make()
+            system = self._free.pop() if self._free else self._make()
         try:
-            yield world
+            yield system
         finally:
             with self._lock:
-                self._free.append(world)
+                self._free.append(system)
 
     @contextmanager
     def together(self, n: int, names: tuple[str, ...], threads: int) -> Iterator[Batch]:
-        """Lend twins that are stepped together; one thread at a time.
+        """Lend n twins of a world that are stepped together, and compute ``names`` in every step.
 
         They share what is declared, which twins that are lent to several threads cannot.
-
-        Args:
-            n: How many.
-            names: What has to be computed in every step.
-            threads: Of the engine.
         """
         with self._batching:
             worlds, self._members = self._members[:n], self._members[n:]
@@ -95,78 +139,333 @@ class Twins:
         """How many twins there are that can be stepped together."""
         return len(self._members)
 
-    def has_pool(self, workers: int) -> bool:
-        """Tell whether there are so many processes already."""
-        return self._pool is not None and self._pool[0] == workers
+    # --- many units ---------------------------------------------------------------------------
 
-    def pool(self, workers: int) -> ProcessPoolExecutor:
+    def run(
+        self,
+        units: Sequence[Unit],
+        finish: Callable[[int, Result], R],
+        workers: int | None = None,
+    ) -> list[R]:
+        """Run units, and reduce what becomes of each.
+
+        Args:
+            units: All of the same steps, with the same names and kind of policy.
+            finish: Called with the place of a unit and its result; what it raises is raised.
+            workers: Threads, see ``Setting``.
+
+        Returns:
+            What ``finish`` returned, in the order of the units.
+        """
+        given = None if workers is None else whole_number("workers", workers, least=1)
+        is_child = multiprocessing.parent_process() is not None  # one of many that share the cores
+        threads = given or (1 if is_child else cores())
+        results: Generator[Result, None, None]
+        if self.model is not None:
+            results = self._solved(units)
+        elif n := self._batch_size(units, threads):
+            results = self._in_batches(units, n, threads)
+        elif not self.batches and not is_child and self._pays(units, given or 1):
+            results = self._in_processes(units, given or 1)
+        elif (given or 1) == 1:
+            results = (self._alone(unit) for unit in units)
+        else:
+            with ThreadPoolExecutor(given) as pool:  # backends compute without Python's lock
+                return [*map(finish, range(len(units)), pool.map(self._alone, units))]
+        with closing(results):
+            return [finish(place, result) for place, result in enumerate(results)]
+
+    def _alone(self, unit: Unit) -> Result:
+        with self.twin() as system:
+            return unit.result(system, self)
+
+    def _batch_size(self, units: Sequence[Unit], threads: int) -> int:
+        """Return how many units to step together; 0 if that does not pay.
+
+        Each further world makes a step cheaper by less, and costs the same.
+        """
+        if not self.batches or len(units) < LEAST or not is_known(units[0]) or units[0].listens:
+            return 0
+        steps = len(units) * (units[0].steps - units[0].first)
+        worth = math.isqrt(steps * threads // PRICE)
+        if worth < LEAST:
+            return 0
+        most = min(max(worth, self.batched), MOST)
+        return math.ceil(len(units) / math.ceil(len(units) / most))
+
+    def _in_batches(
+        self, units: Sequence[Unit], n: int, threads: int
+    ) -> Generator[Result, None, None]:
+        """Run units together, n at a time."""
+        with self.together(n, units[0].names, threads) as batch:
+            for first in range(0, len(units), n):
+                some = units[first : first + n]
+                try:
+                    yield from run_together(batch, some, self)
+                except EngineFailure:  # run separately, it ends its own unit only
+                    yield from map(self._alone, some)
+
+    # --- in processes -------------------------------------------------------------------------
+
+    def _pays(self, units: Sequence[Unit], workers: int) -> bool:
+        """Tell whether processes pay, and everything can be sent to them."""
+        steps = sum(unit.steps - unit.first for unit in units)
+        worth = GOES_ON if self._pool is not None and self._pool[0] == workers else PAYS
+        if workers < 2 or len(units) < 2 or steps < worth:
+            return False
+        try:
+            pickle.dumps((self, [_sent(unit) for unit in units]))
+        except Exception:  # such as a policy that is a lambda: it acts in this process
+            return False
+        return True
+
+    def _in_processes(self, units: Sequence[Unit], workers: int) -> Generator[Result, None, None]:
+        """Run units in other processes; yield the results in the order of the units."""
+        size = math.ceil(len(units) / (SHARE * workers))
+        jobs = [units[i : i + size] for i in range(0, len(units), size)]
+        pool = self._processes(workers)
+        futures = [pool.submit(_run_there, self, [*map(_sent, job)]) for job in jobs]
+        try:
+            with self.twin() as world:
+                for job, future in zip(jobs, futures, strict=True):
+                    for unit, result in zip(job, future.result(), strict=True):
+                        yield _unpacked(result, world, self, unit)
+        except BrokenProcessPool:
+            self._end_processes()
+            raise EngineFailure("a worker process ended", "the backend of a worker") from None
+        finally:
+            for future in futures:
+                future.cancel()
+
+    def _processes(self, workers: int) -> ProcessPoolExecutor:
         """Return processes, which end with the twins."""
         if self._pool is not None and self._pool[0] == workers:
             return self._pool[1]
-        self.close_pool()
+        self._end_processes()
         made = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
         weakref.finalize(self, made.shutdown, wait=False, cancel_futures=True)
         self._pool = workers, made
         return made
 
-    def close_pool(self) -> None:
-        """End the processes, if there are any."""
+    def _end_processes(self) -> None:
         if self._pool is not None:
             self._pool[1].shutdown(wait=False, cancel_futures=True)
             self._pool = None
 
-    def _make(self, family: StructureCache | None = None) -> Simulation:
-        task = copy.copy(self.task) if family is None else family
-        made: Simulation = self._build(self._kind, task, dict(self.options), None)
-        return made
+    # --- equations ----------------------------------------------------------------------------
+
+    def paths(self, units: Sequence[Unit]) -> Floats:
+        """Run units of equations; return all values at all instants, shape (n, steps + 1, size)."""
+        with suppress(Exception):  # the unit raises it again
+            if (together := self._solved_together(units)) is not None:
+                return together[0]
+        with self.twin() as system:
+            return np.array([unit.run(system).vectors for unit in units])
+
+    def _solved(self, units: Sequence[Unit]) -> Generator[Result, None, None]:
+        """Run units of equations: together where they can be, else one by one."""
+        together = None
+        with suppress(Exception):  # run separately, it ends its own unit only
+            together = self._solved_together(units)
+        if together is None:
+            yield from map(self._alone, units)
+            return
+        for unit, vectors, actions in zip(units, *together, strict=True):
+            begin: list[Any] = [(0, self.model)]
+            yield Episode(
+                self,
+                unit,
+                vectors=[*vectors],
+                statics=[(0, {})],
+                declarations=begin,
+                taken=[*actions],
+            )
+
+    def _solved_together(self, units: Sequence[Unit]) -> tuple[Floats, Floats] | None:
+        """Run units as one, if nothing in them depends on the plan of one of them."""
+        first, compiled = units[0], self.model
+        assert compiled is not None  # noqa: S101
+        one = Equations(compiled)
+        policies = [as_policy(u.policy, one) for u in units] if compiled.n_actions else []
+        plans = {id(unit.plan): unit.plan for unit in units}
+        if (
+            len(units) == 1
+            or not compiled.is_vectorised
+            or any(u.first or u.number != first.number + i for i, u in enumerate(units))
+            or any((unit.seed, unit.steps) != (first.seed, first.steps) for unit in units)
+            or not all(isinstance(policy, OpenLoopPolicy) for policy in policies)
+            or any(plan.waits for plan in plans.values())
+        ):
+            return None
+        actions = np.empty((len(units), first.steps, compiled.n_actions))
+        for row, policy in enumerate(policies):
+            one.reset(seed=first.seed, episode=units[row].number)
+            actions[row] = policy.ahead(one, 0, first.steps)  # type: ignore[attr-defined] # OpenLoopPolicy
+        places = {key: group for group, key in enumerate(plans)}
+        together = Equations(compiled, [places[id(unit.plan)] for unit in units])
+        grouped: Any = _Groups([*plans.values()])
+        unit = replace(first, plan=grouped, policy=lambda it: actions[:, it.index], names=())
+        return np.stack(unit.run(together).vectors, axis=1), actions
 
 
 @final
-class EquationTwins:
-    """Where questions to a causal model without a backend are run.
+class _Groups:
+    """The plans of groups of episodes that equations solve together."""
 
-    Args:
-        model: With the interventions that hold in every episode.
+    def __init__(self, plans: Sequence[Plan]) -> None:
+        self._plans = plans
+
+    def due(self, world: System, step: int, fired: Any) -> dict[int, Any]:
+        """Return what is due in each group in which something is."""
+        dues = (plan.due(world, step, fired) for plan in self._plans)
+        return {group: due for group, due in enumerate(dues) if due}
+
+
+def is_known(unit: Unit) -> bool:
+    """Tell whether all actions of a unit are known beforehand, so that it can be in a batch."""
+    return isinstance(as_policy(unit.policy), OpenLoopPolicy) and ALL not in unit.names
+
+
+def run_together(batch: Batch, units: Sequence[Unit], twins: Any = None) -> list[Result]:
+    """Run units in the rows of a batch of as many worlds or more.
+
+    They have the same instants and names, which the tables of the batch have, too, and policies
+    whose actions are known beforehand. A backend that loses a state stops all of them.
     """
-
-    def __init__(self, model: SCM) -> None:
-        self.layout = Layout(model)
-
-    @contextmanager
-    def twin(self) -> Iterator[Equations]:
-        """Give equations to step."""
-        yield Equations(self.layout)
+    running = _Together(batch, units, twins)
+    run(running, units[0].first, units[0].steps)
+    return running.results()
 
 
-AnyTwins = Twins | EquationTwins
+@final
+class _Together:
+    """Units under way in the rows of a batch; an error stops one of them, and no other one."""
+
+    def __init__(self, batch: Batch, units: Sequence[Unit], twins: Any) -> None:
+        self._batch = batch
+        self._rows = [Episode.of(twins, unit, batch.world(i)) for i, unit in enumerate(units)]
+        self._errors: dict[int, Exception] = {}
+        self._first, self._steps, self._names = units[0].first, units[0].steps, units[0].names
+        self._goes_on = np.arange(len(batch)) < len(units)
+        self._pending = np.zeros(len(batch), dtype=np.bool_)  # stepped, and not recorded
+        n_actions = self._rows[0].world.compiled.n_actions
+        self._commands = np.zeros((self._steps, len(batch), n_actions))
+        self._numbers: list[list[Floats]] = [[] for _ in units]  # not in the episode yet
+        self._mechanisms: dict[int, Mechanisms] = {}  # of the rows that have such numbers
+        for row in range(len(units)):
+            self._alone(row, self._first)
+
+    def intervene(self, step: int) -> None:
+        """Do what is due at an instant."""
+        for row in np.flatnonzero(self._goes_on).tolist():
+            one = self._rows[row]
+            if one.plan.concerns(one.world, step, one.fired):
+                self._alone(row, step)
+
+    def record(self, step: int) -> None:
+        """Record an instant of those rows that have not been recorded by themselves."""
+        rows = np.flatnonzero(self._pending)
+        for table, members in self._batch.tables(rows) if len(rows) else ():
+            for row, mine in zip(members.tolist(), table.numbers[members], strict=True):
+                self._mechanisms[row] = table.mechanisms
+                self._numbers[row].append(mine)
+
+    def act(self, step: int) -> None:
+        """Take a control step in all rows."""
+        if self._goes_on.any():
+            self._batch.advance(self._commands[step], self._goes_on)
+        self._pending[:] = self._goes_on
+
+    def results(self) -> list[Result]:
+        """Return the episode of each unit, or the exception that stopped it."""
+        for row in range(len(self._rows)):
+            self._flush(row)
+        return [self._errors.get(row, one.ended()) for row, one in enumerate(self._rows)]
+
+    def _alone(self, row: int, step: int) -> None:
+        """Reset or intervene in one world alone, record the instant, and ask for what follows."""
+        one = self._rows[row]
+        self._flush(row)
+        self._pending[row] = False
+        self._batch.world(row)
+        try:
+            if step == self._first:
+                one.begin()
+            else:
+                one.intervene(step)
+            one.note(step)
+            with blamed(lambda: who(one.policy, one.world)):
+                given = one.policy.ahead(one.world, one.world.index, self._steps - step)
+            for command, action in zip(self._commands[step:, row], given, strict=True):
+                command[:] = one.world.compiled.clipped(action)
+            one.taken[step:] = np.array(given)
+        except Exception as error:  # it ends this unit, and no other one
+            self._errors[row] = error
+            self._goes_on[row] = False
+
+    def _flush(self, row: int) -> None:
+        """Move the numbers of a row into its episode."""
+        if not self._numbers[row]:
+            return
+        mechanisms, episode = self._mechanisms[row], self._rows[row]
+        rows, self._numbers[row] = Rows(mechanisms, np.array(self._numbers[row])), []
+        episode.vectors.extend(rows.numbers[:, : mechanisms.state_size].copy())
+        for name in self._names:
+            if name in rows:
+                episode.values[name].extend(np.array(rows[name]))
 
 
-def asked(system: Simulation | SCM) -> tuple[AnyTwins, Simulation | Equations]:
-    """Return where episodes of a system are run, and a system that knows what is declared.
-
-    Raises:
-        UnknownOption: It is neither a world nor a model.
-    """
-    if isinstance(system, Simulation):
-        return twins_of(system), system
-    if not isinstance(system, SCM):
-        raise UnknownOption("system", system, ("a World", "an SCM"))
-    twins = EquationTwins(system)
-    return twins, Equations(twins.layout)
+# --- what is sent to other processes --------------------------------------------------------------
 
 
-_TWINS: WeakKeyDictionary[Simulation, Twins] = WeakKeyDictionary()
+_THERE: dict[bytes, Twins] = {}
+"""In a worker process: the twins that it has, by what was sent."""
 
 
-def twins_of(world: Simulation) -> Twins:
-    """Return the twins of a world; they are freed with it.
+def _run_there(twins: Twins, units: Sequence[Unit]) -> list[Any]:
+    """Run units in this process for another one, and pack what each leaves behind."""
+    kept = _THERE.setdefault(pickle.dumps(twins), twins)
+    with kept.twin() as world:
+        here = [replace(u, past=_unpacked(u.past, world, None, u)) for u in units]
+        return [_packed(unit.result(world)) for unit in here]
 
-    Raises:
-        UnknownOption: It is no world.
-    """
-    if not isinstance(world, Simulation):
-        raise UnknownOption("world", world, ("a World",))
-    found = _TWINS.get(world)
+
+def _sent(unit: Unit) -> Unit:
+    return replace(unit, past=_packed(unit.past))
+
+
+def _packed(result: Any) -> Any:
+    """Write down an episode for another process: of a structure, what decides it."""
+    if not isinstance(result, Episode):
+        return result
+    plans = [(step, compiled.plan) for step, compiled in result.declarations]
+    sent: Any = None
+    return replace(result, twins=sent, unit=sent, declarations=plans)
+
+
+def _unpacked(result: Any, world: Simulation, twins: Any, unit: Unit) -> Any:
+    if not isinstance(result, Episode):
+        return result
+    found = [(step, world.structures.compiled(plan)) for step, plan in result.declarations]
+    return replace(result, twins=twins, unit=unit, declarations=found)
+
+
+_TWINS: WeakKeyDictionary[Any, Twins] = WeakKeyDictionary()
+
+
+def twins_of(system: System) -> Twins:
+    """Return the twins of a world or of equations; they are freed with it."""
+    if not isinstance(system, System):
+        raise UnknownOption("world", system, ("a World",))
+    found = _TWINS.get(system)
     if found is None:
-        found = _TWINS[world] = Twins(world)
+        found = _TWINS[system] = Twins(system)
     return found
+
+
+def asked(system: Any) -> tuple[Twins, Any]:
+    """Return where episodes of a system are run, and a system that knows what is declared."""
+    if not isinstance(system, System | SCM):
+        raise UnknownOption("system", system, ("a World", "an SCM"))
+    found = Equations(CompiledModel(system)) if isinstance(system, SCM) else system
+    return twins_of(found), found

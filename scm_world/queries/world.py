@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Self, final
@@ -14,12 +14,12 @@ from scm_world._types import ArrayLike
 from scm_world.backends import Backend
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.episodes import Episode
-from scm_world.queries.equations import System
+from scm_world.queries.equations import CompiledModel, Equations, System
 from scm_world.queries.local import local_graph
-from scm_world.queries.plans import UNPLANNED, Key, Plan, Schedule, has_times
+from scm_world.queries.plans import Key, Plan, has_times
 from scm_world.queries.progress import Progress
-from scm_world.queries.questions import Questions
-from scm_world.queries.twins import AnyTwins, twins_of
+from scm_world.queries.questions import SCM, Questions, planned
+from scm_world.queries.twins import Twins, twins_of
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit, Batch, Simulation, WorldSnapshot
@@ -57,7 +57,10 @@ class World(Simulation, Questions):
     """
 
     def __new__(cls, *args: Any, num_worlds: int | None = None, **options: Any) -> Self:
-        """Make one world, or several."""
+        """Make one world, or several; of a causal model an ``EquationWorld``."""
+        if args and isinstance(args[0], SCM):
+            equations: Any = EquationWorld(CompiledModel(args[0]))
+            return equations  # type: ignore[no-any-return] # as below
         if num_worlds is None:
             return super().__new__(cls)
         batch: Any = Batch.of(cls, num_worlds, *args, **options)
@@ -167,7 +170,7 @@ class World(Simulation, Questions):
         )
 
     _standing: Plan = Plan()
-    _schedule: Schedule = UNPLANNED
+    _running: Plan = Plan()
     _fired: Mapping[Key, int] = MappingProxyType({})
     _space: AnyRegion | None = None
     _acted = -1  # the last control step at which the plan was carried out
@@ -196,7 +199,7 @@ class World(Simulation, Questions):
         other = copy.deepcopy(self)
         other._standing = self._with(do)
         if other._started:
-            other._schedule = Schedule([*self._schedule.layers, (other.index, Plan(do))])
+            other._running = self._running.then(do, self.model, at=self.index)
             other._acted = -1
             other.act()
         return other
@@ -207,28 +210,14 @@ class World(Simulation, Questions):
         *,
         at: int = 0,
         actions: Any = "replay",
-        policy: Any = None,
-        seed: int = 0,
-        episode: int = 0,
-        steps: int | None = None,
-        record: Iterable[str] = (),
+        **options: Any,
     ) -> Episode:
         """Run an episode and return its counterfactual: an intervention, with the same noise.
 
-        Args:
-            do: The intervention; without a time it takes place at the instant ``at``.
-            at: Number of the control step.
-            actions: ``"replay"`` for the same actions, or a policy that acts from there on.
-            policy: Of the episode; see ``rollout``, also for what follows.
-            seed: Of the noise.
-            episode: Number of the episode within that noise.
-            steps: How many control steps.
-            record: Variables to write down on the way.
-
-        Returns:
-            The episode as it would have been; compare it with ``rollout`` of the same seed.
+        It is ``world.rollout(**options).counterfactual(do, at=at, actions=actions)``.
         """
-        factual = self.rollout(policy, seed=seed, episode=episode, steps=steps, record=record)
+        record = options.get("record", ())
+        factual = self.rollout(**options)
         return factual.counterfactual(do, at=at, actions=actions, record=record)
 
     def compare(
@@ -301,7 +290,7 @@ class World(Simulation, Questions):
             arguments,
             {
                 "_standing": self._standing,
-                "_schedule": self._schedule,
+                "_running": self._running,
                 "_fired": dict(self._fired),
                 "_space": self._space,
                 "_acted": self._acted,
@@ -320,11 +309,11 @@ class World(Simulation, Questions):
 
         What has a time is done within the episode, where it must lie in ``space`` too.
         """
-        self._schedule, self._fired, self._space, self._acted = UNPLANNED, {}, space, -1
+        self._running, self._fired, self._space, self._acted = Plan(), {}, space, -1
         if not (len(self._standing) or (do and has_times(do))):
             return super().reset(seed=seed, episode=episode, do=do, space=space)
         super().reset(seed=seed, episode=episode)
-        self._schedule = Schedule([(0, self._with(do))])
+        self._running = self._with(do)
         return self.act()
 
     def step(self, action: ArrayLike) -> None:
@@ -336,11 +325,11 @@ class World(Simulation, Questions):
     @property
     def is_planned(self) -> bool:
         """Whether the present episode has a plan, which acts within it."""
-        return bool(self._schedule.layers)
+        return len(self._running) > 0
 
     def may_act(self, step: int) -> bool:
         """Return whether the plan of the episode may still do something at a control step."""
-        return step != self._acted and self._schedule.concerns(self, step, self._fired)
+        return step != self._acted and self._running.concerns(self, step, self._fired)
 
     def act(self) -> Audit | None:
         """Do what the plan of the episode contains for this instant, as the next step would.
@@ -354,21 +343,21 @@ class World(Simulation, Questions):
         if not self.may_act(self.index):
             return None
         fired = dict(self._fired)
-        due = self._schedule.due(self, self.index, fired)
+        due = self._running.due(self, self.index, fired)
         audit = self.do(due, space=self._space) if due else None
         self._fired, self._acted = fired, self.index
         return audit
 
     def snapshot(self) -> WorldSnapshot:
         """Save everything, with the plan and the events that have happened."""
-        memory = (self._schedule, dict(self._fired), self._space, self._acted)
+        memory = (self._running, dict(self._fired), self._space, self._acted)
         return replace(super().snapshot(), memory=memory)
 
     def restore(self, snapshot: WorldSnapshot) -> None:
         """Go back to a snapshot, bit for bit."""
         super().restore(snapshot)
         if snapshot.memory is not None:
-            self._schedule, fired, self._space, self._acted = snapshot.memory
+            self._running, fired, self._space, self._acted = snapshot.memory
             self._fired = dict(fired)
 
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
@@ -376,5 +365,47 @@ class World(Simulation, Questions):
         plan = Plan(do)
         return Plan(merged(self.model, self._standing, plan)) if len(self._standing) else plan
 
-    def _asked(self) -> tuple[AnyTwins, System]:
+    def _asked(self) -> tuple[Twins, System]:
         return twins_of(self), self
+
+
+@final
+class EquationWorld(Equations, Questions):
+    """Equations that also answer questions: ``World(model)`` of a causal model.
+
+    Example:
+        >>> from scm_world.variables import Derived, Exogenous, Linear, Normal
+        >>> model = SCM([
+        ...     Exogenous(name="x", distribution=Normal()),
+        ...     Derived(name="y", parents=("x",), mechanism=Linear(weights=(2.0,))),
+        ... ])
+        >>> world = World(model)
+        >>> world.reset(seed=0)
+        >>> print(world.do({"x": 1.5}))
+        x = 1.5
+          follows: y -2.186088 → 3.
+        >>> float(world["y"])
+        3.0
+        >>> world.effect("y", do={"x": 1.0}, versus={"x": 0.0}, n=10).mean.round(3)
+        np.float64(2.0)
+    """
+
+    def given(self, do: Mapping[str, Any]) -> Self:
+        """Return another world in which this is done too, at the same instant; see ``World``."""
+        other = copy.copy(self)
+        other.compiled = CompiledModel(self.model.do(do))
+        other.model, other._models = other.compiled.model, (self.graph.do(do),)
+        other._changed()
+        return other
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def _asked(self) -> tuple[Twins, System]:
+        return twins_of(self), self
+
+    def _with(self, do: Mapping[str, Any] | None) -> Plan:
+        return planned(self.model, do)

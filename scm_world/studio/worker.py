@@ -22,7 +22,7 @@ from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, in_one_line
 from scm_world.evaluation import in_world
 from scm_world.policies.zoo import PREFIX as ZOO
-from scm_world.queries import LiveEpisode, World, save_episode
+from scm_world.queries import Episode, World, save_episode
 from scm_world.studio.jobs import StudioJob
 from scm_world.studio.reading import (
     Spec,
@@ -105,7 +105,7 @@ class _LaneState:
         first: The instant at which the rows begin.
     """
 
-    def __init__(self, live: LiveEpisode, first: int = 0) -> None:
+    def __init__(self, live: Episode, first: int = 0) -> None:
         self.live, self.first = live, first
         self.rows: list[dict[str, Value]] = []
         self.contacts: list[tuple[Floats, frozenset[tuple[str, str]]]] = []
@@ -514,7 +514,7 @@ class Session:
         self._lanes.append(twin)
         code = ", ".join(f"{name!r}: {code}" for name, (_, code) in parts.items())
         replay = [f"for action in live.actions[{place}:]:", "    twin.step(action)"]
-        self._note(f"twin = live.split({{{code}}}, at={place})", *(replay if actions else ()))
+        self._note(f"twin = live.split({{{code}}}, at={place})", *(replay if len(actions) else ()))
 
     @validate_call
     def join(self) -> None:
@@ -576,7 +576,7 @@ class Session:
         title = self._spec.title.partition(".")[0].replace(":", "-")
         stem = f"{title}-{('factual', 'twin')[lane]}"
         if what == "plan":
-            return {"name": f"{stem}-plan.json", "text": live.plan().to_json()}
+            return {"name": f"{stem}-plan.json", "text": live.plan.to_json()}
         if what == "episode":
             with tempfile.TemporaryDirectory(prefix="scm-world-") as folder:
                 content = save_episode(live.episode(), Path(folder) / "episode.npz").read_bytes()

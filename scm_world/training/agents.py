@@ -107,7 +107,7 @@ class Episodes(VecMonitor):
     def state(self) -> dict[str, Any]:
         """Return what takes other worlds to where these are."""
         return {
-            "running": json.dumps(self.venv.worlds.running()),
+            "running": json.dumps(self.venv.worlds.state()),
             "actions": self._actions[: self.episode_lengths.max()],
             "lengths": self.episode_lengths,
             "returns": self.episode_returns,

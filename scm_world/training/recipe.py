@@ -18,7 +18,7 @@ from pydantic import (
 )
 
 from scm_world._arguments import one_of
-from scm_world.curricula import Curriculum, as_curriculum, everything, goals
+from scm_world.curricula import Curriculum, everything, goals
 from scm_world.env import ENV_OPTIONS
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
 from scm_world.evaluation.protocols import chosen, protocols_of
@@ -274,7 +274,7 @@ def curriculum_of(given: Any) -> Curriculum:
     if isinstance(given, bool | int | float | str):
         allowed = ("0", "1", "2", "the path of a JSON file", "a Curriculum")
         raise UnknownOption("curriculum", given, allowed)
-    return as_curriculum(given)
+    return Curriculum(given)
 
 
 def recipe(task: str, algo: str = "ppo", *, curriculum: Any = None, **changes: Any) -> Recipe:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Annotated, Any, ClassVar, Literal, final
 
-import numpy as np
 from pydantic import ConfigDict, Field, model_validator
 
 from scm_world.errors import ModelError, UnknownOption
@@ -19,6 +18,7 @@ from scm_world.variables.distributions import Distribution
 from scm_world.variables.kinds import (
     SPACES,
     AsMechanism,
+    AsNumber,
     AsParents,
     InverseNoise,
     Parent,
@@ -29,18 +29,6 @@ from scm_world.variables.mechanisms import EQUATIONS, Equation, check_order
 from scm_world.variables.spaces import Frozen
 from scm_world.variables.times import TimedIntervention
 
-Number = float | tuple[float, ...]
-
-
-def _number(what: str, value: Any) -> Any:
-    try:
-        given = np.asarray(value)
-    except ValueError:  # a ragged list
-        given = np.asarray("")
-    if given.dtype.kind not in "iufb":
-        raise UnknownOption(what, value, ("a number", "an array of numbers"))
-    return tuple(given.ravel().tolist()) if given.ndim else value
-
 
 @final
 class Hard(TimedIntervention):
@@ -49,10 +37,10 @@ class Hard(TimedIntervention):
     model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
 
     kind: Literal["hard"] = "hard"
-    value: Number
+    value: AsNumber
 
     def __init__(self, value: Any, **fields: Any) -> None:
-        super().__init__(value=_number("Hard(value)", value), **fields)
+        super().__init__(value=value, **fields)
 
 
 @final
@@ -67,10 +55,10 @@ class Shift(TimedIntervention):
     model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
 
     kind: Literal["shift"] = "shift"
-    by: Number
+    by: AsNumber
 
     def __init__(self, by: Any, **fields: Any) -> None:
-        super().__init__(by=_number("Shift(by)", by), **fields)
+        super().__init__(by=by, **fields)
 
 
 @final
@@ -80,10 +68,10 @@ class Scale(TimedIntervention):
     model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
 
     kind: Literal["scale"] = "scale"
-    by: Number
+    by: AsNumber
 
     def __init__(self, by: Any, **fields: Any) -> None:
-        super().__init__(by=_number("Scale(by)", by), **fields)
+        super().__init__(by=by, **fields)
 
 
 @final
@@ -140,7 +128,7 @@ class Mechanism(TimedIntervention):
         of: A bundle that the function returns as a whole; the variable gets its part of it.
 
     Example:
-        >>> tie = Mechanism(np.mean, ["floor_color"])
+        >>> tie = Mechanism(lambda color: color[..., 0], ["floor_color"])
         >>> tie.parents[0].name, tie.parents[0].lag
         ('floor_color', 0)
     """

@@ -31,24 +31,26 @@ from scm_world.variables.spaces import (
     Space,
 )
 
-Number = float | tuple[float, ...]
 Role = Literal["parameter", "state", "readout", "action"]
 SpaceName = Literal["A", "B", "A|B"]
 SPACES: tuple[SpaceName, ...] = get_args(SpaceName)
 
 
 def _as_number(value: Any) -> Any:
-    if isinstance(value, np.ndarray | list):
-        flat = tuple(float(x) for x in np.ravel(value))
-        return flat if np.ndim(value) else flat[0]
-    return value
+    try:
+        given = np.asarray(value)
+    except ValueError:  # a ragged list
+        given = np.asarray("")
+    if given.dtype.kind not in "iufb":
+        raise ValueError("it can be a number or an array of numbers")
+    return tuple(given.ravel().tolist()) if given.ndim else given.item()
 
 
 def _as_mechanism(value: Any) -> Any:
     return Function(value) if callable(value) and not isinstance(value, EQUATIONS) else value
 
 
-AsNumber = Annotated[Number, BeforeValidator(_as_number)]
+AsNumber = Annotated[float | tuple[float, ...], BeforeValidator(_as_number)]
 AsMechanism = Annotated[Equation, BeforeValidator(_as_mechanism)]
 InverseNoise = Literal["additive", "monotone"] | AsMechanism
 

@@ -7,11 +7,11 @@ noise, with ``noise=``. Values carry leading batch axes; write ``size[..., 2] / 
 
 from __future__ import annotations
 
-import importlib
 import inspect
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property, partial, update_wrapper
 from itertools import pairwise
+from pkgutil import resolve_name
 from typing import Annotated, Any, ClassVar, Literal, Self, final
 
 import numpy as np
@@ -125,7 +125,7 @@ class Function(Frozen):
             return False
         try:
             found = self._look_up()
-        except (ModelError, AttributeError, ImportError):
+        except (ValueError, AttributeError, ImportError):
             return False
         return _lies_in(getattr(found, "__module__", None) or "", packages)
 
@@ -133,18 +133,14 @@ class Function(Frozen):
         """Return whether the function can be found again under its name."""
         try:
             return self._look_up() is self.resolve()
-        except (ModelError, AttributeError, ImportError):
+        except (ValueError, AttributeError, ImportError):
             return False
 
     def _look_up(self) -> Callable[..., Any]:
-        module, _, name = self.reference.partition(":")
-        found: Any = importlib.import_module(module)
-        for part in name.split("."):
-            found = getattr(found, part)
+        found: Callable[..., Any] = resolve_name(self.reference)
         if not callable(found):
             raise ModelError([f"{self.reference!r} is not a function"])
-        function: Callable[..., Any] = found
-        return function
+        return found
 
     def resolve(self) -> Callable[..., Any]:
         """Return the function, importing its module if need be."""

@@ -10,7 +10,8 @@ Source:
 from __future__ import annotations
 
 import hashlib
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -27,14 +28,12 @@ def word_of(text: str) -> int:
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
 
 
+@dataclass(frozen=True)
 class Noise:
     """All the noise of one seed.
 
-    Args:
-        seed: Any whole number that is not negative.
-
     Attributes:
-        key: The 64 bits by which the seed selects its streams.
+        seed: Any whole number that is not negative.
 
     Example:
         >>> noise = Noise(7)
@@ -43,18 +42,15 @@ class Noise:
         True
     """
 
-    def __init__(self, seed: int) -> None:
-        self.seed = whole_number("seed", seed, least=0)
-        self.key = word_of(f"seed {seed}")
+    seed: int
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Noise) and self.seed == other.seed
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "seed", whole_number("seed", self.seed, least=0))
 
-    def __hash__(self) -> int:
-        return hash(("Noise", self.seed))
-
-    def __repr__(self) -> str:
-        return f"Noise({self.seed})"
+    @cached_property
+    def key(self) -> int:
+        """The 64 bits by which the seed selects its streams."""
+        return word_of(f"seed {self.seed}")
 
     def uniforms(
         self, variable: str, *, n: int, episode: int = 0, step: int = 0, count: int = 1

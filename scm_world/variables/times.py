@@ -87,7 +87,8 @@ class Time(_Short):
             episode. A state is put there again at every step of the window: its mechanism is cut
             for as long. A parameter is set once and has its own mechanism again at the end.
         every: Number of steps from one time to the next.
-        when: It takes place at the first step, after the plan began, at which this holds.
+        when: It takes place at the first step, after the plan began, at which this holds; with
+            ``during``, within that window.
     """
 
     RARE: ClassVar[tuple[str, ...]] = ("at", "during", "every", "when")
@@ -99,9 +100,10 @@ class Time(_Short):
 
     def __init__(self, **fields: Any) -> None:
         given = {name: value for name, value in fields.items() if value is not None}
-        if {*given} not in ({"at"}, {"during"}, {"every"}, {"at", "every"}, {"when"}):
-            allowed = ("one of at=, during=, every=, when=", "at= and every=")
-            raise UnknownOption("time of an intervention", given, allowed)
+        one, pairs = "at=, during=, every=, when=", ({"at", "every"}, {"during", "when"})
+        if len(given) != 1 and {*given} not in pairs:
+            both = "at= and every=", "during= and when="
+            raise UnknownOption("time of an intervention", given, (f"one of {one}", *both))
         for name, least in (("at", 0), ("every", 1)):
             if name in given:
                 given[name] = whole_number(name, given[name], least=least)
@@ -114,7 +116,8 @@ class Time(_Short):
 
     def __str__(self) -> str:
         if self.when is not None:
-            return f"when {self.when!r}"
+            window = "" if self.during is None else f", {Time(during=self.during)}"
+            return f"when {self.when!r}{window}"
         if self.during is not None:
             start, stop = self.during
             return f"from {start} to {'the end' if stop is None else stop}"
@@ -123,7 +126,9 @@ class Time(_Short):
 
     def holds(self, step: int) -> bool:
         """Return whether this is a window, and a control step lies in it."""
-        start, stop = self.during or (step + 1, None)
+        if self.during is None or self.when is not None:
+            return False
+        start, stop = self.during
         return start <= step and (stop is None or step < stop)
 
     @property

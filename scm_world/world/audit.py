@@ -116,11 +116,14 @@ def report(
         remarks: Of the backend.
     """
     compiled, old, bundles = done.compiled, before.row, done.compiled.bundles
-    targets = {
-        name: Applied(name, request[name], *_values(done, now, reported, name))
-        for name in done.asked
+    back = now.copy()  # as the backend reports it
+    for name, key in compiled.parameter_keys.items():
+        if key in reported:
+            back[name] = reported[key]
+    asked = {
+        name: Applied(name, request[name], *_values(done, name, now, back)) for name in done.asked
     }
-    known = {*targets, *(part for name in targets for part in bundles.get(name, ()))}
+    known = {*asked, *(part for name in asked for part in bundles.get(name, ()))}
     names = [name for name in done.changed if name not in known]
     if done.change is not None and done.change.state is not None:
         states = (n for n in before.compiled.slices if n in compiled.slices and n not in bundles)
@@ -128,36 +131,21 @@ def report(
     followed = {name: (np.array(old[name]), np.array(now[name])) for name in names}
     engine = {".".join(key): (was, reported[key]) for key, was in inertia.items()}
     there, were = ({*one.composition.bodies} for one in (compiled, before.compiled))
-    return targets, followed, engine, (*sorted(there - were),), (*sorted(were - there),), remarks
+    return asked, followed, engine, (*sorted(there - were),), (*sorted(were - there),), remarks
 
 
 def _values(
-    done: Transaction, now: Rows, reported: Parameters, name: str
+    done: Transaction, name: str, now: Rows, back: Rows
 ) -> tuple[Value | None, Value | None]:
-    """Return the value that a target has now, and what the backend reports of it.
-
-    None of an action that is known only at its step, and of what the backend does not know.
-    """
+    """Return the value of a target, and that which the backend reports; None if there is none."""
     compiled = done.compiled
     targets = compiled.model.targets(name)
-    values, backs = list[Value](), list[Value]()
-    for target in targets:
-        if target in compiled.actions:
-            act = done.acts[target][1]
-            values += [np.array(act.value)] if isinstance(act, Hard) else []
-            continue
-        values.append(np.array(now[target]))
-        key = compiled.parameter_keys.get(target)
-        if key is not None:
-            backs.append(np.array(reported[key]))
-        elif target in compiled.set_by_hand:
-            backs.append(values[-1].copy())
-    if len(values) < len(targets):
-        return None, None
-    if targets == (name,):
-        return values[0], backs[0] if backs else None
-    applied = compiled.in_coordinates(name, *values)
-    if len(backs) < len(targets):
-        return applied, None
-    exact = all(map(same, backs, values))
-    return applied, applied if exact else compiled.in_coordinates(name, *backs)
+    if targets[0] in compiled.actions:
+        acts = [done.acts[target][1] for target in targets]
+        values = [np.array(act.value) for act in acts if isinstance(act, Hard)]
+        if len(values) < len(targets):  # known only at its step
+            return None, None
+        return values[0] if targets == (name,) else compiled.in_coordinates(name, *values), None
+    known = compiled.set_by_hand | compiled.parameter_keys.keys()
+    applied, reported = (np.array(compiled.coordinates(name, row)) for row in (now, back))
+    return applied, reported if known.issuperset(targets) else None

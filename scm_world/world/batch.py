@@ -250,15 +250,12 @@ class Batch:
         parts = found.items()
         return [(self._tables[one], np.sort(np.concatenate(members))) for one, members in parts]
 
-    def advance(
-        self, commands: Floats, which: Mask | None = None, *, evaluate: bool = True
-    ) -> None:
+    def advance(self, commands: Floats, which: Mask | None = None) -> None:
         """Advance worlds one control step; see ``Simulation.advance``.
 
         Args:
             commands: For each world finite numbers in their range, shape (n, n_actions).
             which: Who is advanced, shape (n,); all if None.
-            evaluate: Whether to compute what is computed after every step.
 
         Raises:
             NotReset: A world has no episode yet.
@@ -284,7 +281,7 @@ class Batch:
                 failed = failed or error
         if failed is not None:
             raise failed
-        for (compiled, _), members in groups if evaluate else ():
+        for (compiled, _), members in groups:
             self._tables[compiled].evaluate(self._names, members)
 
     def _step(

@@ -186,7 +186,10 @@ class CompiledTask(ActionVector):
         static_names: Everything that interventions alone decide, causes before effects.
         static: The same, without their order.
         random: Variables that are drawn when an episode begins.
+        last_overlaps: Numbers of the row whose overlaps were computed last, and these.
     """
+
+    last_overlaps: tuple[bytes, tuple[Overlap, ...]] | None = None
 
     def __init__(self, task: Task, options: Options, steps: int) -> None:
         self.task = task
@@ -283,7 +286,9 @@ class CompiledTask(ActionVector):
             self._follow[key] = tuple(name for name in self.static_names if name in follow)
         return self._follow[key]
 
-    def boxes(self, draws: tuple[tuple[str, Any, str], ...]) -> tuple[frozenset[str], list[Any]]:
+    def boxes(
+        self, draws: tuple[tuple[str, Any, str | None], ...]
+    ) -> tuple[frozenset[str], list[Any]]:
         """Find the parameters that are drawn from boxes which follow nothing.
 
         Args:
@@ -457,8 +462,12 @@ class StepBase:
 
     @cached_property
     def overlaps(self) -> tuple[Overlap, ...]:
-        """What lies in one another, however little."""
-        return self.compiled.composition.overlaps(self.compiled.scene(self.row), 0.0)
+        """What lies in one another, however little; many episodes begin in one row."""
+        compiled, numbers = self.compiled, self.row.numbers.tobytes()
+        if compiled.last_overlaps is None or compiled.last_overlaps[0] != numbers:
+            found = compiled.composition.overlaps(compiled.scene(self.row), 0.0)
+            compiled.last_overlaps = numbers, found
+        return compiled.last_overlaps[1]
 
     def value(self, name: str) -> Value | None:
         """Return a parameter or a state, also in other coordinates; None for anything else."""

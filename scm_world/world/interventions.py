@@ -10,7 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._types import Floats, Value
+from scm_world._types import Value
 from scm_world.errors import (
     ConflictingTargets,
     Infeasible,
@@ -192,19 +192,20 @@ class Transaction:
     def _mutilate(self, acts: PendingInterventions) -> None:
         """Mutilate the model, and order the descendants of the targets."""
         compiled = self.compiled
-        moving = self._moving(acts)
-        held = (*self.base.model.interventions.values(), *(act for _, act in acts.values()))
-        adds = any(type(act) is Mechanism for act in held)
+        held = (*self.base.model.interventions.values(), *[act for _, act in acts.values()])
+        adds = Mechanism in map(type, held)
+        moving = self._moving(acts) if adds else {}
         # Where nothing follows others than before, draws from boxes can wait for their values.
-        later = () if adds else self._boxes[0]
+        draws = [t for t, (_, act) in acts.items() if type(act) is Draw]
+        later = self._boxes[0] if draws and not adds else ()
         kept = dict([acts[t] for t in acts if t not in moving and t not in later])
         self.model, cycles = self.base.model.without_cycles(kept)
         self.problems += [*{p.variable: p for p in moving.values()}.values(), *cycles]
         self._impossible = {*moving, *chain(*(problem.cycle for problem in cycles))}
         static, out = compiled.static, self._impossible
         self._targets = tuple([t for t in acts if t in static and t not in out])
-        self._draws = [t for t in self._targets if type(acts[t][1]) is Draw]
-        others = (t for t in self._draws if t not in self._boxes[0])
+        self._draws = [target for target in draws if target in self._targets]
+        others = [t for t in self._draws if t not in self._boxes[0]]
         if adds or any(self._source(*acts[t]).parents() for t in others):
             structure = self.model.structure
             follow = {*self._targets, *structure.instant_descendants(self._targets)}
@@ -243,7 +244,7 @@ class Transaction:
     def _boxes(self) -> Any:
         """Draws from boxes that follow nothing: their names, and groups of them; see ``boxes``."""
         wanted = [
-            (name, act.source, name if act.stream is None else f"{act.stream}/{name}")
+            (name, act.source, act.stream)
             for name, (asked, act) in self.acts.items()
             if type(act) is Draw and asked == name and act.of is None
         ]
@@ -261,10 +262,13 @@ class Transaction:
             key: Where to draw.
         """
         drawn, groups = self._boxes if self._draws else ((), ())
-        self._begin(key, self.base.row.numbers.copy())
-        for names, own, columns, low, edges in groups:
-            numbers = uniforms(key, self._streams(zip(names, own, strict=True)), columns.shape[1])
-            self.row.numbers[columns] = low + edges * numbers
+        self._key, numbers = key, self.base.row.numbers.copy()
+        self.row = Rows(self.compiled.mechanisms, numbers, self._targets)
+        self._wrong, self._impossible = [*self.problems], {*self._whatever}
+        self._whole: dict[str, Value] = {}  # what bundles are to be
+        for names, asked, columns, low, edges in groups:
+            streams = (key.stream(*one, key.attempt) for one in zip(names, asked, strict=True))
+            self.row.numbers[columns] = low + edges * uniforms(key, streams, columns.shape[1])
         self.row.unknown.difference_update(drawn)
         for name in self._order:
             if name not in drawn:
@@ -274,15 +278,6 @@ class Transaction:
         if self.space is not None:
             self._check_space(self.space)
         return self._as_asked() if self._wrong else []
-
-    def _begin(self, key: NoiseKey, numbers: Floats) -> None:
-        self._key, self.row = key, Rows(self.compiled.mechanisms, numbers, self._targets)
-        self._wrong, self._impossible = [*self.problems], {*self._whatever}
-        self._whole: dict[str, Value] = {}  # what bundles are to be
-
-    def _streams(self, named: Iterable[tuple[str, str]]) -> Iterator[str]:
-        attempt, kept = self._key.attempt, self._key.kept
-        return (f"{own}#{attempt}" if attempt and n not in kept else own for n, own in named)
 
     def _compute(self, name: str) -> None:
         """Compute a parameter, whose parents have been."""
@@ -370,7 +365,8 @@ class Transaction:
             value = self._wanted(requested, act)
             if name == target:
                 return value
-            if np.array_equal(value, self.compiled.coordinates(name, self.row)):
+            present = () if type(act) is Draw else self.compiled.coordinates(name, self.row)
+            if np.array_equal(value, present):
                 return self.row[target]
             return np.asarray(requested.inverse.bind()(value))
         if whole not in self._whole:
@@ -486,11 +482,6 @@ class Transaction:
             return []
         return overlaps(self.base, before, compiled, row, self.change, self.asked)
 
-    def redraws(self, name: str) -> bool:
-        """Return whether a draw takes part in where bodies are; what is wrong is drawn once."""
-        compiled = self.compiled
-        return not (self.problems or compiled.material.isdisjoint(compiled.reached((name,))))
-
     def anyhow(self, draws: Iterable[str], problems: Iterable[Overlap]) -> bool:
         """Return whether bodies overlap that follow no draw, although they could be moved."""
         moved = {name.partition(".")[0] for name in self.compiled.reached(draws)}
@@ -511,50 +502,37 @@ class Transaction:
     def promising(self, key: NoiseKey, attempts: range, draws: list[str]) -> Iterator[int]:
         """Yield the draws that do not obviously put two bodies in one place, and the last one."""
         composition, last = self.compiled.composition, attempts[-1]
-        if self.compiled.reached(draws).isdisjoint(composition.screened):
-            yield from attempts
-            return
-        limit = ROUNDING + max((overlap.depth for overlap in self.base.overlaps), default=0.0)
+        varies = not self.compiled.reached(draws).isdisjoint(composition.screened)
         while attempts:
             chunk, attempts = attempts[:CHUNK], attempts[CHUNK:]
-            try:
-                clear = composition.clear(self._screened(key, chunk), limit).tolist()
-            except Exception:  # solving says what is wrong
-                clear = [True] * len(chunk)
+            rows = self._screened(key, chunk) if varies else None
+            if rows is None:
+                yield from chunk
+                continue
+            limit = ROUNDING + max((overlap.depth for overlap in self.base.overlaps), default=0.0)
+            clear = composition.clear(rows, limit).tolist()
             yield from (n for n, stays in zip(chunk, clear, strict=True) if stays or n == last)
 
     @np.errstate(all="ignore")
-    def _screened(self, key: NoiseKey, attempts: range) -> dict[str, Value]:
-        """Compute what decides whether bodies are clear of one another: a row for each draw."""
+    def _screened(self, key: NoiseKey, attempts: range) -> dict[str, Value] | None:
+        """Draw what is screened, a row for each attempt; None where it follows something else."""
         compiled, base = self.compiled, self.base.row
-        where, done = base.mechanisms.where, set[str]()
+        where = base.mechanisms.where
         rows = np.repeat(base.numbers[None], len(attempts), axis=0)
-
-        def compute(name: str) -> None:
-            is_state = name in compiled.slices
-            if name in done or not (is_state or name in self._order):
-                return
-            done.add(name)
-            asked, act = self.acts.get(name, (name, None))
-            variable = compiled.model.declared(name)
-            if isinstance(act, Draw) and asked == name and act.of is None:
-                source, shape = self._source(name, act), variable.shape
-                if not source.parents() and not isinstance(variable.bounds, Rotations):
-                    own = name if act.stream is None else f"{act.stream}/{name}"
-                    streams = (own if name in key.kept or not n else f"{own}#{n}" for n in attempts)
-                    drawn = uniforms(key, streams, source.n_uniforms(shape))
-                    drawn = source.transform(drawn, shape, {})
-                    rows[:, where[name]] = drawn.reshape(len(rows), -1)
-                    return
-            parents = compiled.set_parents.get(name, ()) if is_state else None
-            for parent in self.model.parents(name) if parents is None else parents:
-                compute(parent)
-            for attempt, numbers in zip(attempts, rows, strict=True):
-                self._begin(replace(key, attempt=attempt), numbers)
-                (self._set_state if is_state else self._compute)(name)
-
         for name in compiled.composition.screened:
-            compute(name)
+            asked, act = self.acts.get(name, (name, None))
+            whole = whole_of(act, asked)
+            if type(act) is Draw and asked == name and whole in where:
+                source, shape = self._source(asked, act), compiled.model.declared(whole).shape
+                if source.parents():
+                    return None
+                streams = (key.stream(whole, act.stream, n) for n in attempts)
+                numbers = uniforms(key, streams, source.n_uniforms(shape))
+                rows[:, where[whole]] = source.transform(numbers, shape, {}).reshape(len(rows), -1)
+            elif type(act) is Hard and asked == name:
+                rows[:, where[name]] = np.ravel(act.value)
+            elif act is not None or name in self._order or name in compiled.carried:
+                return None
         return {name: rows[:, where[name]] for name in compiled.composition.screened}
 
     # --- what is kept of it -------------------------------------------------------------------
@@ -605,11 +583,12 @@ def difference(
         if structure is not now.structure:
             scene = compiled.scene(then)
             return Difference(structure, scene.parameters, scene.state)
-    keys, state = compiled.parameter_keys, compiled.state_of(then)
+    keys, size = compiled.parameter_keys, compiled.mechanisms.state_size
     parameters = {keys[name]: then[name] for name in changed if name in keys}
-    moves = now.row.numbers[: len(state.vector)] != state.vector
-    moved = state if (moves & state.layout.can_be_set).any() else None
-    return Difference(None, parameters, moved) if parameters or moved is not None else None
+    moves = now.row.numbers[:size] != then.numbers[:size]
+    moved = (moves & compiled.composition.system.layout.can_be_set).any()
+    state = compiled.state_of(then) if moved else None
+    return Difference(None, parameters, state) if parameters or moved else None
 
 
 def overlaps(
@@ -645,8 +624,7 @@ def feasible(
 
     Bodies that intersect already (a block that is being squeezed) may continue to. What is
     drawn is drawn again until the world can be like that: from the feasible part of its space.
-    What takes no part in where bodies are is drawn once. Where it is drawn which bodies there are,
-    each of these draws is followed by some of the rest.
+    Where it is drawn which bodies there are, each of these draws is followed by some of the rest.
 
     Args:
         structures: Of the task.
@@ -676,12 +654,17 @@ def feasible(
             first, turn = first + 1, turn + 1
             continue
         done, named = drawn, frozenset(drawn.asked)
-        again = [name for name in draws if name not in deciding and done.redraws(name)]
+        # What takes no part in where bodies are is drawn once, and so is what is wrong.
+        reached, material = done.compiled.reached, done.compiled.material
+        free = () if done.problems else (name for name in draws if name not in deciding)
+        again = [name for name in free if not material.isdisjoint(reached((name,)))]
         key = replace(key, kept=frozenset(draws).difference(again)) if draws else key
         end = min(first + CHUNK, ATTEMPTS) if deciding else ATTEMPTS
         attempts = range(first, end if again else first + 1)
         for attempt in done.promising(key, attempts, again) if again else attempts:
-            raise_all(done.solve(replace(key, attempt=attempt) if attempt else key))
+            wrong = done.solve(replace(key, attempt=attempt) if attempt else key)
+            if wrong:
+                raise_all(wrong)
             problems = done.compare(now)
             composition = done.compiled.composition
             if draws and not problems and composition.hides_goals:

@@ -196,23 +196,27 @@ class Rows(Mapping[str, Value]):
         unknown: Variables whose values are to be computed first.
     """
 
-    __slots__ = ("_views", "mechanisms", "numbers", "unknown")
+    __slots__ = ("_counts", "_views", "mechanisms", "numbers", "unknown")
 
     def __init__(
         self, mechanisms: Mechanisms, numbers: Floats, unknown: Iterable[str] = ()
     ) -> None:
         self.mechanisms, self.numbers, self.unknown = mechanisms, numbers, {*unknown}
         self._views: dict[str, Value] = {}
+        self._counts: dict[str, Value] = {}  # of whole numbers
 
     def __getitem__(self, name: str) -> Value:
         view = self._views.get(name)
-        if view is None:
+        if view is not None:
+            return view
+        count = self._counts.get(name)
+        if count is None:
             place, shape, is_whole = self.mechanisms.reading[name]
-            view = self.numbers[..., place].reshape(self.numbers.shape[:-1] + shape)
-            if is_whole:
-                return view.astype(np.int64)
-            self._views[name] = view
-        return view
+            count = self.numbers[..., place].reshape(self.numbers.shape[:-1] + shape)
+            (self._counts if is_whole else self._views)[name] = count
+            if not is_whole:
+                return count
+        return count.astype(np.int64)
 
     def __setitem__(self, name: str, value: ArrayLike) -> None:
         self.numbers[self.mechanisms.where[name]] = np.ravel(value)
@@ -263,11 +267,8 @@ class Rows(Mapping[str, Value]):
     def remember(self, which: Integers = FIRST) -> None:
         """Keep the present of some worlds as the values of one control step ago."""
         matrix, fresh = self._matrix, self.mechanisms.fresh
-        if self.numbers.ndim > 1:
-            stale = which[matrix[which, fresh] == 0.0]
-        else:
-            stale = which[: int(matrix[0, fresh] == 0.0)]
-        if stale.size:
+        stale = which if len(matrix) == 1 else which[matrix[which, fresh] == 0.0]
+        if stale.size and matrix[stale[0], fresh] == 0.0:
             self.mechanisms.evaluate((), matrix, stale)
         self.mechanisms.remember(matrix, which)
 
@@ -312,15 +313,7 @@ class _Compiled:
 
 @final
 class _Python:
-    """A function of Python, called for one row after another.
-
-    Args:
-        mechanisms: Of the structure.
-        name: Of the variable.
-        variable: The variable.
-        parents: What it is given.
-        columns: Of the parents.
-    """
+    """A function of Python, called for one row after another."""
 
     def __init__(
         self,
@@ -338,12 +331,7 @@ class _Python:
         self._arguments = partial(mechanisms.arguments, parents=parents, columns=columns)
 
     def __call__(self, row: Floats) -> None:
-        """Compute, into a row.
-
-        Raises:
-            FunctionFailure: The function raised an error or, if it is a user's, gave something
-                else than finite numbers of the declared shape; or numba cannot compile it.
-        """
+        """Compute, into a row; what a function of a user gives is checked."""
         try:
             value = self._function(*self._arguments(row))
         except ScmWorldError:

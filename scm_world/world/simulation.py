@@ -42,7 +42,7 @@ from scm_world.world.compiled_task import (
     beginning,
     check_functions,
 )
-from scm_world.world.interventions import Transaction, difference, feasible, overlaps, same
+from scm_world.world.interventions import Transaction, difference, feasible, overlaps
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.snapshot import WorldSnapshot
@@ -495,7 +495,8 @@ class Simulation:
             InterventionError: The request was refused; the world is bit-identical to before.
             NotReset: There is no episode yet.
         """
-        self._require_state()
+        if not self._started or self._lost:
+            self._require_state()
         problems: list[InterventionError] = []
         flat, before = flatten(request, problems), self._step_base()
         base = self.base or before
@@ -514,11 +515,7 @@ class Simulation:
     def _anew(
         self, request: Mapping[str, Any], base: StepBase
     ) -> tuple[dict[str, Any], dict[str, int]]:
-        """Give draws noise that no earlier draw of the variable had at this instant.
-
-        Returns:
-            The request, and how often each variable has been drawn then.
-        """
+        """Give draws noise that no earlier draw at this instant had; count the draws."""
         drawn, found = dict(base.drawn), dict(request)
         for name, act in request.items():
             if not (isinstance(act, Draw) and act.stream is None and act.of is None):
@@ -536,15 +533,13 @@ class Simulation:
         for name, act in request.items():
             if not isinstance(act, Mechanism) or name not in self.model:
                 continue
-            targets, parents = self.model.targets(name), [p.name for p in act.parents if not p.lag]
+            targets = self.model.targets(name)
+            parents = tuple(p.name for p in act.parents if not p.lag)
             known = len(parents) == len(act.parents) and all(p in self.model for p in parents)
             if not known or not self.compiled.actions.keys() >= {*targets}:
                 continue  # parents are refused with the reason
             try:
-                model, values = (
-                    self.model.with_interventions({name: act}),
-                    self.evaluate((*parents,)),
-                )
+                model, values = self.model.with_interventions({name: act}), self.evaluate(parents)
                 for target in targets:
                     value, declared = model.evaluate(target, values), model.declared(target)
                     if np.shape(value) != declared.shape:
@@ -581,7 +576,7 @@ class Simulation:
         at_start: bool,
     ) -> Audit:
         """Apply what was computed, and read it back; or put everything back and raise."""
-        index, change, backend = self.index, done.change or Difference(), self.backend
+        index, change, backend = self.index, done.change, self.backend
         compiled, keys = done.compiled, done.compiled.parameter_keys
 
         def undo() -> None:
@@ -591,25 +586,33 @@ class Simulation:
                 backend.apply(lost)
 
         with self._all_or_nothing(before, undo):
-            inertia = self._inertia(change)
-            if change:
+            inertia: Parameters = {}
+            wanted = {keys[t] for n in done.asked for t in compiled.model.targets(n) if t in keys}
+            if change is not None:
+                inertia = self._inertia(change)
                 backend.apply(change)
-            targets = (t for name in done.asked for t in compiled.model.targets(name))
-            wanted = {keys[target] for target in targets if target in keys}
-            reported = backend.parameters({*change.parameters, *inertia, *wanted})
-            self._refuse_other(change, reported)
-            structure = change.structure or self.structure
-            self._adopt(compiled, done.held(), done.row, done.changed, structure)
-            remarks: tuple[str, ...] = ()
-            set_here = () if change.structure is not None else change.parameters
-            if any(what.endswith("friction") for _, what in set_here):
-                frictions = {keys[n]: before.row[n] for n in done.changed if n in keys}
-                remarks = backend.capabilities.remarks(backend, frictions)
+                wanted.update(change.parameters, inertia)
+            reported, remarks = backend.parameters(wanted), tuple[str, ...]()
+            if change is not None:
+                self._refuse_other(change, reported)
+                set_here = () if change.structure is not None else change.parameters
+                if any(what.endswith("friction") for _, what in set_here):
+                    frictions = {keys[n]: before.row[n] for n in done.changed if n in keys}
+                    remarks = backend.capabilities.remarks(backend, frictions)
+            clock = done.row.numbers[compiled.mechanisms.clock]
+            stays = compiled is before.compiled and clock == index
+            if stays and change is None and not done.changed:
+                self._adopt_model(done.held())
+                self.version += 1
+            else:
+                structure = change.structure if change is not None else None
+                structure = structure or self.structure
+                self._adopt(compiled, done.held(), done.row, done.changed, structure)
+                self._offset += self.index - index
+                if at_start:
+                    self._forget()
             now = self.row.copy()
             audit = Audit(partial(report, request, done, before, now, inertia, reported, remarks))
-            self._offset += self.index - index
-            if at_start:
-                self._forget()
             if check is not None:
                 check()
         return audit
@@ -834,7 +837,7 @@ def _copied(kind: Any, task: Task, options: Mapping[str, Any], snapshot: Any) ->
 
 
 def _close(given: Floats, reported: Floats) -> bool:
-    if same(given, reported):
+    if given.tobytes() == reported.tobytes():
         return True
     return bool(np.all(np.abs(given - reported) <= READ_BACK * np.maximum(1.0, np.abs(given))))
 

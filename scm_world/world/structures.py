@@ -122,11 +122,12 @@ class StructureCache:
             if isinstance(v, Exogenous) and v.name not in targets
         }
         values = model.solve(known, key=key)
-        with suppress(InterventionError):  # refused later, with the reason
+        try:
             for variable in self.head.variables:
                 check_bounds(variable, coerce(variable, values[variable.name]), values)
-            return self.plan(values)
-        return None
+        except InterventionError:
+            return None  # the intervention will be refused, with the reason
+        return self.plan(values)
 
 
 def as_task(task: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Task:

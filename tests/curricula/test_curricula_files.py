@@ -16,12 +16,11 @@ from gymnasium.envs.registration import EnvSpec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scm_world import Draw, Scale, Shift
+from scm_world import Draw, Hard, Scale, Shift, do
 from scm_world.curricula import (
     A,
     B,
     Curriculum,
-    as_curriculum,
     at_reset,
     at_step,
     during,
@@ -37,7 +36,7 @@ from scm_world.curricula import (
     together,
     weighted,
 )
-from scm_world.curricula.base import Part
+from scm_world.curricula.base import Part, nested
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.graph import SCM
 from scm_world.variables import Box, Either, Function, Mechanism, Natural, Normal
@@ -46,6 +45,7 @@ LEAVES: list[Any] = [
     {},
     {"floor_friction": 0.4},
     {"block": {"size": [0.05, 0.06, 0.07]}, "tool_block.mass": Draw("B"), "gravity": Scale(0.5)},
+    do({"floor_friction": (0.3, Hard(0.2, at=1)), "tool_block": {"mass": Draw("A", every=4)}}),
     {"floor_friction": Mechanism(Function("numpy:mean"), ["floor_color"]), "x": Natural()},
     resample(["*.mass", "@looks"], "A|B", besides="robot_*"),
     resample("tool_block.mass", Normal(0.03, 0.001)),
@@ -87,7 +87,7 @@ def test_every_curriculum_survives_json_and_pickle(given_part: Any) -> None:
         again = Curriculum.from_json(text, trusted=["numpy"])
         assert again == one
         assert again.to_json() == text
-        assert [p.key for p in again.part.walk()] == [p.key for p in one.part.walk()]
+        assert [p.key for p in nested(again, Part)] == [p.key for p in nested(one, Part)]
         assert pickle.loads(pickle.dumps(one)) == one == copy.deepcopy(one)  # noqa: S301 # our own
 
 
@@ -99,7 +99,7 @@ def test_every_kind_is_tried() -> None:
         )
     )
     known = {k for k, part in Part.KINDS.items() if part.__module__.startswith("scm_world.curric")}
-    assert {part.kind for part in text.part.walk()} == known
+    assert {part.kind for part in nested(text, Part)} == known
 
 
 def test_a_file_makes_the_same_episodes(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_a_file_makes_the_same_episodes(tmp_path: Path) -> None:
     again = Curriculum.load(file)
     mass = "tool_block.mass"
     assert series(under(one), mass, 4) == series(under(again), mass, 4)
-    assert as_curriculum(json.loads(one.to_json())) == one
+    assert Curriculum(json.loads(one.to_json())) == one
 
 
 def test_functions_of_others_are_called_only_if_trusted() -> None:
@@ -143,7 +143,7 @@ WRONG = [
     ),
     (
         '{"format": "scm_world/curriculum/1", "part": {"kind": "resample", "what": "a", "mor": 1}}',
-        "no field of Resample is named 'mor'",
+        "no field of resample is named 'mor'",
     ),
     (
         '{"format": "scm_world/curriculum/1", "part": {"kind": "in_turn", "of": [{}], "each": 0}}',
@@ -166,6 +166,12 @@ def test_what_is_no_curriculum_is_refused(text: str, says: str, tmp_path: Path) 
     assert "\n" not in str(refused.value)
 
 
+def test_what_is_not_finite_has_no_file() -> None:
+    """It is refused as in a plan."""
+    with pytest.raises(ModelError, match="not finite"):
+        Curriculum(together({}, {"floor_friction": float("nan")})).to_json()
+
+
 def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     """No file, or one that is no text."""
     with pytest.raises(UnreadableFile, match="absent"):
@@ -174,7 +180,7 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     with pytest.raises(UnreadableFile, match="binary"):
         Curriculum.load(tmp_path / "binary")
     with pytest.raises(UnknownOption, match="part of a curriculum"):
-        as_curriculum(5)
+        Curriculum(5)
 
 
 def test_wrapped_environments_can_be_written_down() -> None:

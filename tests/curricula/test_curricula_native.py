@@ -95,7 +95,7 @@ def roll(envs: Any, others: Any, steps: int, mode: AutoresetMode) -> None:
             which = ended if ended.any() else np.arange(envs.num_envs) == 1
             again = {"reset_mask": which}
             same(envs.reset(options=dict(again)), others.reset(options=dict(again)), f"reset {t}")
-    assert envs.memory == others.memory
+    assert envs.stages == others.stages
     assert envs.state() == others.state()
 
 
@@ -160,7 +160,7 @@ def test_it_is_what_is_made_where_the_engine_has_it() -> None:
     native = make_vec(PUSHING, 2, part, disable_env_checker=True, threads=2)
     assert isinstance(native.env, NativeVectorEnv)
     assert [*native.env.get_attr("curriculum")] == [native.curriculum] * 2
-    assert native.env.get_attr("where") == (None, None)
+    assert [state["noise"] for state in native.state()["members"]] == [None, None]
     limited = make_vec(PUSHING, 2, part, backend="fake", max_episode_steps=2)
     limited.reset(seed=0)
     assert [limited.step(np.zeros((2, 9), np.float32))[3].all() for _ in range(2)] == [False, True]
@@ -174,10 +174,14 @@ def test_what_is_refused_happens_in_none_of_them() -> None:
     part = together(interpolate({FRICTION: 1.0}, start={FRICTION: 0.0}, episodes=100), inside)
     envs = made("native", part, AutoresetMode.DISABLED)
     envs.reset(seed=0)
-    before = envs.env.present()
+    before, state = envs.env.present(), envs.state()
     with pytest.raises(InterventionError, match="environment 1"):
         envs.reset()
     same(envs.env.present(), before)
+    assert envs.state() == state
+    with pytest.raises(InterventionError, match="environment 1"):
+        envs.reset()
+    assert envs.state() == state
     with pytest.raises(InterventionError, match=r"nowhere"):
         made("native", {"nowhere": 1.0}, AutoresetMode.DISABLED)
 
@@ -192,18 +196,3 @@ def test_a_snapshot_goes_back_to_what_is_due() -> None:
     first = [envs.step(action) for _ in range(2)]
     envs.env.restore(snapshot)
     same([envs.step(action) for _ in range(2)], first)
-
-
-def test_members_that_are_left_alone_are_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where nothing is due within an episode, only resets ask an environment by itself."""
-    envs = made("native", goals("A"), AutoresetMode.NEXT_STEP)
-    many: Any = envs.env
-    envs.reset(seed=0)
-    asked: list[int] = []
-    bring = many._bring
-    monkeypatch.setattr(many, "_bring", lambda row: asked.append(row) or bring(row))
-    for _ in range(4):
-        envs.step(np.zeros((3, 9), np.float32))
-    assert asked == []
-    envs.step(np.zeros((3, 9), np.float32))
-    assert asked == [0, 1, 2]

@@ -13,10 +13,7 @@ from scm_world import Draw, Shift
 from scm_world.curricula import (
     A,
     B,
-    Do,
-    Follow,
-    NewGoal,
-    as_curriculum,
+    Curriculum,
     at_reset,
     at_step,
     during,
@@ -34,7 +31,8 @@ from scm_world.curricula import (
     together,
     weighted,
 )
-from scm_world.curricula.targets import grouped
+from scm_world.curricula.base import as_part
+from scm_world.curricula.targets import grouped, regions
 from scm_world.errors import (
     InterventionError,
     OutOfBounds,
@@ -49,6 +47,10 @@ from scm_world.variables import Box, Categories, Cylinder, Integers, Normal
 from scm_world.world import Simulation
 
 MASS, FRICTION = "tool_block.mass", "floor_friction"
+SOLVED = {
+    "goal_block.cartesian_position": [0.0, 0.0, 0.0325],
+    "tool_block.cartesian_position": [0.0, 0.0, 0.0325],
+}
 
 
 def test_do_does_the_same_in_every_episode() -> None:
@@ -79,15 +81,23 @@ def test_resample_draws_from_the_space_that_is_named() -> None:
 def test_resample_knows_patterns_groups_and_exceptions() -> None:
     """Patterns and groups name variables; ``besides`` takes some out."""
     world = Simulation("pushing", backend="fake")
-    found = resample(["*.mass", FRICTION], besides="robot_*").targets(world.compiled)
+    found = regions(world.compiled, ["*.mass", FRICTION], besides=["robot_*"])
     assert found == {MASS: "A", FRICTION: "A"}
-    assert MASS in physics().targets(world.compiled)
-    assert set(joints().targets(world.compiled)) == {"joint_positions"}
-    assert set(poses().targets(world.compiled)) == {
+    assert drawn_by(resample(["*.mass", FRICTION], besides="robot_*")) == {MASS, FRICTION}
+    assert MASS in drawn_by(physics())
+    assert drawn_by(joints()) == {"joint_positions"}
+    assert drawn_by(poses()) == {
         "tool_block.cylindrical_position",
         "tool_block.euler_orientation",
     }
-    assert "tool_block.color" in looks().targets(world.compiled)
+    assert "tool_block.color" in drawn_by(looks())
+
+
+def drawn_by(part: Any) -> set[str]:
+    """Return the variables that a part sets at a reset."""
+    env = under(part)
+    env.reset(seed=0)
+    return {name for _, acts in env.unwrapped.interventions for name in acts}
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -98,8 +108,8 @@ def test_groups_fit_every_task(task: str) -> None:
     assert not found["looks"] & found["physics"]
     assert not (found["looks"] | found["poses"]) - found["everything"]
     for group in found:
-        as_curriculum(resample(f"@{group}")).check(world)
-    as_curriculum(goals("A|B")).check(world)
+        Curriculum(resample(f"@{group}")).check(world)
+    Curriculum(goals("A|B")).check(world)
 
 
 def test_goal_draws_what_the_task_draws() -> None:
@@ -112,7 +122,7 @@ def test_goal_draws_what_the_task_draws() -> None:
     moved = {name for name in names if value(env, name) != first[name]}
     assert moved
     assert all("goal" in n or n in ("reward", "fractional_success") for n in moved), moved
-    kept = under(NewGoal("A", besides="goal_block.euler_orientation"))
+    kept = under(goals("A", besides="goal_block.euler_orientation"))
     turns = series(kept, "goal_block.euler_orientation", 3)
     assert turns[0] == turns[1] == turns[2]
 
@@ -242,11 +252,9 @@ def test_stages_go_up_and_down_with_success() -> None:
     """A window of successes leads up, one of failures down; then a new window begins."""
     part = stages({MASS: 0.02}, {MASS: 0.03}, {MASS: 0.04}, up=0.5, down=0.25, window=2)
     env = under(part, max_episode_length=1)
-    done = {"goal_block.cartesian_position": [0.0, 0.0, 0.0325]}
-    done["tool_block.cartesian_position"] = done["goal_block.cartesian_position"]
     found = []
     for success in (1, 1, 0, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0):
-        env.reset(options={"do": done} if success else None)
+        env.reset(options={"do": SOLVED} if success else None)
         found.append(value(env, MASS))
         assert env.step(STILL)[4]["is_success"] is bool(success)
     expected = [2, 2, 3, 3, 4, 4, 4, 4, 4, 3, 3, 2, 2]
@@ -257,12 +265,27 @@ def test_stages_count_the_episodes_in_which_they_act() -> None:
     """Successes of other episodes are not theirs; a part that is there twice counts once."""
     part = stages({MASS: 0.02}, {MASS: 0.03}, up=1.0, window=2)
     env = under(together(during(range(2, 9), part), during(range(2, 9), part)))
-    for success in (True, True, True):
-        env.reset(seed=0)
-        env._turn.ended(success=success)
-        env._running = False
+    for _ in range(3):
+        env.reset(options={"do": SOLVED})
+        assert env.step(STILL)[4]["is_success"]
+    env.reset()
     (progress,) = env.memory.stages.values()
-    assert (progress.level, list(progress.recent)) == (0, [True])
+    assert progress == (0, (True,))
+
+
+def test_stages_that_are_drawn_by_lot_count_when_they_act() -> None:
+    """Of two ladders of which one is drawn, the other one stays where it is."""
+    ladders = [stages({MASS: 0.02 + i}, {MASS: 0.03 + i}, up=1.0, window=50) for i in (0.0, 0.01)]
+    env = under(weighted((1.0, ladders[0]), (1.0, ladders[1])))
+    drawn = []
+    for _ in range(20):
+        env.reset()
+        drawn.append(value(env, MASS))
+        env.step(STILL)
+    env.reset()
+    counts = [len(env.memory.stages[ladder.key].recent) for ladder in ladders]
+    assert counts == [drawn.count(0.02), drawn.count(0.03)]
+    assert min(counts) > 0
 
 
 WRONG: list[Any] = [
@@ -290,9 +313,9 @@ WRONG: list[Any] = [
     lambda: interpolate({MASS: Draw("A")}, episodes=2),
     lambda: interpolate({MASS: 0.1}, start={FRICTION: 0.3}, episodes=2),
     lambda: follow(5),
-    lambda: Follow({"kind": "linear", "weights": [1.0]}),
-    lambda: Do({MASS: "C"}),
-    lambda: Do(5),  # type: ignore[arg-type]
+    lambda: follow({"kind": "linear", "weights": [1.0]}),
+    lambda: as_part({MASS: "C"}),
+    lambda: as_part({"kind": "do", "request": 5}),
 ]
 
 
@@ -314,7 +337,7 @@ IMPOSSIBLE: list[tuple[Any, type[ScmWorldError]]] = [
     (resample(MASS, Box((0.1, 0.2), (0.2, 0.3))), InterventionError),
     (resample("*.cartesian_position", "A"), InterventionError),
     (resample("solver_preset", Normal(0.0, 1.0)), InterventionError),
-    (NewGoal("A", besides=["gravity"]), UnknownVariable),
+    (goals("A", besides=["gravity"]), UnknownVariable),
     (interpolate({"tool_blok.mass": 0.1}, episodes=5), UnknownVariable),
     (interpolate({MASS: -0.1}, episodes=5), OutOfBounds),
     (interpolate({"gravity": [0.0, 0.0]}, episodes=5), WrongValue),
@@ -347,7 +370,7 @@ def test_whole_numbers_are_drawn_from_whole_numbers() -> None:
         (lambda: resample([]), "what cannot be"),
         (lambda: during(range(5, 5), goals()), "episodes cannot be"),
         (
-            lambda: as_curriculum({"kind": "during", "first": 5, "stop": 5, "part": {}}),
+            lambda: Curriculum({"kind": "during", "first": 5, "stop": 5, "part": {}}),
             "stop cannot",
         ),
     ],

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from curriculum_envs import ENGINES, STILL, TOWERS, series, under, value
 
 from scm_world.curricula import (
-    at_step,
     everything,
     follow,
     goals,
@@ -21,7 +18,7 @@ from scm_world.curricula import (
 )
 from scm_world.env import IDS
 from scm_world.errors import InterventionError, OutOfBounds, UnknownVariable
-from scm_world.variables import Integers
+from scm_world.variables import Hard, Integers
 
 NUMBER, FEW = "number_of_blocks_in_tower", Integers(1, 2)
 LATE = "tool_level_5_col_0_row_0"
@@ -63,10 +60,8 @@ def test_numbers_are_the_same_whatever_else_is_drawn() -> None:
 
 def test_what_is_refused_in_the_second_half_takes_the_first_back() -> None:
     """If the bodies cannot be as asked, they do not come either."""
-    env = under(
-        together({NUMBER: [1, 1, 6]}, at_step(1, together({NUMBER: [1, 1, 2]}, follow(_wrong)))),
-        TOWERS,
-    )
+    wrong = {NUMBER: Hard([1, 1, 2], at=1), "tool_level_1_col_0_row_0.mass": Hard(-1.0, at=1)}
+    env = under(together({NUMBER: [1, 1, 6]}, follow(lambda _: wrong)), TOWERS)
     env.reset(seed=0)
     before = env.unwrapped.world.values()
     with pytest.raises(OutOfBounds):
@@ -76,12 +71,6 @@ def test_what_is_refused_in_the_second_half_takes_the_first_back() -> None:
     assert after.keys() == before.keys()
     assert [step for step, _ in env.unwrapped.interventions] == [0]
     assert env.step(STILL)[0].shape == env.observation_space.shape
-
-
-def _wrong(situation: Any) -> dict[str, Any] | None:
-    """Ask for a negative mass once the two levels are there."""
-    blocks = len(situation.compiled.composition.blocks)
-    return {"tool_level_1_col_0_row_0.mass": -1.0} if blocks == 2 else None
 
 
 def test_a_name_that_never_comes_is_refused_at_the_reset() -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import pickle
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -26,6 +27,7 @@ from scm_world.curricula import (
     everything,
     follow,
     goals,
+    in_turn,
     interpolate,
     looks,
     make_vec,
@@ -36,7 +38,6 @@ from scm_world.curricula import (
     together,
     when,
 )
-from scm_world.curricula.base import Part
 from scm_world.env.wrappers import MovingAverageAction
 from scm_world.errors import (
     FunctionFailure,
@@ -46,6 +47,7 @@ from scm_world.errors import (
     UnreadableFile,
 )
 from scm_world.models.scene import TOLERANCE
+from scm_world.queries.plans import do
 from scm_world.tasks.trifinger.entities.block_world import overlaps
 from scm_world.variables import Hard, Reaches
 
@@ -219,7 +221,7 @@ def test_an_environment_that_has_begun_goes_on_in_its_noise() -> None:
 
 
 def test_wrappers_may_be_inside_and_outside() -> None:
-    """Observation wrappers inside see the intervention; those that remember go outside."""
+    """They see what is observed after an intervention."""
     base: Any = gymnasium.make(PUSHING, backend="fake", disable_env_checker=True)
     averaged = MovingAverageAction(base, 1)
     halved = TransformObservation(averaged, lambda seen: seen / 2, base.observation_space)
@@ -230,10 +232,12 @@ def test_wrappers_may_be_inside_and_outside() -> None:
     assert CurriculumEnv(flat, goals("A")).reset(seed=0)[0].shape == flat.observation_space.shape
     low = RescaleObservation(base, np.float32(0.0), np.float32(1.0))
     assert low.observation_space.contains(CurriculumEnv(low, poses("A")).reset(seed=0)[0])
-    with pytest.raises(UnknownOption, match="put FrameStackObservation around"):
-        CurriculumEnv(FrameStackObservation(base, 2), goals("A"))
-    stacked: Any = FrameStackObservation(CurriculumEnv(base, goals("A")), 2)
-    assert stacked.reset(seed=0)[0].shape == (2, 56)
+    part = together(goals("A"), at_step(1, poses("B")))
+    stacked: Any = FrameStackObservation(CurriculumEnv(base, part), 2)
+    seen = [stacked.reset(seed=0)[0], stacked.step(STILL)[0]]
+    inner = CurriculumEnv(FrameStackObservation(base, 2), part)
+    np.testing.assert_array_equal(seen, [inner.reset(seed=0)[0], inner.step(STILL)[0]])
+    assert seen[0].shape == (2, 56)
 
 
 def test_other_environments_are_refused() -> None:
@@ -264,7 +268,7 @@ def test_episodes_are_counted_when_they_end() -> None:
     env.reset()
     assert env.memory.episode == 3
     (progress,) = env.memory.stages.values()
-    assert list(progress.recent) == [False, False]  # one without a step tells nothing
+    assert progress.recent == (False, False)  # one without a step tells nothing
     around = TimeLimit(under(part), 1)
     around.reset(seed=0)
     around.step(STILL)
@@ -317,40 +321,27 @@ def test_what_is_no_state_is_refused() -> None:
     for wrong in (
         5,
         {},
-        {"episode": "x", "stages": {}},
+        {"episode": "x", "stages": {}, "noise": None},
         {**before, "noise": 5},
         {**before, "noise": [1, -1]},
     ):
         with pytest.raises(UnreadableFile, match="state"):
             env.resume(wrong)
-    with pytest.raises(UnreadableFile, match=r"'stages' is missing; give what state\(\) returned"):
-        env.resume({"a": 1})
+    with pytest.raises(UnreadableFile, match=r"Field required.*; give what state\(\) returned"):
+        env.resume({"episode": 1})
     assert env.state() == before
 
 
-class Wild(Part):
-    """A part of a user's own that fails."""
-
-    kind: Literal["wild"] = "wild"
-
-    def acts(self, situation: Any) -> dict[str, Any]:
-        """Fail."""
-        return {}["mass"]  # type: ignore[no-any-return]
-
-
 def test_errors_of_a_user_are_named() -> None:
-    """Of a function, with its name; of a part, with the place; the cause is the error itself."""
+    """Of a function, with its name; the cause is the error itself."""
 
     def fragile(situation: Any) -> dict[str, Any]:
         return {}["mass"]  # type: ignore[no-any-return]
 
-    for curriculum, words in (
-        (follow(fragile), "fragile' of a curriculum raised KeyError: 'mass'"),
-        (Wild(), "in episode 0, raised KeyError: 'mass'"),
-    ):
-        with pytest.raises(FunctionFailure, match=words) as refused:
-            under(curriculum).reset(seed=0)
-        assert isinstance(refused.value.__cause__, KeyError)
+    words = "fragile' of a curriculum raised KeyError: 'mass'"
+    with pytest.raises(FunctionFailure, match=words) as refused:
+        under(follow(fragile)).reset(seed=0)
+    assert isinstance(refused.value.__cause__, KeyError)
 
 
 @pytest.mark.parametrize("given", [3, [("do", {})]])
@@ -401,3 +392,43 @@ def test_an_event_within_the_episode_is_a_predicate_of_the_plan() -> None:
     for _ in range(2):
         env.reset()
         assert along(env, MASS, 4) == [0.02, 0.05, 0.05, 0.05]
+
+
+def test_a_plan_is_a_part() -> None:
+    """Its times are those of every episode, and together with others it counts as any part."""
+    plan = do({MASS: (0.03, Hard(0.05, at=2)), "floor_friction": Hard(0.2, at=1)})
+    for curriculum in (plan, Curriculum(plan), together({"floor_friction": 0.5}, plan)):
+        env = under(curriculum)
+        for _ in range(2):
+            env.reset()
+            assert [value(env, MASS), *along(env, MASS, 3)] == [0.03, 0.03, 0.05, 0.05]
+            assert value(env, "floor_friction") == 0.2
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_snapshot_has_the_plan_and_the_stages(inside: bool) -> None:
+    """Also of an episode before the present one, and of two curricula around one another."""
+    part = together(
+        interpolate({MASS: 0.1}, start={MASS: 0.02}, episodes=8),
+        at_step(2, resample("floor_friction")),
+        when(Reaches("control_index", above=2.5), {"gravity": [0.0, 0.0, -5.0]}),
+        stages({}, {"restitution": 0.3}, up=0.01, window=2),
+    )
+    env = under(part, max_episode_length=4)
+    env = CurriculumEnv(env, in_turn({}, {"stage_friction": 0.3})) if inside else env
+    env.reset(seed=4)
+    env.step(STILL)
+    saved, state = env.snapshot(), env.state()
+
+    def rest() -> list[Any]:
+        seen = [env.step(STILL)[0] for _ in range(3)]
+        for _ in range(2):
+            seen += [env.reset()[0], *(env.step(STILL)[0] for _ in range(4))]
+        return [*seen, env.state(), env.unwrapped.world.values()]
+
+    first = rest()
+    env.restore(saved)
+    assert env.state() == state
+    np.testing.assert_equal(rest(), first)
+    env.restore(pickle.loads(pickle.dumps(saved)))  # noqa: S301 # our own
+    np.testing.assert_equal(rest(), first)

@@ -16,7 +16,7 @@ from scm_world.discovery.data import (
     default_causes,
     default_outcomes,
 )
-from scm_world.env.observer import Observing, observer
+from scm_world.env.observer import Observer, Observing
 from scm_world.errors import (
     Forbidden,
     InterventionError,
@@ -287,12 +287,12 @@ def test_the_range_is_that_of_the_observations(world: World) -> None:
     from scm_world.discovery.data.worlds import half_range
 
     how: Any = Observing(normalize_observations=False)
-    vector = observer(world, world.compiled, how, None, world.compiled)
-    for name, place in vector.layouts["observation"].items():
+    vector: Any = Observer(world, world.compiled, how, world.compiled).parts["observation"]
+    for name, place in vector.layout.items():
         if world.model.declared(name).role in ("state", "readout"):
             np.testing.assert_array_equal(
                 half_range(world, name),
-                vector._spread[place],  # type: ignore[attr-defined]
+                vector._spread[place],
             )
 
 

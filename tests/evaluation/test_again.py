@@ -18,7 +18,6 @@ from evaluation_samples import (
     small,
 )
 
-from scm_world import World
 from scm_world.errors import (
     ModelError,
     SnapshotMismatch,
@@ -26,7 +25,7 @@ from scm_world.errors import (
 )
 from scm_world.evaluation import Evaluation, why
 from scm_world.evaluation import files as files_module
-from scm_world.queries import save_episode
+from scm_world.policies import save_policy
 from scm_world.tasks import make_task
 from scm_world.variables import Draw, Shift, Subset
 
@@ -102,12 +101,15 @@ def test_other_versions_are_not_compared() -> None:
 
 def test_one_file_in_two_places_is_one_policy(tmp_path: Path) -> None:
     """Where a machine keeps a policy does not matter, its content does."""
-    episode = World("pushing", backend="fake").rollout("sweep", seed=0, steps=4)
+    layers = {
+        "layers.0.weight": np.full((9, 56), 0.05, np.float32),
+        "layers.0.bias": np.zeros(9, np.float32),
+    }
     tables = []
     for name in ("here", "there"):
         (tmp_path / name).mkdir()
-        save_episode(episode, tmp_path / name / "policy.npz")
-        tables.append(small(str(tmp_path / name / "policy.npz"), out=tmp_path / "out"))
+        path = save_policy(tmp_path / name / "policy.safetensors", layers, {"task": "pushing"})
+        tables.append(small(str(path), out=tmp_path / "out"))
     assert len(contents(tmp_path / "out")) == 2
     assert tables[1] == tables[0]
 

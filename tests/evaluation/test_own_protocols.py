@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scm_world.curricula import Resample, every, stages, together
+from scm_world.curricula import every, resample, stages, together
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ModelError, ScmWorldError, UnknownOption
 from scm_world.evaluation import Protocol, evaluate, protocols_of
@@ -31,7 +31,7 @@ def test_one_line_makes_a_protocol() -> None:
             "subset", [mass, "floor_friction"], Subset({mass: Box(0.02, 0.03), "floor_*": "B"})
         ),
         Protocol("normal", mass, Normal(0.05, 0.001)),
-        Protocol("part", act=together({"floor_friction": 0.7}, Resample(mass, space="A"))),
+        Protocol("part", act=together({"floor_friction": 0.7}, resample(mass, "A"))),
         Protocol("fixed", act={T: {"mass": 0.03}}),
     ]
     here = EpisodeRunner(ScmWorldEnv(backend="fake"))
@@ -201,7 +201,7 @@ def test_functions_in_files_have_to_be_trusted() -> None:
 def test_d11_every_step_of_an_episode_can_be_acted_at() -> None:
     """The control step counts, not the episode: a part that acts every second step does."""
     here = EpisodeRunner(ScmWorldEnv(backend="fake", max_episode_length=6))
-    often = Protocol("often", act=every(2, Resample("floor_friction", space="B"), first=2))
+    often = Protocol("often", act=every(2, resample("floor_friction", "B"), first=2))
     for episode in range(3):
         here.play(as_player("still"), often, seed=0, episode=episode)
         assert [step for step, _ in here.env.interventions] == [2, 4]

@@ -14,11 +14,10 @@ import gymnasium
 import numpy as np
 import pytest
 
-import scm_world
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.players import NAMES, WorldPolicy, as_player, checked, player_from
 from scm_world.policies import Layer, MlpPolicy
-from scm_world.queries import Random, save_episode
+from scm_world.queries import Random
 
 STEPS = 6
 
@@ -292,24 +291,6 @@ def test_given_actions_are_played_and_the_last_one_is_held() -> None:
     np.testing.assert_array_equal(played([0.5] * 9, make()), np.full((STEPS, 9), 0.5))
     with pytest.raises(ActionError, match=r"shape \(9,\)"):
         played(np.zeros((2, 8)), make())
-
-
-def test_a_saved_episode_is_played(tmp_path: Path) -> None:
-    """Its commands reach the world bit for bit where actions are in SI units."""
-    world = scm_world.World("pushing", backend="fake")
-    episode = world.rollout(steps=4, seed=1, policy="random")
-    path = save_episode(episode, tmp_path / "episode")
-    raw = played(path, make(normalize_actions=False))
-    np.testing.assert_array_equal(raw[:4], episode.actions)
-    env = make()
-    np.testing.assert_array_equal(played(str(path), env), played(episode, env))
-    np.testing.assert_allclose(
-        env.unwrapped.world["action"], np.clip(episode.actions[-1], -10, 10), atol=1e-9
-    )
-    with pytest.raises(UnknownOption, match="action_mode"):
-        played(path, make(action_mode="joint_torques"))
-    about = as_player(path).about
-    assert player_from(about).about == about
 
 
 # --- files ------------------------------------------------------------------------------------

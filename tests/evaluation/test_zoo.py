@@ -228,4 +228,4 @@ def test_a_policy_of_the_zoo_acts_in_a_world_as_in_an_environment() -> None:
         assert episode.counterfactual({}, at=4, actions=policy) == episode
     for _ in range(12):
         observation, *_ = env.step(player.act(observation))
-    assert env.world.vector.tobytes() == episode.trace.vectors[-1].tobytes()
+    assert env.world.vector.tobytes() == episode.vectors[-1].tobytes()

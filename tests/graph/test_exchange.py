@@ -12,9 +12,9 @@ import pytest
 from graph_models import small
 
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.graph import SCM, unrolled
+from scm_world.graph import SCM
 from scm_world.graph.exchange import space_lines, to_digraph
-from scm_world.graph.views import slices_of, to_dag, window_of
+from scm_world.graph.views import to_dag, unrolled, window_of
 from scm_world.queries import identify
 from scm_world.tasks import TASKS, make_task
 from scm_world.variables import Affine, Box, Either, Exogenous, Measured, Parent, Switch
@@ -127,7 +127,7 @@ def test_two_slices_separate_what_a_long_past_separates(seed: int) -> None:
         if (lag or cause < effect) and rng.random() < 0.25:
             graph.add_edge(cause, effect, lag, lag=lag)
     window = window_of(graph)
-    long = slices_of(graph, 60)
+    long = unrolled(graph, 60)
     nodes = [node for node in window if node[1] <= 0]
     for _ in range(30):
         x, y, *rest = (nodes[i] for i in rng.permutation(len(nodes)))

@@ -10,7 +10,13 @@ import pytest
 
 from scm_world import SCM
 from scm_world.discovery.data import Design, as_frame, collect
-from scm_world.errors import ImpossibleObservation, ModelError, UnknownOption, UnknownVariable
+from scm_world.errors import (
+    FunctionFailure,
+    ImpossibleObservation,
+    ModelError,
+    UnknownOption,
+    UnknownVariable,
+)
 from scm_world.queries import Counterfactuals
 from scm_world.variables import (
     Action,
@@ -20,6 +26,7 @@ from scm_world.variables import (
     Categories,
     Derived,
     Draw,
+    Either,
     Exogenous,
     Hard,
     Integers,
@@ -931,3 +938,28 @@ def test_other_coordinates_of_what_was_observed(was: Any, do: Any) -> None:
     assert found.exact
     for name, values in wanted.draw(3, seed=0).items():
         np.testing.assert_allclose(found[name], values, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("back", "match"),
+    [
+        (lambda v, x: {}["none"], "raised KeyError"),
+        (lambda v, x: np.zeros(7), "raised ValueError"),
+        (lambda v, x: v, "no value of its noise"),
+    ],
+)
+def test_a_wrong_inverse_is_named(back: Any, match: str) -> None:
+    """One that raises, has another shape, or is not the inverse."""
+    with pytest.raises((FunctionFailure, ImpossibleObservation), match=f"'y'.*{match}"):
+        line(mechanism=lambda x, noise: x + noise, inverse_noise=back).counterfactual(
+            {"x": 1.0, "y": 2.0}, do={"x": 0.0}
+        )
+
+
+@pytest.mark.parametrize("space", [Either(Box(0.0, 1.0), Box(2.0, 3.0)), Box(1.0, 1.0)])
+def test_what_lies_outside_a_space_is_impossible(space: Any) -> None:
+    """Whatever its density is."""
+    model = SCM([Exogenous(name="x", distribution=space), *line().variables[1:]])
+    assert model.counterfactual({"x": 1.0, "y": 2.0}, do={"x": 0.5})["y"] == 1.0
+    with pytest.raises(ImpossibleObservation, match="'x'"):
+        model.counterfactual({"x": 1.5, "y": 2.0}, do={"x": 0.5})

@@ -206,7 +206,7 @@ def test_an_episode_in_a_file_happens_again(tmp_path: Path, backend: str) -> Non
     assert again.twins.options["frame_skip"] == 5
     ask = (
         "import sys; from scm_world.queries import load_episode; "
-        "print(load_episode(sys.argv[1]).trace.vectors[-1].tobytes().hex())"
+        "print(load_episode(sys.argv[1]).vectors[-1].tobytes().hex())"
     )
     elsewhere = subprocess.run(  # noqa: S603 # our own
         [sys.executable, "-c", ask, str(tmp_path / "branch.npz")],
@@ -214,7 +214,7 @@ def test_an_episode_in_a_file_happens_again(tmp_path: Path, backend: str) -> Non
         text=True,
         check=True,
     )
-    assert elsewhere.stdout.strip() == branch.trace.vectors[-1].tobytes().hex()
+    assert elsewhere.stdout.strip() == branch.vectors[-1].tobytes().hex()
 
 
 def test_a_file_that_is_none_is_refused(tmp_path: Path) -> None:

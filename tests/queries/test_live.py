@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
 
+import numpy as np
 import pytest
 
 from scm_world.errors import ActionError, InterventionError, UnknownOption
-from scm_world.queries import SCM, Plan, World
-from scm_world.queries.live import LiveEpisode
+from scm_world.queries import SCM, Episode, Plan, World
 from scm_world.variables import (
     Derived,
     Draw,
@@ -18,6 +20,7 @@ from scm_world.variables import (
     Natural,
     Normal,
     Parent,
+    Reaches,
     Shift,
 )
 
@@ -31,7 +34,7 @@ def world() -> Iterator[World]:
         yield made
 
 
-def walked(live: LiveEpisode, steps: int) -> None:
+def walked(live: Episode, steps: int) -> None:
     """Take some control steps with the policy."""
     for _ in range(steps):
         live.step()
@@ -53,7 +56,7 @@ def test_it_is_the_episode_of_its_plan(world: World) -> None:
     assert episode.steps == 15
     plan = {MASS: [Hard(0.05, during=(5, None))], FRICTION: Hard(0.2, during=(9, 12))}
     assert world.rollout("random", seed=3, do=plan, steps=15) == episode
-    assert world.rollout(live.actions, seed=3, do=live.plan(), steps=15) == episode
+    assert world.rollout(live.actions, seed=3, do=live.plan, steps=15) == episode
     assert episode.counterfactual({}, at=10) == episode
     assert not world.has_begun
 
@@ -90,7 +93,7 @@ def test_the_plan_says_what_was_done(world: World) -> None:
     live.do({MASS: Natural()})
     live.do({FRICTION: Hard(0.4, during=(9, 11))})
     walked(live, 6)
-    plan = Plan.from_json(live.plan().to_json())
+    plan = Plan.from_json(live.plan.to_json())
     assert world.rollout("random", seed=5, do=plan, steps=15) == live.episode()
 
 
@@ -160,3 +163,44 @@ def test_equations_are_run_by_hand_too() -> None:
         twin.step(action)
     assert live.episode() == model.rollout(seed=4, steps=6)
     assert twin.episode() == live.episode().counterfactual({"push": 1.0}, at=2)
+
+
+def some_request(rng: np.random.Generator, now: int) -> dict[str, Hard | Shift | Draw]:
+    """Return an intervention at random, with a time from now on."""
+    times: list[dict[str, Any]] = [
+        {},
+        {"at": now + int(rng.integers(4))},
+        {"during": (now + int(rng.integers(3)), now + int(rng.integers(3, 7)))},
+        {"during": (now, None)},
+        {"at": int(rng.integers(5)), "every": int(rng.integers(1, 4))},
+        {"when": Reaches("joint_velocities", above=0.2, component=int(rng.integers(9)))},
+    ]
+    time, value = times[rng.integers(len(times))], float(rng.uniform(0.02, 0.06))
+    if rng.integers(8) == 0:
+        return {PLACE: Hard([0.0, -value, 0.0325], **time)}
+    name = (MASS, "joint_damping")[rng.integers(2)]
+    return {name: (Hard(value, **time), Shift(0.001, **time), Draw("A", **time))[rng.integers(3)]}
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_whatever_is_done_by_hand_is_in_the_plan(seed: int) -> None:
+    """Cut windows, events, repetitions and draws happen again, in rollouts, branches and splits."""
+    rng, world = np.random.default_rng(seed), World("pushing", backend="fake")
+    live = world.live("random", seed=seed)
+    for _ in range(12):
+        for _ in range(rng.integers(3)):
+            with suppress(InterventionError):
+                live.do(some_request(rng, live.steps))
+        with suppress(InterventionError):
+            live.step()
+    episode, at = live.episode(), int(rng.integers(live.steps))
+    plan = Plan.from_json(episode.plan.to_json())
+    assert world.rollout(live.actions, seed=seed, do=plan, steps=episode.steps) == episode
+    assert episode.counterfactual({}, at=at) == episode
+    other = episode.counterfactual({MASS: Hard(0.07, at=at)}, at=at)
+    assert other.counterfactual({}, at=int(rng.integers(at + 1))) == other
+    twin = live.split({MASS: 0.07}, at=at)
+    for action in live.actions[at:]:
+        with suppress(InterventionError):
+            twin.step(action)
+    assert twin.episode() == other

@@ -72,7 +72,7 @@ def test_an_episode_without_it_is_exact(backend: str) -> None:
     assert largest < {"mujoco": 1e-12, "bullet": 1e-4}[backend]
     assert (6, ("floor", GONE), 0) in apart.contacts
     late = world.rollout(steps=12, do={GONE: Null(at=5)})
-    np.testing.assert_array_equal(late.trace.vectors[-1], other.trace.vectors[-1])
+    np.testing.assert_array_equal(late.vectors[-1], other.vectors[-1])
 
 
 def test_walls_and_goals_go_too_and_what_follows_from_them() -> None:

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from scm_world.errors import InterventionError, ModelError, UnknownOption
+from scm_world.errors import InterventionError, ModelError, ScmWorldError, UnknownOption
 from scm_world.queries import SCM, Plan, World, do
 from scm_world.variables import (
     Box,
@@ -79,7 +79,7 @@ def test_later_wins_and_nothing_changes() -> None:
 )
 def test_what_is_no_plan_is_refused(make) -> None:  # type: ignore[no-untyped-def] # a table
     """At once, with what it can be."""
-    with pytest.raises(UnknownOption, match="can be"):
+    with pytest.raises(ScmWorldError, match="can be"):
         make()
 
 
@@ -248,3 +248,25 @@ def test_models_of_one_instant_know_no_later_one() -> None:
         with pytest.raises(UnknownOption, match="has one instant"):
             model.rollout(do={"a": late})
     assert model.rollout(do={"a": Hard(0.5, at=0)}).final("a") == 0.5
+
+
+def test_a_plain_number_beside_an_intervention_is_a_hard_one() -> None:
+    """In a tuple of several as by itself."""
+    both = Plan({"floor_friction": (0.3, Hard(0.2, at=5), "A")})
+    assert both == Plan({"floor_friction": (Hard(0.3), Hard(0.2, at=5), Draw("A"))})
+    assert Plan.from_json(both.to_json()) == both
+
+
+def test_names_are_text() -> None:
+    """Anything else is refused with what is allowed."""
+    for request in ({1: 2.0}, {None: 2.0}, {("a", "b"): 2.0}):
+        with pytest.raises(UnknownOption, match=r"name of a variable .* text"):
+            Plan(request)  # type: ignore[arg-type]
+
+
+def test_what_is_not_finite_is_not_written() -> None:
+    """All such variables are named; doing it is refused, too."""
+    plan = Plan({"a": float("nan"), "b": Shift([1.0, float("inf")], at=2), "c": 1.0})
+    with pytest.raises(ModelError, match=r"do\(a\).*not finite") as refused:
+        plan.to_json()
+    assert len(refused.value.problems) == 2

@@ -619,14 +619,39 @@ def test_equations_without_a_name_are_given_on_reading(tmp_path: Path) -> None:
 
 
 def test_an_episode_of_equations_is_no_policy(tmp_path: Path) -> None:
-    """Its actions are not those of an environment."""
+    """Its actions are: an array is."""
     episode = equations().rollout("random", steps=2)
     saved = save_episode(SCM([RATE]).rollout(), tmp_path / "episode")
     for policy in (episode, saved):
-        with pytest.raises(UnknownOption, match="an episode of a world"):
+        with pytest.raises(UnknownOption, match="an array of actions"):
             as_player(policy)
 
 
 def test_the_world_is_one_of_a_step_function() -> None:
     """Both sides of the comparison are what they are said to be."""
     assert isinstance(world().task, StepTask)
+
+
+def test_equations_are_a_world() -> None:
+    """They are reset, stepped, intervened on and asked; what is given leaves the first as it is."""
+    model = equations()
+    with World(model) as world:
+        assert world.action_space.shape == (world.compiled.n_actions,)
+        assert {*world.observation_space} == {*model}
+        world.reset(seed=3)
+        audit = world.do({"rate": 1.0})
+        assert {*audit.targets} == {"rate"}
+        kept = world.snapshot()
+        other = world.given({"rate": 2.0})
+        assert (world["rate"], other["rate"]) == (1.0, 2.0)
+        for _ in range(4):
+            world.step(world.idle())
+        lived = model.rollout(seed=3, do={"rate": 1.0}, steps=4)
+        assert all(np.array_equal(lived.final(name), world[name]) for name in model)
+        assert world.rollout(seed=3, do={"rate": 1.0}, steps=4) == lived
+        world.restore(kept)
+        assert world.index == 0
+        assert world.reset(do={"rate": 0.0}) is not None
+        assert (world.noise.seed, world.episode) == (3, 1)
+        with pytest.raises(SnapshotMismatch):
+            world.restore(SCM([]))

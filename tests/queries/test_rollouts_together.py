@@ -15,12 +15,11 @@ from scm_world.backends.mujoco.batch import MujocoBatch
 from scm_world.discovery.data import Design
 from scm_world.discovery.data.collect import source_of
 from scm_world.errors import EngineFailure, OutOfBounds, UnknownVariable
-from scm_world.queries import Outcome, World, parallel
-from scm_world.queries.episodes import Episode
-from scm_world.queries.parallel import is_known, run_together
-from scm_world.queries.rollouts import Trace, Unit
+from scm_world.queries import Outcome, World
+from scm_world.queries import twins as parallel
+from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.samples import Setting
-from scm_world.queries.twins import Twins, twins_of
+from scm_world.queries.twins import Twins, is_known, run_together, twins_of
 from scm_world.variables import Contact, Hard, Mechanism, Null, Reaches
 
 BULLET = pytest.mark.skipif(
@@ -62,16 +61,16 @@ def units_of(world: World, plans: Sequence[Mapping[str, Any]], **setting: Any) -
     return [made.unit(world, plan, i, names) for i, plan in enumerate(plans)]
 
 
-def alone(twins: Twins, units: Sequence[Unit]) -> list[Trace | Exception]:
+def alone(twins: Twins, units: Sequence[Unit]) -> list[Episode | Exception]:
     """Let units happen one after another."""
     with twins.twin() as world:
         return [unit.result(world) for unit in units]
 
 
-def together(twins: Twins, units: Sequence[Unit], threads: int = 2) -> list[Trace | Exception]:
+def together(twins: Twins, units: Sequence[Unit], threads: int = 2) -> list[Episode | Exception]:
     """Let units happen at the same time."""
     with twins.together(len(units), units[0].names, threads) as batch:
-        return run_together(batch, units)
+        return run_together(batch, units, twins)
 
 
 def same_values(one: Any, other: Any) -> bool:
@@ -80,19 +79,19 @@ def same_values(one: Any, other: Any) -> bool:
     return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
 
 
-def assert_same(one: Trace | Exception, other: Trace | Exception) -> None:
+def assert_same(one: Episode | Exception, other: Episode | Exception) -> None:
     """Compare all that two units leave behind, but for snapshots."""
-    if not isinstance(one, Trace) or not isinstance(other, Trace):
+    if not isinstance(one, Episode) or not isinstance(other, Episode):
         assert (type(one), str(one)) == (type(other), str(other))
         return
-    for a, b in ((one.vectors, other.vectors), (one.actions, other.actions)):
+    for a, b in ((one.vectors, other.vectors), (one.taken, other.taken)):
         assert len(a) == len(b)
         assert all(map(same_values, a, b))
     assert [step for step, _ in one.statics] == [step for step, _ in other.statics]
     for (_, mine), (_, its) in zip(one.statics, other.statics, strict=True):
         assert mine.keys() == its.keys()
         assert all(same_values(mine[name], its[name]) for name in mine)
-    plans = ([(at, found.plan) for at, found in trace.declarations] for trace in (one, other))
+    plans = ([(at, found.plan) for at, found in episode.declarations] for episode in (one, other))
     assert next(plans) == next(plans)
     assert one.fired == other.fired
     assert {at: str(a) for at, a in one.audits.items()} == {
@@ -150,18 +149,17 @@ def test_branches_together_are_those_alone(at: int) -> None:
         "gravity": Hard([0, 0, -5], at=12),
     }
     (unit,) = units_of(world, [event], steps=24, policy="across")
-    (ending,) = together(twins, [unit])
-    assert isinstance(ending, Trace)
-    episode = Episode(twins, unit, ending)
+    (episode,) = together(twins, [unit])
+    assert isinstance(episode, Episode)
     lived = world.rollout("across", seed=0, do=event, steps=24)
     assert episode == lived
-    assert not episode.trace.snapshots
+    assert not episode.snapshots
     dos = [{"tool_block.mass": 0.02 + 0.001 * i} for i in range(24)]
     branches = episode.worlds(dos, at=at, record=["reward"], workers=2)
     assert len(branches) == 24
     for do, branch in zip(dos[::6], branches[::6], strict=True):
         single = lived.counterfactual(do, at=at, record=["reward"])
-        assert_same(single.trace, branch.trace)
+        assert_same(single, branch)
         assert episode.counterfactual(do, at=at) == single
     again = branches[3].counterfactual({"floor_friction": 0.5}, at=at)
     first = lived.counterfactual(dos[3], at=at).counterfactual({"floor_friction": 0.5}, at=at)
@@ -269,7 +267,7 @@ def test_processes_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
         one, two = (episode.worlds(dos, at=at, record=["reward"], workers=w) for w in (1, 2))
         assert len(set(multiprocessing.active_children()) - others) == 2
         for first, second in zip(one, two, strict=True):
-            assert_same(first.trace, second.trace)
+            assert_same(first, second)
         assert two[1].counterfactual({"floor_friction": 0.3}, at=9) == one[1].counterfactual(
             {"floor_friction": 0.3}, at=9
         )

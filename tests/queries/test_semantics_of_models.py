@@ -121,7 +121,7 @@ def test_discrete_noises_have_their_shares(given: Any, shares: dict[Any, float])
     ("make", "words"),
     [
         (lambda: Continuous("nothing"), "scipy.stats"),
-        (lambda: Gamma(-1.0), "no distribution"),
+        (lambda: Gamma(-1.0), "not a distribution"),
         (lambda: Continuous("norm", width=1.0), "width"),
         (lambda: Discrete((1, 2), (0.5, 0.6)), "sum to 1.1"),
         (lambda: Discrete((1, 2), (1.0,)), "as many"),

@@ -21,7 +21,6 @@ from scm_world import (
     StepTask,
     World,
 )
-from scm_world.queries.twins import asked
 from scm_world.variables import Normal
 
 CART_POLE = """
@@ -180,7 +179,7 @@ class Kind:
     def system(self) -> Any:
         """Return a system of its own to reset, step and intervene on."""
         made = self.make()
-        return asked(made)[1] if isinstance(made, SCM) else made
+        return World(made) if isinstance(made, SCM) else made
 
 
 @cache

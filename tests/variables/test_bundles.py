@@ -119,7 +119,7 @@ def test_what_is_wrong_with_a_bundle_is_said_of_it() -> None:
 
 def test_a_draw_of_a_bundle_belongs_to_its_parts_only() -> None:
     """Another variable has no part in it."""
-    with pytest.raises(InterventionError, match="no part of the bundle"):
+    with pytest.raises(InterventionError, match="not a part of the bundle"):
         model().do({"sum": Draw(Box(0.0, 1.0), of="both")})
 
 

@@ -96,4 +96,4 @@ def test_noise_is_compared_by_its_seed() -> None:
     """Two noises of one seed are one value."""
     assert Noise(3) == Noise(3) != Noise(4)
     assert len({Noise(3), Noise(3)}) == 1
-    assert repr(Noise(3)) == "Noise(3)"
+    assert repr(Noise(3)) == "Noise(seed=3)"

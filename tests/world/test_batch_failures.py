@@ -91,19 +91,6 @@ def test_an_interrupted_batch_is_where_its_engine_is(monkeypatch: pytest.MonkeyP
         assert other["reward"] == batch.table(index)["reward"][index]
 
 
-def test_what_was_not_computed_is_remembered_all_the_same() -> None:
-    """What a step leaves out is computed as soon as a later step needs it."""
-    alone, many = _worlds(), _worlds()
-    batch = Batch(many, names=("reward",))
-    for step, asked in enumerate(_commands(alone[0], 6)):
-        batch.advance(asked, evaluate=step % 3 == 2)
-        for index, world in enumerate(alone):
-            world.advance(asked[index].copy())
-            if step % 3 == 2:
-                now = world.evaluate(("reward",))
-                assert batch.table(index)["reward"][index] == now["reward"]
-
-
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_batch_goes_on_in_a_forked_process() -> None:

@@ -15,12 +15,10 @@ from scm_world.discovery.data.recorded import reached
 from scm_world.discovery.data.truth import truth_of_model
 from scm_world.graph import SCM
 from scm_world.graph.structure import Edge
-from scm_world.queries.equations import Equations
+from scm_world.queries.episodes import Unit
+from scm_world.queries.equations import length
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.parallel import paths
-from scm_world.queries.plans import Schedule
-from scm_world.queries.rollouts import Unit
-from scm_world.queries.twins import EquationTwins
+from scm_world.queries.twins import asked
 
 FORMAT = "scm_world/dataset/1"
 
@@ -95,8 +93,8 @@ class ModelSource:
 
     def __init__(self, model: SCM, design: Design, *, seed: int, steps: int | None) -> None:
         self._model, self._design, self._seed = model, design, seed
-        self._twins = EquationTwins(model)
-        self._length = Equations(self._twins.layout).length(steps)
+        self._twins, system = asked(model)
+        self._length = length(system, steps)
         for name, act in design.acts.items():
             model.do({name: act})
         self.columns: tuple[Column, ...] = tuple(c for v in model.variables for c in columns_of(v))
@@ -118,12 +116,11 @@ class ModelSource:
         kinds, where = np.unique(chosen, axis=0, return_inverse=True)
         kind_of = np.asarray(where, dtype=np.int64).reshape(len(chosen))
         regimes = [self._design.regime_of(kind) for kind in kinds]
-        plans = [Schedule([(0, regime.plan)]) for regime in regimes]
         units = [
-            Unit(self._seed, number, plans[kind], None, self._length)
+            Unit(self._seed, number, regimes[kind].plan, None, self._length)
             for number, kind in zip(numbers, kind_of.tolist(), strict=True)
         ]
-        vectors = paths(self._twins, units)[:, min(self._length, 1) :]
+        vectors = self._twins.paths(units)[:, min(self._length, 1) :]
         n, length, size = vectors.shape
         tell(n)
         return SourceRows(

@@ -32,7 +32,7 @@ from scm_world.queries.estimates import CONFIDENCE, difference
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import Setting
-from scm_world.queries.twins import AnyTwins, asked
+from scm_world.queries.twins import Twins, asked
 from scm_world.variables import Box, Categories, Either, Integers, Variable
 from scm_world.variables.kinds import SPACES
 from scm_world.work.executors import Executor
@@ -366,7 +366,7 @@ class Grid:
 
     def __init__(
         self,
-        twins: AnyTwins,
+        twins: Twins,
         world: System,
         points: Sequence[Point],
         outcomes: Iterable[Any] | None,

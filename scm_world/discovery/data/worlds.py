@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import groupby
@@ -38,17 +37,15 @@ from scm_world.env.vector import WIDE, bounds, spread
 from scm_world.errors import Forbidden, InterventionError, ModelError, UnknownOption
 from scm_world.graph.structure import Edge
 from scm_world.policies.scripted import Sequence as Given
-from scm_world.queries.episodes import Episode
-from scm_world.queries.equations import Equations, Layout, System
+from scm_world.queries.episodes import Episode, Unit
+from scm_world.queries.equations import Equations, System
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.local import contact_terms
 from scm_world.queries.outcomes import Outcome, as_outcomes
-from scm_world.queries.parallel import Result, run_units
 from scm_world.queries.plans import Plan
-from scm_world.queries.rollouts import Unit
 from scm_world.queries.samples import Setting
-from scm_world.queries.twins import AnyTwins, EquationTwins
+from scm_world.queries.twins import Result, Twins
 from scm_world.variables import Noise, Normal
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import Simulation
@@ -95,7 +92,7 @@ class WorldSource:
 
     def __init__(
         self,
-        twins: AnyTwins,
+        twins: Twins,
         world: System,
         design: Design,
         *,
@@ -123,8 +120,7 @@ class WorldSource:
             usual = default_outcomes(world, every_step=every_step)
             outcomes = [o for o in usual if is_state(model, o.name) or o.name not in varied]
         measured = _outcomes(outcomes, every_step=every_step)
-        layout = world.compiled
-        self._actions = {*(layout.actions if isinstance(layout, Layout) else layout.commanded)}
+        self._actions = {*world.compiled.commanded}
         actions = tuple(world.compiled.actions) if every_step else ()
         self._watched = tuple(dict.fromkeys((*varied, *(o.name for o in measured), *actions)))
         # At an instant a system still has the action of the step before.
@@ -200,7 +196,6 @@ class WorldSource:
         """Run some episodes; those that are refused are left out."""
         chosen = self._design.chosen(self._setting.seed, numbers.start, len(numbers))
         regimes = [self._design.regime_of(kind) for kind in chosen]
-        lock = threading.Lock()
 
         seen: dict[int, list[Picture]] = {}
         touching: dict[int, Any] = {}
@@ -212,14 +207,12 @@ class WorldSource:
             if isinstance(result, Exception):
                 found = str(result)
             else:
-                episode = Episode(self._twins, units[place], result)
-                found = self._row(episode)
+                found = self._row(result)
                 if self._contacts:
                     touching[numbers[place]] = _runs(result.touched)
                 if self._pictures is not None:
-                    seen[place] = self._look(self._pictures, episode)
-            with lock:
-                tell(1)
+                    seen[place] = self._look(self._pictures, result)
+            tell(1)
             return found
 
         kept = {*self._world.compiled.slices, *self._world.static_names}
@@ -229,7 +222,7 @@ class WorldSource:
             given = Plan(merged(self._world.model, self._given, done.plan))
             unit = self._setting.unit(self._world, given, number, written)
             units.append(replace(unit, listens=self._contacts))
-        found = run_units(self._twins, units, finish, self._setting.workers)
+        found = self._twins.run(units, finish, self._setting.workers)
         rows: list[Row] = []
         refused: list[tuple[int, str]] = []
         for number, done, values in zip(numbers, regimes, found, strict=True):
@@ -313,8 +306,8 @@ def _runs(steps: Sequence[frozenset[tuple[str, str]]]) -> dict[str, Any]:
     return {"pairs": [list(pair) for pair in pairs], "runs": runs}
 
 
-def _system(world: System, twins: AnyTwins) -> dict[str, Any]:
-    if isinstance(twins, EquationTwins):
+def _system(world: System, twins: Twins) -> dict[str, Any]:
+    if twins.model is not None:
         return {"system": "model"}
     return {"system": twins.task.name, "options": plain_options(twins.options)}
 

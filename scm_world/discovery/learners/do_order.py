@@ -59,7 +59,7 @@ Ints = NDArray[np.int64]
 
 @final
 @dataclass(frozen=True)
-class Rows:
+class SampledRows:
     """Standardised numbers, and from which rows each variable may be learned.
 
     Attributes:
@@ -87,7 +87,7 @@ class Rows:
         numbers = np.repeat(np.arange(len(self.blocks)), list(map(len, self.blocks)))
         return np.asarray(numbers[np.argsort(np.concatenate(self.blocks))])
 
-    def summed(self) -> Rows:
+    def summed(self) -> SampledRows:
         """Return fewer rows with the same sums of products, for each set of targets.
 
         Source:
@@ -106,7 +106,7 @@ class Rows:
         return replace(self, x=table[:, :-1], one=table[:, -1], targeted=np.concatenate(masks))
 
 
-def before_each(rows: Rows, effects: Bools, causes: Bools) -> Bools:
+def before_each(rows: SampledRows, effects: Bools, causes: Bools) -> Bools:
     """Return which column may act on which, shape (p, p): causes that come before it."""
     may = np.zeros((len(causes), len(causes)), bool)
     always = causes & (rows.past | (rows.one**2 @ ~rows.targeted < causes.sum() + SPARE))
@@ -188,7 +188,7 @@ class _Cost:
 class _Moments:
     """Sums of products over the rows in which a column was not intervened on."""
 
-    def __init__(self, rows: Rows) -> None:
+    def __init__(self, rows: SampledRows) -> None:
         self.x, self.one, self.targeted = rows.x, rows.one, rows.targeted
         self.ones = np.concatenate([rows.x, rows.one[:, None]], axis=1)
         self._all = self.ones.T @ self.ones
@@ -344,14 +344,14 @@ class _Form:
     spread: bool
 
 
-def _rows(data: Dataset, blocks: bool) -> Rows:
+def _rows(data: Dataset, blocks: bool) -> SampledRows:
     n = len(data)
     if n < 3:
         raise ModelError([f"do_order needs some rows, got {n}"])
     together = tuple(data.blocks.values()) if blocks else tuple(np.arange(len(data.names))[:, None])
     past = np.array([column.lag > 0 for column in data.columns])
     values = data.standardised().values
-    return Rows(values, np.ones(n), data.targeted, together, past)
+    return SampledRows(values, np.ones(n), data.targeted, together, past)
 
 
 def _still(data: Dataset) -> Bools:
@@ -369,7 +369,7 @@ def _still(data: Dataset) -> Bools:
 # --- edges --------------------------------------------------------------------------------------
 
 
-def _tested(rows: Rows, effects: Bools, causes: Bools, form: _Form) -> Floats:
+def _tested(rows: SampledRows, effects: Bools, causes: Bools, form: _Form) -> Floats:
     """Test every block of causes on every column; 2 where there is no test, shape (blocks, p)."""
     summed = rows.summed()
     before = before_each(summed, effects, causes)
@@ -391,7 +391,7 @@ def _tested(rows: Rows, effects: Bools, causes: Bools, form: _Form) -> Floats:
     return found
 
 
-def _hidden(rows: Rows, data: Dataset) -> Bools:
+def _hidden(rows: SampledRows, data: Dataset) -> Bools:
     """Return which columns may act unseen on a cause and its effect, shape (p,).
 
     These are the columns that were never set, where a cause was free in some row and there are no
@@ -405,7 +405,7 @@ def _hidden(rows: Rows, data: Dataset) -> Bools:
     return np.asarray(rows.alive & ~set_ & early & is_open)
 
 
-def _instrumented(rows: Rows, causes: Bools, form: _Form) -> Floats:
+def _instrumented(rows: SampledRows, causes: Bools, form: _Form) -> Floats:
     """Test every block of causes with the values that were set as instruments, (blocks, p)."""
     terms, owner = _features(rows, form.features)
     found = np.full((len(rows.blocks), rows.x.shape[1]), 2.0)
@@ -449,7 +449,7 @@ def _f_tail(ratio: float, m: int, free: int) -> float:
     return float(fdtrc(m, free, ratio))
 
 
-def _features(rows: Rows, highest: int) -> tuple[Floats, Ints]:
+def _features(rows: SampledRows, highest: int) -> tuple[Floats, Ints]:
     """Return powers of the columns, as orthogonal polynomials, and the column each is of."""
     size = np.maximum(np.abs(rows.x).max(axis=0), 1e-12)
     scaled = rows.x / size
@@ -493,7 +493,7 @@ def _tails(design: Floats, answers: list[Floats], blocks: dict[int, Ints]) -> di
     return found
 
 
-def _bent(rows: Rows, matrix: Bools, form: _Form) -> tuple[str, ...]:
+def _bent(rows: SampledRows, matrix: Bools, form: _Form) -> tuple[str, ...]:
     """Note how many effects are not what their causes add up to.
 
     Source:
@@ -530,7 +530,7 @@ def _bent(rows: Rows, matrix: Bools, form: _Form) -> tuple[str, ...]:
     )
 
 
-def _separable(rows: Rows) -> Bools:
+def _separable(rows: SampledRows) -> Bools:
     """Return where a column was set while another was free, shape (p, p).
 
     Of two that were only ever set together, no row says which one acts on the other.
@@ -541,7 +541,7 @@ def _separable(rows: Rows) -> Bools:
 
 
 def _notes(
-    data: Dataset, rows: Rows, causes: Bools, separable: Bools, hidden: Bools
+    data: Dataset, rows: SampledRows, causes: Bools, separable: Bools, hidden: Bools
 ) -> tuple[str, ...]:
     found = []
     still = [name for name, varies in zip(data.names, rows.alive, strict=True) if not varies]

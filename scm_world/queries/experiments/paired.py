@@ -24,7 +24,7 @@ from scm_world.errors import EngineFailure, InterventionError, SnapshotMismatch,
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier
 from scm_world.policies.planning import action_range
-from scm_world.queries.equations import Layout
+from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.experiments.effects import RESOLUTION, EdgeKey, Effects, ProbeSetting, gap
 from scm_world.queries.experiments.probes import Probe, Random, another, touching_pairs
 from scm_world.variables import Action, Exogenous, Measured, Noise
@@ -73,7 +73,8 @@ class Paired:
         self.states, self.targets, self.exact = tuple[str, ...](), tuple(self.model), False
         self.actions: Mapping[str, Any] = {}
         if self.world is None:
-            self._idle = Layout(self.model).idle()
+            compiled = CompiledModel(self.model)
+            self._idle = compiled.split(Equations(compiled).idle())
         else:
             self.states, self.targets = engine_decided(self.model), settable(self.model)
             self.actions, self.exact = self.world.compiled.actions, self.world.task.generated_graph
