@@ -453,10 +453,10 @@ class OtherCommands:
         self.honest = world.command
         world.command = self
 
-    def __call__(self, action: Any, index: int) -> Any:
+    def __call__(self, action: Any) -> Any:
         """Turn an action into a command."""
-        command = np.array(self.honest(action, index))
-        return self.wrong(command, self.world.row, self.world.noise_key(index))
+        command = np.array(self.honest(action))
+        return self.wrong(command, self.world.row, self.world.noise_key(self.world.index))
 
 
 def with_commands(world: Any, wrong: Callable[[Any, Any, NoiseKey], Any]) -> Any:

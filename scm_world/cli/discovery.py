@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING, Annotated, Any
@@ -146,14 +146,14 @@ def discover(
                 checkpoint=folder / "progress.json",
             )
         names = tuple(system.graph)
-    report = replace(report, arguments=tuple(option or ()))
+    report = report.model_copy(update={"arguments": tuple(option or ())})
     _edge_table(report, names)
     used = {name for edge in (*report.found, *report.declared) for name in edge[:2]}
     if lonely := [name for name in names if name not in used]:
         from scm_world.discovery.names import by_entity
 
         console.say(f"no edge at all: {', '.join(by_entity(lonely))}", "")
-    console.facts(_numbers(report))
+    console.facts(report.rows())
     with console.staged(folder) as draft:
         report.save(draft / "report.json")
         draw_graphs(report, draft / "graphs.png")
@@ -197,42 +197,6 @@ def _edge_table(report: DiscoveryReport, names: Sequence[str]) -> None:
         caption="[+] found but not declared   [-] declared but not found",
         whole=(0,),
     )
-
-
-def _numbers(report: DiscoveryReport) -> Iterator[tuple[str, str, bool | None]]:
-    """Yield the numbers of a report, what they mean, and whether they are good."""
-
-    def listed(edges: Sequence[tuple[str, str, int]]) -> str:
-        shown = [f"{cause} -> {effect} (lag {lag})" for cause, effect, lag in edges[:LISTED]]
-        more = [f"and {len(edges) - LISTED} more, see report.json"] * (len(edges) > LISTED)
-        return "\n".join([str(len(edges)), *shown, *more])
-
-    from scm_world.queries.verification import counted
-
-    score, complete = report.score, report.probes == report.planned
-    version = report.versions.get(report.backend, "")
-    states = f"{report.probes}" if complete else f"{report.probes} of {report.planned}: interrupted"
-    good = {"confirmed": True, "refuted": False}
-    yield "outcome", report.outcome, good.get(report.outcome)
-    yield from counted(report.provenance)
-    yield "backend", f"{report.backend} {version}, preset {report.preset}", None
-    if report.arguments:
-        yield "options", ", ".join(report.arguments), None
-    yield "probe states", states, None if complete else False
-    yield "rollouts, at least needed", f"{report.rollouts}, {report.bound}", None
-    yield "noise floor (run twice)", f"{report.floor:.3g}", None
-    yield "threshold", f"{report.threshold:.3g}", None
-    yield "largest effect without an edge", f"{report.inert:.3g}", None
-    yield "precision", f"{score.precision:.4f}", None
-    yield "recall", f"{score.recall:.4f}", None
-    yield "F1", f"{score.f1:.4f}", None
-    yield "SHD over all edges", str(score.shd), score.shd == 0
-    yield "[+] undeclared", listed(score.undeclared), not score.undeclared
-    yield "[-] missed", listed(score.missed), not score.missed
-    if report.refused:
-        refused = ", ".join(f"{name} ({n})" for name, n in report.refused.items())
-        yield "no feasible value in some states", refused, None
-    yield "seconds", f"{report.seconds:.1f}", None
 
 
 def _benchmark(

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any, final
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import Any, Literal, final
+
+from pydantic import computed_field
 
 from scm_world._arguments import typed, whole_number
 from scm_world.discovery.metrics import GraphScore, score
@@ -16,104 +18,91 @@ from scm_world.graph import SCM
 from scm_world.output.durable import made, removed, write_durably, write_whole
 from scm_world.output.reading import read_text
 from scm_world.output.remote import Location, located
-from scm_world.queries.experiments.effects import EdgeKey, Effects, series
-from scm_world.queries.experiments.paired import REMEMBERED, Paired
+from scm_world.queries.experiments.effects import EdgeKey, Effects
+from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
-from scm_world.queries.verification import Outcome, by_provenance, counted, outcome
+from scm_world.queries.verification import (
+    GraphReport,
+    Outcome,
+    Row,
+    arrow,
+    counted,
+    edge_reports,
+    listed,
+    outcome,
+)
 from scm_world.world import Simulation
 
-REPORT = "scm_world/discovery/1"
 CHECKPOINT = "scm_world/discovery-progress/4"
 
 
 @final
-@dataclass(frozen=True)
-class DiscoveryReport:
+class DiscoveryReport(GraphReport):
     """A graph recovered from interventional experiments, compared with the declared one.
 
     Attributes:
-        task: Name of the task or model.
-        backend: Name of the engine; ``"none"`` for a model without physics.
-        preset: Numerical settings of the engine.
-        seed: Of the experiments.
-        probes: Probe states that were used.
-        planned: Probe states that were asked for; more than ``probes`` if it was interrupted.
-        rollouts: Control steps simulated in an experiment of their own.
-        bound: Fewest of them that find a graph without prior knowledge: one for each variable that
+        format: Of the file.
+        bound: Fewest rollouts that find a graph without prior knowledge: one for each variable that
             can be set, in each probe state.
-        floor: Largest difference between two runs without a change.
-        threshold: An effect must exceed it.
         inert: Largest effect among the pairs that are no edge in the estimated graph.
-        score: The comparison.
-        found: Edges of the estimated graph.
-        declared: Edges of the declared graph.
-        effects: Largest effect of each estimated edge, in the unit of the child.
         refused: Targets that found no feasible value in some probes, with how often.
-        seconds: Wall time.
-        versions: Of everything that decides the result.
-        provenance: How many declared edges were found, how many there are, and how many others were
-            found, by what decides the effect: engine, readout or definition.
-        arguments: What the task was made with, each as ``name=value``, where that is known.
     """
 
-    task: str
-    backend: str
-    preset: str
-    seed: int
-    probes: int
-    planned: int
-    rollouts: int
+    format: Literal["scm_world/discovery/2"] = "scm_world/discovery/2"
     bound: int
-    floor: float
-    threshold: float
     inert: float
-    score: GraphScore
-    found: tuple[EdgeKey, ...]
-    declared: tuple[EdgeKey, ...]
-    effects: dict[EdgeKey, float]
     refused: dict[str, int]
-    seconds: float
-    versions: dict[str, str]
-    provenance: dict[str, tuple[int, int, int]] = field(default_factory=dict)
-    arguments: tuple[str, ...] = ()
+
+    @computed_field  # type: ignore[prop-decorator]
+    @cached_property
+    def score(self) -> GraphScore:
+        """The comparison of the estimated with the declared graph."""
+        return score(self.found, self.declared)
+
+    @property
+    def threshold(self) -> float:
+        """What an effect must exceed."""
+        return Effects(unstable=self.unstable).threshold
 
     @property
     def outcome(self) -> Outcome:
         """``"refuted"`` if an effect without an edge was found, ``"confirmed"`` if the graph is."""
-        missed = bool(self.score.missed) or self.probes < self.planned
-        return outcome(wrong=bool(self.score.undeclared), unseen=missed)
+        unseen = bool(self.unseen) or self.probes < self.planned
+        return outcome(wrong=bool(self.undeclared), unseen=unseen)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the report as plain data."""
-        return {
-            "format": REPORT,
-            "task": self.task,
-            "arguments": list(self.arguments),
-            "outcome": self.outcome,
-            "backend": self.backend,
-            "preset": self.preset,
-            "seed": self.seed,
-            "probes": self.probes,
-            "planned_probes": self.planned,
-            "complete": self.probes == self.planned,
-            "rollouts": self.rollouts,
-            "fewest_rollouts": self.bound,
-            "floor": self.floor,
-            "threshold": self.threshold,
-            "largest_effect_without_edge": self.inert,
-            "provenance": {by: list(counts) for by, counts in self.provenance.items()},
-            **asdict(self.score),
-            "edges": [
-                {"cause": c, "effect": e, "lag": lag, "largest": self.effects[c, e, lag]}
-                for c, e, lag in self.found
-            ],
-            "declared": [list(edge) for edge in self.declared],
-            "refused": self.refused,
-            "seconds": self.seconds,
-            "versions": self.versions,
-        }
+    @property
+    def title(self) -> str:
+        """The first line of the report."""
+        return f"Discovery of {self.task} on {self.backend}: {self.outcome}"
+
+    def rows(self) -> tuple[Row, ...]:
+        """List the numbers, what they mean, and whether they are good."""
+        s, complete = self.score, self.probes == self.planned
+        version = self.versions.get(self.backend, "")
+        states = f"{self.probes}" if complete else f"{self.probes} of {self.planned}: interrupted"
+        refused = ", ".join(f"{name} ({n})" for name, n in self.refused.items())
+        good = {"confirmed": True, "refuted": False}
+        return (
+            ("outcome", self.outcome, good.get(self.outcome)),
+            *counted(self.provenance),
+            ("backend", f"{self.backend} {version}, preset {self.preset}", None),
+            *((("options", ", ".join(self.arguments), None),) if self.arguments else ()),
+            ("probe states", states, None if complete else False),
+            ("rollouts, at least needed", f"{self.rollouts}, {self.bound}", None),
+            ("noise floor (run twice)", f"{self.floor:.3g}", None),
+            ("threshold", f"{self.threshold:.3g}", None),
+            ("largest effect without an edge", f"{self.inert:.3g}", None),
+            ("precision", f"{s.precision:.4f}", None),
+            ("recall", f"{s.recall:.4f}", None),
+            ("F1", f"{s.f1:.4f}", None),
+            ("SHD over all edges", str(s.shd), s.shd == 0),
+            ("[+] undeclared", listed(map(arrow, s.undeclared)), not s.undeclared),
+            ("[-] missed", listed(map(arrow, s.missed)), not s.missed),
+            *((("no feasible value in some states", refused, None),) if refused else ()),
+            ("seconds", f"{self.seconds:.1f}", None),
+        )
 
     def save(self, path: Location | str) -> None:
         """Write the report as JSON, whole or not at all.
@@ -121,17 +110,7 @@ class DiscoveryReport:
         Raises:
             UnwritableFolder: There is no such folder, no room, or no permission.
         """
-        write_whole(json.dumps(self.as_dict(), indent=1) + "\n", path)
-
-    def __str__(self) -> str:
-        s = self.score
-        counts = "; ".join(f"{name} {text}" for name, text, _ in counted(self.provenance))
-        return (
-            f"{self.task} on {self.backend}: {self.outcome}; {counts}; "
-            f"precision {s.precision:.3f}, recall {s.recall:.3f}, F1 {s.f1:.3f}, "
-            f"SHD over all edges {s.shd}; {self.probes} probe states, {self.rollouts} rollouts, "
-            f"floor {self.floor:g}"
-        )
+        write_whole(self.to_json(), path)
 
 
 @typed
@@ -162,7 +141,8 @@ def discover(
         options: Arguments of ``World``, where ``system`` is a name.
 
     Raises:
-        UnknownOption: ``probes`` is not a positive number, or a name does not exist.
+        UnknownOption: ``probes`` is not a positive number, a name does not exist, or there are
+            options for a world that is made.
         UnreadableFile: The checkpoint is damaged, or of another discovery.
 
     Example:
@@ -175,80 +155,44 @@ def discover(
         0
     """
     whole_number("number of probes", probes, least=1)
-    started = time.perf_counter()
-    if isinstance(system, SCM):
-        return _discovered(system, probes, seed, progress, found, checkpoint, started)
-    world = Simulation(system, **options) if isinstance(system, str) else system
-    try:
-        with world.unchanged():
-            return _discovered(world, probes, seed, progress, found, checkpoint, started)
-    finally:
-        if isinstance(system, str):
-            world.close()
-
-
-def _discovered(
-    system: Simulation | SCM,
-    probes: int,
-    seed: int,
-    progress: Progress | None,
-    found: Callable[[set[EdgeKey]], object] | None,
-    path: Location | str | None,
-    started: float,
-) -> DiscoveryReport:
-    model = system if isinstance(system, SCM) else system.model
-    declared = {edge.key for edge in model.edges}
-    paired = Paired(system, seed)
-    effects, first, saved = Effects(exact=paired.exact), 0, None
-    if path is not None and isinstance(system, Simulation):
-        saved = Checkpoint(path, _terms(system, seed))
-        first = min(saved.read(effects), probes)
-    states = probe_states(system, probes, seed, first=max(0, first - REMEMBERED))
-
-    def experiments() -> Iterator[Effects]:
-        for number, probe in enumerate(states, max(0, first - REMEMBERED)):
-            if number < first:  # what it lends to later ones is not in the file
-                paired.look(number, probe)
-            else:
-                yield paired.run(number, probe)
-
-    def finished(done: int) -> bool:
-        if found is not None:
-            found(effects.edges(declared))
-        if saved is not None:
-            saved.write(effects, done)
-        return False
-
-    done, _ = series(experiments(), effects, probes, finished, progress, done=first)
-    if saved is not None and done == probes:
-        saved.end()
-    edges = effects.edges(declared)
-    inert = [size for key, size in effects.largest.items() if key not in edges]
-    task, backend, preset, engine = "model", "none", "none", ""
-    if isinstance(system, Simulation):
-        task, backend, engine = system.task.name, system.backend.name, system.engine
-        preset = system.options.preset
-    return DiscoveryReport(
-        task=task,
-        backend=backend,
-        preset=preset,
-        seed=seed,
-        probes=done,
-        planned=probes,
-        rollouts=effects.rollouts,
-        bound=done * sum(effects.changed[name] > 0 for name in paired.targets),
-        floor=effects.floor,
-        threshold=effects.threshold,
-        inert=max(inert, default=0.0),
-        score=score(edges, declared),
-        provenance=by_provenance(model, declared, edges, edges - declared),
-        found=tuple(sorted(edges)),
-        declared=tuple(sorted(declared)),
-        effects={key: effects.largest[key] for key in edges},
-        refused=dict(effects.refused),
-        seconds=time.perf_counter() - started,
-        versions=versions(engine),
-    )
+    with opened(system, options) as there:
+        started, paired = time.perf_counter(), Paired(there, seed)
+        declared = {edge.key for edge in paired.model.edges}
+        effects, first, saved = Effects(exact=paired.exact), 0, None
+        if checkpoint is not None and isinstance(there, Simulation):
+            saved = Checkpoint(checkpoint, _terms(there, seed))
+            first = min(saved.read(effects), probes)
+        done = first
+        try:
+            for probe in probe_states(there, probes, seed, first=first):
+                effects.add(paired.run(done, probe))
+                done += 1
+                if found is not None:
+                    found(effects.edges(declared))
+                if saved is not None:
+                    saved.write(effects, done)
+                if progress is not None:
+                    progress(done, probes)
+        except KeyboardInterrupt:
+            if not done:
+                raise
+        if saved is not None and done == probes:
+            saved.end()
+        edges = effects.edges(declared)
+        inert = [size for key, size in effects.largest.items() if key not in edges]
+        effects.settings.clear()  # a file of progress does not have them
+        return DiscoveryReport.of(
+            there,
+            effects,
+            edge_reports(paired.model, effects),
+            seed=seed,
+            probes=done,
+            planned=probes,
+            bound=done * sum(effects.changed[name] > 0 for name in paired.targets),
+            inert=max(inert, default=0.0),
+            refused=dict(effects.refused),
+            seconds=time.perf_counter() - started,
+        )
 
 
 def _terms(world: Simulation, seed: int) -> dict[str, Any]:

@@ -9,19 +9,19 @@ from itertools import pairwise
 from typing import Literal, final
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict
 
 from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats, Values
 from scm_world.backends import backends
 from scm_world.errors import EngineFailure, InterventionError
 from scm_world.queries.experiments.effects import FACTOR, RESOLUTION
-from scm_world.queries.experiments.paired import another, engine_decided, settable
-from scm_world.queries.experiments.probes import ProbeGenerator
+from scm_world.queries.experiments.paired import engine_decided, settable
+from scm_world.queries.experiments.probes import another
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.progress import Progress
 from scm_world.queries.twins import twins_of
-from scm_world.queries.verification import Outcome, Report, Row, outcome, written
-from scm_world.variables import Noise
+from scm_world.queries.verification import Outcome, Report, Row, outcome
 from scm_world.world import Simulation
 
 SAME = 0.95
@@ -32,7 +32,7 @@ SCALE = 0.1
 
 
 @final
-class ParameterEffects(Report):
+class ParameterEffects(BaseModel):
     """The effects of one parameter that are clear on both backends.
 
     Attributes:
@@ -43,6 +43,8 @@ class ParameterEffects(Report):
         low: Quantile of 10 % of this ratio.
         high: Quantile of 90 %.
     """
+
+    model_config = ConfigDict(frozen=True, ser_json_inf_nan="strings")
 
     parameter: str
     clear: int
@@ -107,9 +109,6 @@ class Comparison(Report):
             ("seconds", f"{self.seconds:.1f}", None),
         )
 
-    def __str__(self) -> str:
-        return written(self.title, self.rows())
-
 
 def compare_backends(
     world: Simulation,
@@ -165,7 +164,7 @@ def _answers(
     Two backends differ after one step even if nothing is changed, since contacts are solved
     differently. An effect is clear if it is ten times as large as this difference on both.
     """
-    model, rng = pair[0].model, ProbeGenerator(Noise(seed), number)
+    model, rng = pair[0].model, np.random.default_rng((seed, number))
     states = [name for name in engine_decided(model) if name in pair[1].model]
 
     def ends(change: Mapping[str, object]) -> Floats:
@@ -183,7 +182,7 @@ def _answers(
     starts = np.cumsum([0, *(np.size(pair[0][name]) for name in states)])
     for name in values:
         parameter = model.declared(name).role == "parameter"
-        value = another(model, name, values, rng, "compared", SCALE) if parameter else None
+        value = another(model.declared(name), values, rng, SCALE) if parameter else None
         if value is None:
             continue
         try:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from itertools import accumulate
+from types import MappingProxyType
 from typing import Any, Literal, Self, final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from scm_world.errors import UnreadableFile
-from scm_world.graph import SCM
-from scm_world.queries.experiments.effects import EdgeKey
+from scm_world.graph import SCM, Edge
+from scm_world.queries.experiments.effects import EdgeKey, Effects, ProbeSetting
+from scm_world.queries.experiments.versions import versions
 from scm_world.variables import Measured
+from scm_world.world import Simulation
 
 SHOWN = 10  # edges that are written out in a table
 NAMED = 3  # variables that are named in a headline
@@ -20,10 +25,26 @@ Row = tuple[str, str, bool | None]
 """What a number means, the number, and whether it is good; None where it is neither."""
 
 
-class Report(BaseModel):
-    """Data that can be written as JSON and read back without loss."""
+class Report(BaseModel, ABC):
+    """Data that can be written as JSON and read back without loss, and as text."""
 
     model_config = ConfigDict(frozen=True, ser_json_inf_nan="strings")
+
+    @property
+    @abstractmethod
+    def title(self) -> str:
+        """The first line of the report."""
+
+    @abstractmethod
+    def rows(self) -> tuple[Row, ...]:
+        """List the numbers, what they mean, and whether they are good."""
+
+    def __str__(self) -> str:
+        rows = self.rows()
+        width = max(len(name) for name, _, _ in rows)
+        indent = "\n" + " " * (width + 4)
+        lines = (f"  {name:<{width}}  {value.replace(chr(10), indent)}" for name, value, _ in rows)
+        return "\n".join([self.title, *lines])
 
     def to_json(self) -> str:
         """Write the report as JSON."""
@@ -43,144 +64,158 @@ class Report(BaseModel):
             raise UnreadableFile(cls.__name__, reason, "give what to_json() wrote") from None
 
 
-class EdgeReport(Report):
+@final
+class EdgeReport(BaseModel):
     """What was found of one edge.
 
     Attributes:
         cause: The variable that was changed; several, joined by ``" & "``, if each is needed.
         effect: The variable that responded, or did not.
-        lag: After how many control steps.
+        lag: After how many control steps; at a lag of 2 or more without a declared edge, something
+            remembers what no state holds.
+        status: ``"fired"`` is a declared edge that moved its child, ``"unseen"`` one that did in no
+            probe state, ``"undeclared"`` an effect without an edge.
+        size: Largest effect observed, in the unit of the child.
+        states: In how many probe states the cause was changed; of declared edges.
+        after: How many probe states it took until it was seen; of declared edges.
+        probe: Number of the probe state in which the largest effect was observed.
+        kind: How this probe state came about.
+        change: By how much the cause was moved, flattened; empty if a mechanism was evaluated.
+        reason: Why nothing was seen, as far as the experiments tell.
     """
+
+    model_config = ConfigDict(frozen=True, ser_json_inf_nan="strings")
 
     cause: str
     effect: str
     lag: int
+    status: Literal["fired", "unseen", "undeclared"]
+    size: float = 0.0
+    states: int = 0
+    after: int = 0
+    probe: int | None = None
+    kind: str = ""
+    change: tuple[float, ...] = ()
+    reason: str = ""
 
     @property
     def key(self) -> EdgeKey:
         """Cause, effect and lag."""
         return self.cause, self.effect, self.lag
 
-
-@final
-class Fired(EdgeReport):
-    """A declared edge that moved its child.
-
-    Attributes:
-        after: How many probe states it took.
-        largest: Largest effect observed, in the unit of the child.
-    """
-
-    after: int
-    largest: float
-
-
-@final
-class Undeclared(EdgeReport):
-    """An effect without an edge; at a lag of 2 or more, something remembers what no state holds.
-
-    Attributes:
-        size: Largest effect observed, in the unit of the child.
-        probe: Number of the probe state in which it was observed.
-        kind: How this probe state came about.
-        change: By how much the cause was moved, flattened; empty if a mechanism was evaluated.
-    """
-
-    size: float
-    probe: int
-    kind: str
-    change: tuple[float, ...]
-
     def __str__(self) -> str:
-        return f"{arrow(self.key)}: {self.size:.3g} in probe {self.probe} ({self.kind})"
+        seen = f"{self.size:.3g} in probe {self.probe} ({self.kind})"
+        return f"{arrow(self.key)}: {self.reason or seen}"
 
 
-@final
-class Unseen(EdgeReport):
-    """A declared edge that moved its child in no probe state.
-
-    Attributes:
-        states: In how many probe states the cause was changed.
-        reason: Why nothing was seen, as far as the experiments tell.
-    """
-
-    states: int
-    reason: str
-
-    def __str__(self) -> str:
-        return f"{arrow(self.key)}: {self.reason}"
-
-
-@final
-class Verification(Report):
-    """The result of comparing a declared graph with the physics.
+class GraphReport(Report):
+    """The result of experiments with a declared graph.
 
     Attributes:
-        format: Of the file.
         task: Name of the task.
         arguments: What the task was made with, each as ``name=value``, where that is known.
         backend: Its name.
         preset: Its numerical settings.
         seed: Of the experiments.
-        generated: Whether the graph follows from structure: then physics may have nothing to show
-            of an edge (the mass of what falls freely moves nothing).
         probes: Probe states that were used.
-        held_out: Further ones, of another seed and without the task's scenarios, in which effects
-            without an edge were looked for.
+        planned: How many there may have been.
+        rollouts: Control steps simulated in an experiment of their own.
+        edges: Declared edges, and effects without one.
         provenance: How many declared edges were seen, how many there are, and how many effects
             without an edge were seen, by what decides the effect: ``"engine"``, ``"readout"``
             (computed from states) or ``"definition"``.
         unstable: By how much a variable differed though nothing had been changed: in a second run,
             or evaluated a second time.
-        planned: How many probe states there may have been, without those.
-        interrupted: Whether it was stopped (Ctrl-C) before it was through.
-        rollouts: Control steps simulated in an experiment of their own.
-        fired: Declared edges that were seen.
-        unseen: Declared edges that were not, with the reasons.
-        undeclared: Effects without an edge.
         seconds: Wall time.
         versions: Of everything that decides the result.
     """
 
-    format: Literal["scm_world/verification/3"] = "scm_world/verification/3"
     task: str
     arguments: tuple[str, ...] = ()
     backend: str
     preset: str
     seed: int
-    generated: bool = False
     probes: int
-    held_out: int = 0
+    planned: int
+    rollouts: int
+    edges: tuple[EdgeReport, ...]
     provenance: dict[str, tuple[int, int, int]] = {}
     unstable: dict[str, float] = {}
-    planned: int
-    interrupted: bool
-    rollouts: int
-    fired: tuple[Fired, ...]
-    unseen: tuple[Unseen, ...]
-    undeclared: tuple[Undeclared, ...]
     seconds: float
     versions: dict[str, str]
+
+    @property
+    def fired(self) -> tuple[EdgeReport, ...]:
+        """The declared edges that were seen."""
+        return tuple(edge for edge in self.edges if edge.status == "fired")
+
+    @property
+    def unseen(self) -> tuple[EdgeReport, ...]:
+        """The declared edges that were not seen, with the reasons."""
+        return tuple(edge for edge in self.edges if edge.status == "unseen")
+
+    @property
+    def undeclared(self) -> tuple[EdgeReport, ...]:
+        """The effects without an edge."""
+        return tuple(edge for edge in self.edges if edge.status == "undeclared")
+
+    @property
+    def declared(self) -> tuple[EdgeKey, ...]:
+        """The declared edges, as keys."""
+        return tuple(edge.key for edge in self.edges if edge.status != "undeclared")
+
+    @property
+    def found(self) -> tuple[EdgeKey, ...]:
+        """The edges that were observed, declared or not, as keys."""
+        return tuple(edge.key for edge in self.edges if edge.status != "unseen")
 
     @property
     def floor(self) -> float:
         """The largest difference between two runs without a change."""
         return max(self.unstable.values(), default=0.0)
 
+    @classmethod
+    def of(
+        cls, system: Simulation | SCM, effects: Effects, edges: Iterable[EdgeReport], **more: Any
+    ) -> Self:
+        """Make the report of a system."""
+        world = None if isinstance(system, SCM) else system
+        model = system if isinstance(system, SCM) else system.model
+        return cls(
+            task=world.task.name if world else "model",
+            backend=world.backend.name if world else "equations",
+            preset=world.options.preset if world else "none",
+            versions=versions(world.engine if world else ""),
+            rollouts=effects.rollouts,
+            unstable=effects.unstable,
+            edges=tuple(edges),
+            provenance=by_provenance(model, edges),
+            **more,
+        )
+
+
+@final
+class Verification(GraphReport):
+    """The result of comparing a declared graph with the physics.
+
+    Attributes:
+        format: Of the file.
+        generated: Whether the graph follows from structure: then physics may have nothing to show
+            of an edge (the mass of what falls freely moves nothing).
+        held_out: Further probe states, of another seed and without the task's scenarios, in which
+            effects without an edge were looked for.
+        interrupted: Whether it was stopped (Ctrl-C) before it was through.
+    """
+
+    format: Literal["scm_world/verification/4"] = "scm_world/verification/4"
+    generated: bool = False
+    held_out: int = 0
+    interrupted: bool
+
     @property
     def never_fired(self) -> tuple[EdgeKey, ...]:
-        """List the declared edges that were not seen."""
+        """The declared edges that were not seen, as keys."""
         return tuple(edge.key for edge in self.unseen)
-
-    @property
-    def declared(self) -> tuple[EdgeKey, ...]:
-        """List the declared edges."""
-        return (*(edge.key for edge in self.fired), *self.never_fired)
-
-    @property
-    def found(self) -> tuple[EdgeKey, ...]:
-        """List the edges that were observed, declared or not."""
-        return (*(edge.key for edge in self.fired), *(edge.key for edge in self.undeclared))
 
     @property
     def share(self) -> float:
@@ -213,39 +248,43 @@ class Verification(Report):
         difference without a cause. Otherwise ``"confirmed"`` if every declared edge was seen and
         nothing was interrupted, and ``"not refuted"`` if not.
         """
-        return outcome(
-            wrong=bool(self.undeclared or self.unstable),
-            unseen=bool(self.unseen) or self.interrupted,
-        )
+        wrong, unseen = self.undeclared or self.unstable, self.unseen or self.interrupted
+        return outcome(wrong=bool(wrong), unseen=bool(unseen))
 
     @property
     def headline(self) -> str:
-        """The outcome in a sentence: which variables never changed, what was wrong, what is left.
+        """The outcome in a sentence: what never changed, what was wrong, what is left."""
+        names, its = self.unresponsive, "its" if len(self.unresponsive) == 1 else "their"
+        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+        silent = f"{', '.join(names[:NAMED])}{more}"
+        told = {
+            f"{silent} never changed under any of {its} declared causes": names,
+            f"{len(self.undeclared)} effects without an edge": self.undeclared,
+            f"{len(self.unstable)} variables that differ by themselves": self.unstable,
+            f"{len(self.unseen)} of {len(self.declared)} edges were never seen": self.unseen,
+            f"all {len(self.declared)} edges were seen, and no other effect": (
+                self.outcome == "confirmed"
+            ),
+            "interrupted": self.interrupted,
+        }
+        return f"{self.outcome}: {'; '.join(words for words, holds in told.items() if holds)}"
 
-        Example:
-            >>> from scm_world.queries import verify
-            >>> verify("reaching", backend="fake", probes=1, held_out=0).headline[:26]
-            'not refuted: joint_torques'
-        """
-        counts = (
-            (len(self.undeclared), "effects without an edge"),
-            (len(self.unstable), "variables that differ by themselves"),
-        )
-        names, more = self.unresponsive[:NAMED], len(self.unresponsive) - NAMED
-        also, its = f" and {more} more" if more > 0 else "", "its" if len(names) == 1 else "their"
-        said = [f"{', '.join(names)}{also} never changed under any of {its} declared causes"]
-        said = said * bool(names) + [f"{number} {what}" for number, what in counts if number]
-        if self.unseen:
-            said.append(f"{len(self.unseen)} of {len(self.declared)} edges were never seen")
-        elif self.outcome == "confirmed":
-            said.append(f"all {len(self.declared)} edges were seen, and no other effect")
-        said += ["interrupted"] * self.interrupted
-        return f"{self.outcome}: {'; '.join(said)}"
+    @property
+    def title(self) -> str:
+        """The first line of the report."""
+        return f"Verification of {self.task} on {self.backend}: {self.headline}"
 
     def rows(self) -> tuple[Row, ...]:
         """List the numbers, what they mean, and whether they are good."""
         states = f"{self.probes} of at most {self.planned}"
         states += f", {self.held_out} held out" if self.held_out else ""
+        unstable = (f"{name}: {size:.3g}" for name, size in self.unstable.items())
+        silent, unseen = {*self.unresponsive}, dict[tuple[str, str], list[str]]()
+        for edge in sorted(self.unseen, key=lambda edge: edge.effect not in silent):
+            unseen.setdefault((edge.cause, edge.reason), []).append(edge.effect)
+        never = (
+            f"{c} -> {', '.join(dict.fromkeys(found))}: {why}" for (c, why), found in unseen.items()
+        )
         return (
             *counted(self.provenance),
             ("engine", f"{self.backend} {self.versions.get(self.backend, '')}".strip(), None),
@@ -253,35 +292,11 @@ class Verification(Report):
             ("probe states", states + ": interrupted" * self.interrupted, None),
             ("rollouts", f"{self.rollouts:,}", None),
             ("noise floor (run twice)", f"{self.floor:g}", self.floor == 0.0),
-            ("never seen", self._reasons(), None),
-            ("undeclared effects", listed(map(str, self.undeclared)), not self.undeclared),
-            (
-                "differs by itself",
-                listed(f"{name}: {size:.3g}" for name, size in self.unstable.items()),
-                not self.unstable,
-            ),
+            ("never seen", listed(never, len(self.unseen)), None),
+            ("undeclared effects", listed(self.undeclared), not self.undeclared),
+            ("differs by itself", listed(unstable), not self.unstable),
             ("seconds", f"{self.seconds:.1f}", None),
         )
-
-    def _reasons(self) -> str:
-        """Count the unseen edges and list them by cause, of what never changed first."""
-        silent = {*self.unresponsive}
-        effects: dict[tuple[str, str], list[str]] = {}
-        for edge in sorted(self.unseen, key=lambda edge: edge.effect not in silent):
-            effects.setdefault((edge.cause, edge.reason), []).append(edge.effect)
-        lines = [
-            f"{cause} -> {', '.join(dict.fromkeys(names))}: {reason}"
-            for (cause, reason), names in effects.items()
-        ]
-        return "\n".join([str(len(self.unseen)), *listed(lines).split("\n")[1:]])
-
-    @property
-    def title(self) -> str:
-        """The first line of the report."""
-        return f"Verification of {self.task} on {self.backend}: {self.headline}"
-
-    def __str__(self) -> str:
-        return written(self.title, self.rows())
 
 
 def outcome(*, wrong: bool, unseen: bool) -> Outcome:
@@ -299,28 +314,60 @@ def failed(outcomes: Iterable[Outcome], *, strict: bool) -> bool:
     return not {*outcomes} <= ({"confirmed"} if strict else {"confirmed", "not refuted"})
 
 
-def by_provenance(
-    model: SCM, declared: Iterable[EdgeKey], found: set[EdgeKey], undeclared: Iterable[EdgeKey]
-) -> dict[str, tuple[int, int, int]]:
+def by_provenance(model: SCM, edges: Iterable[EdgeReport]) -> dict[str, tuple[int, int, int]]:
     """Count declared edges that were seen, all of them, and undeclared ones, by what decides.
 
     The engine decides states and what it reports. What is computed from them is a readout, and
     everything else follows by definition: its edges hold because the mechanism is what it is.
     """
-    counted = {"engine": [0, 0, 0], "readout": [0, 0, 0], "definition": [0, 0, 0]}
+    counts = {by: Counter[str]() for by in ("engine", "readout", "definition")}
+    for edge in edges:
+        effect: Any = model.declared(edge.effect)
+        measured = isinstance(effect, Measured)
+        by = "definition" if not measured else "engine" if effect.mechanism is None else "readout"
+        counts[by][edge.status] += 1
+    return {
+        by: (found["fired"], found["fired"] + found["unseen"], found["undeclared"])
+        for by, found in counts.items()
+    }
 
-    def of(key: EdgeKey) -> list[int]:
-        effect: Any = model.declared(key[1])
-        if not isinstance(effect, Measured):
-            return counted["definition"]
-        return counted["engine" if effect.mechanism is None else "readout"]
 
-    for key in declared:
-        of(key)[0] += key in found
-        of(key)[1] += 1
-    for key in undeclared:
-        of(key)[2] += 1
-    return {by: (seen, all_, others) for by, (seen, all_, others) in counted.items()}
+def edge_reports(
+    model: SCM,
+    effects: Effects,
+    after: Mapping[EdgeKey, int] = MappingProxyType({}),
+    reason: Callable[[Edge], str] = lambda edge: "not seen",
+) -> list[EdgeReport]:
+    """List declared edges, seen or not, and effects without an edge.
+
+    Args:
+        model: Declares the edges.
+        effects: What was seen.
+        after: How many probe states it took until an edge was seen, where that is known.
+        reason: Returns why a declared edge was not seen.
+    """
+    edges, reports = sorted(model.edges, key=lambda edge: edge.key), list[EdgeReport]()
+    declared = {edge.key for edge in edges}
+    observed = effects.edges(declared)
+
+    def add(key: EdgeKey, size: float, setting: ProbeSetting | None, **more: Any) -> None:
+        if setting is not None:
+            more |= setting._asdict() | {"change": setting.change.tolist()}
+        cause, effect, lag = key
+        reports.append(EdgeReport(cause=cause, effect=effect, lag=lag, size=size, **more))
+
+    for edge in edges:
+        more: dict[str, Any] = {"states": effects.changed[edge.cause], "status": "fired"}
+        if edge.key in observed:
+            more["after"] = after.get(edge.key, 0)
+        else:
+            more |= {"status": "unseen", "reason": reason(edge)}
+        where = effects.settings.get(edge.key)
+        add(edge.key, effects.largest.get(edge.key, 0.0), where, **more)
+    for key in sorted(observed - declared | effects.violations.keys()):
+        seen = effects.largest.get(key, 0.0), effects.settings.get(key)
+        add(key, *effects.violations.get(key, seen), status="undeclared")
+    return reports
 
 
 def counted(provenance: Mapping[str, tuple[int, int, int]]) -> list[Row]:
@@ -330,11 +377,6 @@ def counted(provenance: Mapping[str, tuple[int, int, int]]) -> list[Row]:
         for by, (seen, all_, others) in provenance.items()
         if all_ or others
     ]
-
-
-def named(key: EdgeKey) -> dict[str, Any]:
-    """Name the parts of an edge as the fields of reports are."""
-    return dict(zip(("cause", "effect", "lag"), key, strict=True))
 
 
 def arrow(key: EdgeKey) -> str:
@@ -348,16 +390,8 @@ def arrow(key: EdgeKey) -> str:
     return f"{cause} -> {effect} (lag {lag})"
 
 
-def listed(items: Iterable[object]) -> str:
+def listed(items: Iterable[object], count: int | None = None) -> str:
     """Count things and name the first of them, one per line."""
     found = [str(item) for item in items]
     more = [f"and {len(found) - SHOWN} more"] if len(found) > SHOWN else []
-    return "\n".join([str(len(found)), *found[:SHOWN], *more])
-
-
-def written(title: str, rows: tuple[Row, ...]) -> str:
-    """Write rows as plain text, continued lines below their first one."""
-    width = max(len(name) for name, _, _ in rows)
-    indent = "\n" + " " * (width + 4)
-    lines = (f"  {name:<{width}}  {value.replace(chr(10), indent)}" for name, value, _ in rows)
-    return "\n".join([title, *lines])
+    return "\n".join([str(len(found) if count is None else count), *found[:SHOWN], *more])

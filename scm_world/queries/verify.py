@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from scm_world._arguments import whole_number
-from scm_world.errors import UnknownOption
 from scm_world.graph import SCM, Edge
-from scm_world.queries.experiments.effects import EdgeKey, Effects, series
+from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.markov import Markov
-from scm_world.queries.experiments.paired import Paired
-from scm_world.queries.experiments.probes import Probe
+from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import probes as probe_states
-from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
-from scm_world.queries.verification import (
-    Fired,
-    Undeclared,
-    Unseen,
-    Verification,
-    by_provenance,
-    named,
-)
+from scm_world.queries.verification import Verification, edge_reports
 from scm_world.tasks import Task
 from scm_world.world import Simulation
 
@@ -94,110 +84,55 @@ def verify(
     """
     whole_number("number of probes", probes, least=1)
     whole_number("number of held-out probes", held_out, least=0)
-    if isinstance(system, Simulation | SCM):
-        if options:
-            raise UnknownOption("option for a world that is made", next(iter(options)), ())
-        with system.unchanged() if isinstance(system, Simulation) else contextlib.nullcontext():
-            return _verified(system, probes, held_out, seed, progress, found)
-    world = Simulation(system, **options)
-    with contextlib.closing(world):
-        return _verified(world, probes, held_out, seed, progress, found)
-
-
-def _verified(
-    system: Simulation | SCM,
-    probes: int,
-    held_out: int,
-    seed: int,
-    progress: Progress | None,
-    found: Callable[[set[EdgeKey]], object] | None,
-) -> Verification:
-    started = time.perf_counter()
-    world = system if isinstance(system, Simulation) else None
-    model: SCM = system if isinstance(system, SCM) else system.model
-    generated = world is not None and world.task.generated_graph
-    declared = tuple(edge.key for edge in model.edges)
-    missing, after = set(declared), dict[EdgeKey, int]()
-    effects = Effects(exact=generated)
-    paired, markov = Paired(system, seed), None if world is None else Markov(world, seed)
-
-    def experiments(states: Iterator[Probe], first: int, *, held: bool) -> Iterator[Effects]:
-        for number, probe in enumerate(states, first):
-            one = paired.run(number, probe, missing)
-            if held and markov is not None and not one.unstable:
-                markov.run(number, probe, one)
-            yield one
-
-    def is_enough(done: int) -> bool:
-        now = effects.edges(declared)
-        if found is not None:
-            found(now)
-        after.update(dict.fromkeys(missing & now, done))
-        missing.difference_update(now)
-        return not missing or (generated and done - max(after.values(), default=0) >= QUIET)
-
-    states = probe_states(system, probes, seed)
-    searched, interrupted = series(
-        experiments(states, 0, held=False), effects, probes, is_enough, progress, further=held_out
-    )
-    done = searched
-    if not interrupted:
-        states = probe_states(system, held_out, seed + OTHER, scenarios=False)
-        done, interrupted = series(
-            experiments(states, searched, held=True),
+    with opened(system, options) as there:
+        started, paired = time.perf_counter(), Paired(there, seed)
+        model, world = paired.model, there if isinstance(there, Simulation) else None
+        markov = None if world is None else Markov(paired)
+        generated = world is not None and world.task.generated_graph
+        declared = {edge.key for edge in model.edges}
+        missing, after = set(declared), dict[EdgeKey, int]()
+        effects, done, searched, interrupted = Effects(exact=generated), 0, 0, False
+        search = probe_states(there, probes, seed)
+        others = probe_states(there, held_out, seed + OTHER, scenarios=False)
+        try:
+            for held, states in ((False, search), (True, others)):
+                for probe in states:
+                    one = paired.run(done, probe, missing)
+                    if held and markov is not None and not one.unstable:
+                        markov.run(one)
+                    effects.add(one)
+                    done, searched = done + 1, searched + (not held)
+                    now = effects.edges(declared)
+                    after.update(dict.fromkeys(missing & now, done))
+                    missing -= now
+                    quiet = generated and done - max(after.values(), default=0) >= QUIET
+                    last = not held and (quiet or not missing)
+                    if found is not None:
+                        found(now)
+                    if progress is not None:
+                        progress(done, held_out + (searched if held or last else probes))
+                    if last:
+                        break
+        except KeyboardInterrupt:
+            if not done:
+                raise
+            interrupted = True
+        reason = partial(_reason, world, effects, effects.edges(declared))
+        return Verification.of(
+            there,
             effects,
-            searched + held_out,
-            lambda done: is_enough(done) and False,
-            progress,
-            done=searched,
+            edge_reports(model, effects, after, reason),
+            seed=seed,
+            generated=generated,
+            probes=searched,
+            held_out=done - searched,
+            planned=probes,
+            interrupted=interrupted,
+            seconds=time.perf_counter() - started,
         )
-    observed = effects.edges(declared)
-    wrong = dict(effects.violations)
-    for key in observed.difference(declared):
-        wrong.setdefault(key, (effects.largest[key], effects.settings[key]))
-    undeclared = tuple(
-        Undeclared(
-            **named(key),
-            size=size,
-            probe=setting.probe,
-            kind=setting.kind,
-            change=() if setting.change is None else tuple(setting.change.tolist()),
-        )
-        for key, (size, setting) in sorted(wrong.items())
-    )
-    return Verification(
-        task=world.task.name if world else "model",
-        backend=world.backend.name if world else "equations",
-        preset=world.options.preset if world else "none",
-        seed=seed,
-        generated=generated,
-        probes=searched,
-        held_out=done - searched,
-        planned=probes,
-        interrupted=interrupted,
-        rollouts=effects.rollouts,
-        provenance=by_provenance(model, declared, observed, wrong),
-        unstable=effects.unstable,
-        fired=tuple(
-            Fired(**named(key), after=after[key], largest=effects.largest[key])
-            for key in sorted(observed.intersection(declared))
-        ),
-        unseen=tuple(
-            Unseen(
-                **named(edge.key),
-                states=effects.changed[edge.cause],
-                reason=_reason(world, edge, effects, observed),
-            )
-            for edge in sorted(model.edges, key=lambda edge: edge.key)
-            if edge.key not in observed
-        ),
-        undeclared=undeclared,
-        seconds=time.perf_counter() - started,
-        versions=versions(world.engine if world else ""),
-    )
 
 
-def _reason(world: Simulation | None, edge: Edge, effects: Effects, observed: set[EdgeKey]) -> str:
+def _reason(world: Simulation | None, effects: Effects, observed: set[EdgeKey], edge: Edge) -> str:
     """Say why an edge was not seen, as far as the experiments tell."""
     cause, states = edge.cause, effects.changed[edge.cause]
     if not states:

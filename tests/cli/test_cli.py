@@ -18,22 +18,7 @@ from scm_world.cli.arguments import parse_assignments, parse_value
 from scm_world.errors import ConflictingTargets
 from scm_world.variables import Draw, Scale, Shift
 
-KEYS = {
-    "task",
-    "backend",
-    "seed",
-    "probes",
-    "rollouts",
-    "floor",
-    "shd",
-    "precision",
-    "recall",
-    "f1",
-    "undeclared",
-    "missed",
-    "seconds",
-    "versions",
-}
+KEYS = {"task", "backend", "seed", "probes", "rollouts", "score", "edges", "seconds", "versions"}
 CHAIN = """
 import scm_world as sw
 
@@ -90,7 +75,7 @@ def test_missing_edges_are_marked_and_strict_fails() -> None:
     folder = "scm-world-results/discover-reaching-fake-seed0-default_goal_60=0_0_0.2"
     assert f"{folder}/report.json" in result.stdout
     report = read(f"{folder}/report.json")
-    assert report["shd"] > 0
+    assert report["score"]["shd"] > 0
     assert report["arguments"] == ["default_goal_60=0,0,0.2"]
     assert not CONTROL.search(result.output)
     assert "…" not in result.output
@@ -159,7 +144,7 @@ def test_an_interrupted_discovery_reports_what_it_has(
     assert result.exit_code == 130
     if finished:
         assert "1 of 3: interrupted" in result.stdout
-        assert read("here/report.json")["complete"] is False
+        assert read("here/report.json")["planned"] == 3
     else:
         assert "interrupted" in result.stderr
         assert files() == ["chain.py"]

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ PROBES = 3
 
 def whole(report: DiscoveryReport) -> dict[str, Any]:
     """Give all of a report but the time it took."""
-    return {name: value for name, value in asdict(report).items() if name != "seconds"}
+    return report.model_dump(exclude={"seconds"})
 
 
 def interrupted(world: World, path: Path, after: int) -> DiscoveryReport:

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from scm_world.discovery import DiscoveryReport, discover, score
+from scm_world.discovery import DiscoveryReport, discover
 from scm_world.discovery.model_pictures import draw_model, lay_out, to_html
 from scm_world.discovery.names import Families, braces, by_entity
 from scm_world.discovery.plots import EXTRA, MATCHED, MISSING, draw_graphs
 from scm_world.graph import SCM
 from scm_world.queries.experiments.effects import EdgeKey
+from scm_world.queries.verification import EdgeReport
 from scm_world.variables import Derived, Exogenous, Linear, Parent
 from scm_world.world import Simulation
 
@@ -30,22 +31,25 @@ MODEL = SCM(
 
 def report(found: tuple[EdgeKey, ...], declared: tuple[EdgeKey, ...]) -> DiscoveryReport:
     """Write a report with these edges."""
+    status = {
+        **dict.fromkeys(declared, "unseen"),
+        **{edge: "fired" if edge in declared else "undeclared" for edge in found},
+    }
+    edges = tuple(
+        EdgeReport.model_validate({"cause": c, "effect": e, "lag": lag, "status": what})
+        for (c, e, lag), what in status.items()
+    )
     return DiscoveryReport(
         task="model",
-        backend="none",
+        backend="equations",
         preset="none",
         seed=0,
         probes=1,
         planned=1,
         rollouts=1,
         bound=0,
-        floor=0.0,
-        threshold=1e-12,
         inert=0.0,
-        score=score(found, declared),
-        found=found,
-        declared=declared,
-        effects=dict.fromkeys(found, 1.0),
+        edges=edges,
         refused={},
         seconds=0.0,
         versions={},

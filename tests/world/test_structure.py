@@ -87,6 +87,22 @@ def test_snapshots_know_the_structure(backend: str, task: str) -> None:
     np.testing.assert_array_equal(play(world, actions(10, seed=4)), future)
 
 
+def test_a_snapshot_before_anything_was_read_goes_on_alike_from_another_structure() -> None:
+    """Rewards compare with one control step ago, which is computed where nothing read it yet."""
+    world = Simulation("reaching")
+    world.reset(seed=0)
+    world.step(np.full(9, 0.1))
+    here, runs = world.snapshot(), []
+    for _ in range(2):
+        world.restore(here)
+        world.step(np.full(9, 0.2))
+        runs.append(world.values())
+        world.restore(here)
+        world.do({"number_of_obstacles": 1})
+        world.step(np.full(9, 0.1))
+    assert all(np.array_equal(value, runs[1][name]) for name, value in runs[0].items())
+
+
 def test_what_is_not_there_cannot_be_set() -> None:
     """The error names what there is; after the structure changed it can be set."""
     world = shared("fake", "reaching")

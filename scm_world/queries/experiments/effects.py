@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Container
 from dataclasses import dataclass, field
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value
-from scm_world.queries.progress import Progress
 
 EdgeKey = tuple[str, str, int]
 """Cause, effect, lag."""
@@ -22,20 +21,18 @@ FACTOR = 10.0
 """How many times the noise floor an effect must be."""
 
 
-@final
-@dataclass(frozen=True)
-class ProbeSetting:
+class ProbeSetting(NamedTuple):
     """The experiment in which something was seen.
 
     Attributes:
         probe: Number of the probe state.
         kind: How the probe state came about.
-        change: By how much the cause was moved, flattened; None where a mechanism was evaluated.
+        change: By how much the cause was moved, flattened; empty where a mechanism was evaluated.
     """
 
     probe: int
     kind: str
-    change: Floats | None = None
+    change: Floats = np.zeros(0)
 
 
 @final
@@ -46,7 +43,7 @@ class Effects:
     Attributes:
         largest: By cause, effect and lag.
         settings: Where it was seen, if it is not zero.
-        violations: The largest effect, and where, of what changed while all its parents were held.
+        violations: By how much, and where, something changed while all its parents were held.
         unstable: By how much a variable differed though nothing had been changed.
         changed: In how many probe states each variable got another value.
         refused: Targets for which no feasible value was found, with how often.
@@ -72,11 +69,6 @@ class Effects:
             if setting is not None and size > 0.0:
                 self.settings[key] = setting
 
-    def see_violation(self, key: EdgeKey, size: float, setting: ProbeSetting) -> None:
-        """Keep an effect on what has other parents if it is the largest of its pair."""
-        if size > self.violations.get(key, (0.0,))[0]:
-            self.violations[key] = size, setting
-
     def see_unstable(self, name: str, size: float) -> None:
         """Keep a difference that nothing explains if it is the largest of its variable."""
         if size > self.unstable.get(name, 0.0):
@@ -86,8 +78,7 @@ class Effects:
         """Add what was seen in another probe state."""
         for key, size in other.largest.items():
             self.see(key, size, other.settings.get(key))
-        for key, (size, setting) in other.violations.items():
-            self.see_violation(key, size, setting)
+        self.violations = other.violations | self.violations
         for name, size in other.unstable.items():
             self.see_unstable(name, size)
         self.changed += other.changed
@@ -122,46 +113,3 @@ def gap(a: Value, b: Value) -> float:
         return 0.0
     size = float(np.max(np.abs(x.astype(float) - y)))
     return size if size == size else np.inf
-
-
-def series(
-    experiments: Iterable[Effects],
-    effects: Effects,
-    planned: int,
-    enough: Callable[[int], bool],
-    progress: Progress | None = None,
-    *,
-    done: int = 0,
-    further: int = 0,
-) -> tuple[int, bool]:
-    """Add up the experiments in one probe state after another; Ctrl-C ends them.
-
-    Args:
-        experiments: What was seen in each probe state.
-        effects: Is added to.
-        planned: Number of probe states, those before included.
-        enough: Is given how many are finished; returns whether to stop.
-        progress: Called after each probe state.
-        done: How many were finished before.
-        further: How many follow in another series.
-
-    Returns:
-        How many are finished, and whether it was interrupted.
-
-    Raises:
-        KeyboardInterrupt: It was interrupted before the first probe state was finished.
-    """
-    try:
-        for found in experiments:
-            effects.add(found)
-            done += 1
-            last = enough(done)
-            if progress is not None:
-                progress(done, (done if last else planned) + further)
-            if last:
-                break
-    except KeyboardInterrupt:
-        if done == 0:
-            raise
-        return done, True
-    return done, False

@@ -3,55 +3,55 @@
 A graph says of each variable that, given its parents and its own noise, nothing else acts on it. So
 all else may be changed together, by much, and the variable has to stay as it is, bit for bit. That
 one question covers effects without an edge, effects that need two causes, thresholds and rare
-values, and memory that no variable holds. What answers is found by halving: causes are left out as
-long as the difference remains.
+values. It covers memory, too: in some runs everything is put back after a control step, and what
+differs later though its parents do not is remembered by something that is no variable. And a
+mechanism is handed its parents as they were: what differs then is read past them. What answers is
+found by halving: causes are left out as long as the difference remains.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.errors import EngineFailure, InterventionError, ModelError, SeveralProblems
+from scm_world.errors import EngineFailure, InterventionError, ModelError
 from scm_world.policies.planning import action_range
-from scm_world.queries.experiments.effects import RESOLUTION, Effects, ProbeSetting, gap
-from scm_world.queries.experiments.paired import another, engine_decided, settable
-from scm_world.queries.experiments.probes import Probe, ProbeGenerator, anywhere
+from scm_world.queries.experiments.effects import RESOLUTION, Effects, gap
+from scm_world.queries.experiments.paired import Paired
+from scm_world.queries.experiments.probes import Random, without_refused
 from scm_world.queries.local import contacts_of
-from scm_world.variables import Noise, Rotations
-from scm_world.world import Simulation
+from scm_world.variables import Rotations
 
-DRAWS = 5
-"""How often all else gets other values, in each probe state."""
+DRAWS = 5  # how often all else gets other values, in each probe state
+MOST_GROUPS = 4  # for how many sets of parents, in each of these draws
+LATER = 3  # for how many control steps memory is looked for, after everything has been put back
+NEAR = 0.01  # how far towards another value geometry is moved: else bodies would overlap
+GEOMETRY = "m", "rad"  # units of what decides whether bodies overlap; orientations do as well
+BLAMED = 6  # of how many variables the causes of a difference are looked for
 
-MOST_GROUPS = 4
-"""For how many sets of parents, in each of these draws."""
+Changed = dict[str, Value]
+"""Variables that get other values."""
 
-LATER = 3
-"""For how many control steps memory is looked for, after everything has been put back."""
+Effect = tuple[str, int]
+"""A variable, and the number of control steps after the change."""
 
-PLACES = 4
-"""How many states are tried that both runs are put into."""
 
-NEAR = 0.01
-"""How far towards another value of its spaces geometry is moved: else bodies would overlap."""
+class Run(NamedTuple):
+    """What a change is followed by.
 
-GEOMETRY = "m", "rad"
-"""Units of what decides whether bodies overlap; orientations do as well."""
+    Attributes:
+        request: The change, and what was held.
+        values: Before and after a control step, after everything was put back, and later.
+        solved: Of each mechanism, with its parents as they are in the probe state.
+    """
 
-BLAMED = 6
-"""For how many variables, and how often of each, the causes of a difference are looked for."""
-
-ATTEMPTS = 4
-"""How often a request is tried, each time without what was refused."""
-
-Differing = dict[tuple[str, int], float]
-"""By how much each variable differs, by name and number of control steps after the change."""
+    request: Changed
+    values: list[Values]
+    solved: dict[Effect, Value]
 
 
 @final
@@ -59,283 +59,197 @@ class Markov:
     """The test of one world, whose backend decides some of its variables.
 
     Args:
-        world: It is restored to the probe state before every experiment.
-        seed: Of the values that variables are given.
+        paired: The world, in the probe state in which the test is made.
     """
 
-    def __init__(self, world: Simulation, seed: int) -> None:
-        self._world, self._noise = world, Noise(seed)
-        model, deciding = world.model, frozenset(world.task.decided_by)
+    def __init__(self, paired: Paired) -> None:
+        self._paired, self._world, model = paired, paired.world, paired.model
+        deciding = frozenset(self._world.task.decided_by)
         self._targets = tuple(
             name
-            for name in settable(model)
-            if not deciding or deciding.isdisjoint({name, *world.compiled.static_order((name,))})
+            for name in paired.targets
+            if not deciding
+            or deciding.isdisjoint({name, *self._world.compiled.static_order((name,))})
         )
         self._geometry = {
             v.name for v in model.variables if v.unit in GEOMETRY or isinstance(v.bounds, Rotations)
         }
-        self._actions, self._compiled = world.compiled.actions, world.compiled
-        self._states = engine_decided(model)
-        self._alone = tuple(
+        self._compiled = self._world.compiled
+        self._parents = {
+            name: tuple(p for p in model.declared(name).all_parents if p.lag)
+            for name in paired.states
+        }
+        self._mechanisms = tuple(
             v.name
             for v in model.variables
             if getattr(v, "mechanism", None) is not None and getattr(v, "noise", None) is None
         )
-        self._parents = {
-            name: tuple(p for p in model.declared(name).all_parents if p.lag)
-            for name in self._states
-        }
-        self._least = 0.0 if world.task.generated_graph else RESOLUTION
-        self._blamed: Counter[tuple[str, int]] = Counter()
+        self._known: dict[Effect, set[str]] = {}
 
-    def run(self, number: int, probe: Probe, effects: Effects) -> None:
-        """Do all experiments of one probe state, and note what is seen."""
-        self._number, self._probe, self.effects = number, probe, effects
-        world, rng = self._world, ProbeGenerator(self._noise, number)
-        world.restore(probe.snapshot)
-        self._first, self._earlier = world.values(), world.previous()
+    def run(self, effects: Effects) -> None:
+        """Do all experiments in the present probe state, and note what is seen."""
+        self._effects, number = effects, self._paired.setting.probe
+        rng = np.random.default_rng((self._paired.seed, number, 1))
+        actions = rng.uniform(*action_range(self._world), (LATER, self._compiled.n_actions))
         for draw in range(DRAWS):
-            context = self._wish(rng, f"context {draw}", actions=False) if draw else {}
-            base = self._held(context)
-            groups = self._groups(context)
-            wish = self._wish(rng, f"together {draw}", geometry=draw == 0)
+            context = self._other_values(rng, actions=False) if draw else {}
+            base = self._base(context, None if draw else actions)
+            groups = self._groups(base.request)
+            changed = self._other_values(rng, geometry=draw == 0)
             for turn in range(min(MOST_GROUPS, len(groups))):
                 parents, children = groups[(number + draw * MOST_GROUPS + turn) % len(groups)]
-                changed = {name: v for name, v in wish.items() if name not in parents}
-                self._see(changed, partial(self._now, context, base, parents, children))
-        self._see_memory(rng)
+                some = {name: value for name, value in changed.items() if name not in parents}
+                self._see(some, partial(self._differing, base, parents, children, None))
+            if draw == 0:  # writing all parameters anew could hide that one writes another one
+                later = actions if len(base.values) > 2 else actions[:0]
+                chosen = {name for name in changed if rng.random() < 0.5}
+                for half in (chosen, changed.keys() - chosen):
+                    some = {name: value for name, value in changed.items() if name in half}
+                    self._see(some, partial(self._differing, base, (), [], later))
 
     # --- the pieces -------------------------------------------------------------------------------
 
-    def _groups(self, context: Mapping[str, Value]) -> list[tuple[Collection[str], list[str]]]:
+    def _groups(self, context: Changed) -> list[tuple[Collection[str], list[str]]]:
         """Group the states by their parents; those by contact act only where something touches."""
         groups: dict[frozenset[str], list[str]] = {}
-        held, touching = {*self._targets, *self._actions}, self._touches(context)
+        held, touching = {*self._targets, *self._paired.actions}, self._touches(context)
         for name, parents in self._parents.items():
             here = {p.name for p in parents if p.when != "contact" or touching}
             groups.setdefault(frozenset(here & held), []).append(name)
         return list(groups.items())
 
-    def _touches(self, request: Mapping[str, Value]) -> bool:
+    def _touches(self, changed: Changed) -> bool:
         """Check whether any two bodies touch in a physics step of the coming control step."""
-        action = self._set(request)
+        action = self._paired.at(changed)
         try:
             return any(contacts_of(self._world, action))
-        except ModelError:  # contacts are not all known
+        except (ModelError, EngineFailure):  # contacts are not all known
             return True
 
-    def _wish(
-        self, rng: ProbeGenerator, stream: str, *, geometry: bool = False, actions: bool = True
-    ) -> dict[str, Value]:
+    def _other_values(
+        self, rng: Random, *, geometry: bool = False, actions: bool = True
+    ) -> Changed:
         """Draw another value of everything that can be set, the action too.
 
         Of what decides where bodies are, most draws are refused, which takes long. With
         ``geometry``, this is moved a little, and so are velocities: more would make bodies touch.
         """
-        model, now, wish = self._world.model, self._first, dict[str, Value]()
-        for name in self._targets:
+        paired, found = self._paired, Changed()
+        little = {*self._geometry, *paired.states} if geometry else set[str]()
+        for name in (*self._targets, *(paired.actions if actions else ())):
             if geometry or name not in self._geometry:
-                little = name in self._geometry or (geometry and name in self._states)
-                scale = NEAR if little else 1.0
-                value = another(model, name, now, rng, stream, scale)
-                if value is not None and gap(value, now[name]) > 0.0:
-                    wish[name] = value
-        low, high = action_range(self._world)
-        action = low + rng.random(f"action {stream}", len(low)) * (high - low)
-        return wish | {name: action[where] for name, where in self._actions.items() if actions}
+                value = paired.other(name, paired.first, rng, NEAR if name in little else 1.0)
+                if value is not None and gap(value, paired.first[name]) > 0.0:
+                    found[name] = value
+        return found
 
-    def _set(self, changed: Mapping[str, Value]) -> Floats:
-        """Go to the probe state and change some variables; return the action, changed likewise.
+    def _base(self, context: Changed, later: Floats | None) -> Run:
+        """Run in other circumstances, in which some effects show only, and in present ones if not.
 
-        Raises:
-            InterventionError: That is impossible.
+        Where bodies that press on each other could not be put back, it does not go on.
         """
-        self._world.restore(self._probe.snapshot)
-        request = {name: value for name, value in changed.items() if name not in self._actions}
-        if request:
-            self._world.do(request)
-        action = np.array(self._probe.action)
-        for name in self._actions.keys() & changed.keys():
-            action[self._actions[name]] = changed[name]
-        return action
-
-    def _held(self, context: dict[str, Value]) -> tuple[Values, Values]:
-        """Take a control step under other circumstances, in which some effects show only.
-
-        Returns:
-            All values before and after it. Where the circumstances are refused, they are cleared.
-        """
-        try:
-            action = self._set(context)
-            before = self._world.values()
-            self._world.step(action)
-        except (InterventionError, EngineFailure):
-            context.clear()
-            return self._held(context)
-        return before, self._world.values()
-
-    def _now(
-        self,
-        context: Mapping[str, Value],
-        base: tuple[Values, Values],
-        parents: Collection[str],
-        children: Iterable[str],
-        changed: Mapping[str, Value],
-    ) -> Differing:
-        """Take a control step with other values of what is no parent; compare the children."""
-        request = {**context, **changed}
-        action = self._set(request)
-        now = self._world.row
-        moved = {n: base[0][n] for n in parents if n not in self._actions}
-        moved = {n: value for n, value in moved.items() if gap(now[n], value) > 0.0}
-        if moved:  # follows from what was changed
-            request |= moved
-            action = self._set(request)
-        if self._world.compiled is not self._compiled:
-            return {}
-        self._world.step(action)
-        self.effects.rollouts += 1
-        now = self._world.row
-        found = {(name, 1): gap(now[name], base[1][name]) for name in children}
-        found = {key: size for key, size in found.items() if size > self._least}
-        if not found:
-            return {}
-        touching = self._touches(request)  # what did not touch before may act now
-        return {
-            (name, lag): size
-            for (name, lag), size in found.items()
-            if not touching
-            or not any(p.when == "contact" and p.name in changed for p in self._parents[name])
-        }
-
-    # --- the past ---------------------------------------------------------------------------------
-
-    def _see_memory(self, rng: ProbeGenerator) -> None:
-        """Change one half of everything for a control step, put it back, and go on; then the other.
-
-        What differs from a run without the change is remembered by something that is no variable.
-        To write all parameters anew could hide that one of them writes another one, too.
-        """
-        low, high = action_range(self._world)
-        shares = rng.random("memory", LATER * len(low)).reshape(LATER, -1)
-        actions = low + shares * (high - low)
-        for place in range(PLACES):
-            self._set({})
-            back = {name: self._first[name] for name in self._targets}
-            if place:
-                back |= anywhere(self._world, ProbeGenerator(self._noise, self._number, place))[0]
+        shorter = None if later is None else later[:0]
+        for request, further in ((context, later), (context, shorter)):
             try:
-                base = self._after({}, back, actions)
+                return self._run(request, {}, further)
             except (InterventionError, EngineFailure):
                 continue
-            break
-        else:
-            return
-        wish = self._wish(rng, "memory", geometry=True)
-        chosen = rng.random("half", len(wish)) < 0.5
-        for half in (chosen, ~chosen):
-            some = {name: wish[name] for name, one in zip(wish, half, strict=True) if one}
-            self._see(some, lambda changed: self._since(base, self._after(changed, back, actions)))
+        return self._run({}, {}, shorter)
 
-    def _after(
-        self, changed: Mapping[str, Value], back: Mapping[str, Value], actions: Floats
-    ) -> tuple[dict[tuple[str, int], Value], list[dict[str, Value]]]:
-        """Change something for a control step, put it back, and go on.
-
-        Returns:
-            What each mechanism gives at the two instants, whose parents are handed to it as they
-            were: what differs is read past them. And all values from then on.
-        """
-        world, solve = self._world, self._world.model.solve
-        action = self._set(changed)
-        mechanisms: dict[tuple[str, int], Value] = {}
+    def _run(
+        self, request: Changed, held: Values, later: Floats | None, back: Values | None = None
+    ) -> Run:
+        """Take a control step after a change, put all back, and go on; ask mechanisms, too."""
+        paired, world, solved = self._paired, self._world, dict[Effect, Value]()
+        action = paired.at(request)
+        gaps = paired.gaps(held, held)
+        if any(gaps.values()):  # follows from what was changed
+            request = request | {name: held[name] for name, size in gaps.items() if size > 0.0}
+            action = paired.at(request)
+        values = [world.values()]
         for lag in (0, 1):
-            for name in reversed(self._alone):
-                found = solve(self._first, previous=self._earlier, only=(name,))
-                mechanisms[name, lag] = found[name]
+            for name in self._mechanisms if later is not None else ():
+                solved[name, lag] = paired.evaluated(name, paired.here)
             if lag == 0:
                 world.step(action)
-        now = world.row
-        world.do({name: value for name, value in back.items() if gap(now[name], value) > 0.0})
-        values = [world.values()]
-        for action in actions:
-            world.step(action)
-            self.effects.rollouts += 1
+        values.append(world.values())
+        self._effects.rollouts += 1
+        if later is not None and len(later):
+            back = values[0] if back is None else back
+            moved = (name for name in self._targets if gap(values[1][name], back[name]) > 0.0)
+            world.do({name: back[name] for name in moved})
             values.append(world.values())
-        return mechanisms, values
+        for action in () if later is None else later:
+            world.step(action)
+            self._effects.rollouts += 1
+            values.append(world.values())
+        return Run(request, values, solved)
 
-    def _since(
+    def _differing(
         self,
-        base: tuple[dict[tuple[str, int], Value], list[dict[str, Value]]],
-        other: tuple[dict[tuple[str, int], Value], list[dict[str, Value]]],
-    ) -> Differing:
-        """Tell what differs from a run without the change though its parents do not."""
-        found = {key: gap(other[0][key], value) for key, value in base[0].items()}
-        for step in range(LATER):
-            (before, now), (its, then) = base[1][step : step + 2], other[1][step : step + 2]
-            for name, parents in self._parents.items():
-                held = (p.name for p in parents if p.name not in self._actions)
-                if all(gap(its[parent], before[parent]) == 0.0 for parent in held):
-                    found[name, step + 2] = gap(then[name], now[name])
-        return {key: size for key, size in found.items() if size > self._least}
+        base: Run,
+        parents: Collection[str],
+        children: list[str],
+        later: Floats | None,
+        changed: Changed,
+    ) -> dict[Effect, float]:
+        """Compute by how much variables differ whose parents do not when others are changed."""
+        before, acts = base.values[0], self._paired.actions
+        held = {name: before[name] for name in parents if name not in acts}
+        run = self._run({**base.request, **changed}, held, later, before)
+        if self._world.compiled is not self._compiled:
+            return {}
+        found = {key: gap(value, base.solved[key]) for key, value in run.solved.items()}
+        now = {name: gap(run.values[1][name], base.values[1][name]) for name in children}
+        if any(now.values()) and self._touches(run.request):  # what did not touch may act now
+            for name in children:
+                if any(p.when == "contact" and p.name in changed for p in self._parents[name]):
+                    del now[name]
+        found |= {(name, 1): size for name, size in now.items()}
+        for lag in range(2, len(run.values) - 1):
+            for name, causes in self._parents.items():
+                same = (p.name for p in causes if p.name not in acts)
+                if all(gap(run.values[lag][p], base.values[lag][p]) == 0.0 for p in same):
+                    found[name, lag] = gap(run.values[lag + 1][name], base.values[lag + 1][name])
+        least = 0.0 if self._paired.exact else RESOLUTION
+        return {key: size for key, size in found.items() if size > least}
 
     # --- the causes -------------------------------------------------------------------------------
 
-    def _see(
-        self, wish: dict[str, Value], differing: Callable[[Mapping[str, Value]], Differing]
-    ) -> None:
+    def _see(self, changed: Changed, differing: Callable[[Changed], dict[Effect, float]]) -> None:
         """Find and note the causes of what differs when everything is changed."""
-        found = self._feasible(wish, differing)
+        found = without_refused(changed, differing, self._geometry) or {}
         for effect in sorted(found, key=lambda one: -found[one])[:BLAMED]:
-            if self._blamed[effect] >= BLAMED:  # it is known by now
+            size = partial(self._size, effect, changed, differing)
+            known = self._known.setdefault(effect, set())
+            if size([]) or not size([*changed]):  # it differs by itself
+                self._effects.see_unstable(effect[0], found[effect])
                 continue
-            self._blamed[effect] += 1
-            sizes = [found[effect]]
-
-            def differs(
-                names: list[str], effect: tuple[str, int] = effect, sizes: list[float] = sizes
-            ) -> bool:
-                try:
-                    again = differing({name: wish[name] for name in names})
-                except (InterventionError, EngineFailure):
-                    return False
-                sizes.append(again.get(effect, sizes[-1]))
-                return effect in again
-
-            if differs([]) or not differs([*wish]):  # it differs by itself
-                self.effects.see_unstable(effect[0], sizes[-1])
+            new = [name for name in changed if name not in known]
+            if not new or not size(new):
                 continue
-            causes = fewest([*wish], differs)
-            now = {name: self._probe.action[where] for name, where in self._actions.items()}
-            now |= {name: self._first[name] for name in causes if name not in now}
-            change = np.concatenate([np.ravel(wish[n]) - np.ravel(now[n]) for n in causes])
-            setting = ProbeSetting(self._number, f"{self._probe.kind}, together", change)
-            self.effects.see_violation((" & ".join(causes), *effect), sizes[-1], setting)
+            causes = fewest(new, size)
+            known.update(causes)
+            first, setting = self._paired.first, self._paired.setting
+            change = np.concatenate([np.ravel(changed[n]) - np.ravel(first[n]) for n in causes])
+            setting = setting._replace(kind=f"{setting.kind}, together", change=change)
+            self._effects.violations[" & ".join(causes), *effect] = size(causes), setting
 
-    def _feasible(
-        self, wish: dict[str, Value], differing: Callable[[Mapping[str, Value]], Differing]
-    ) -> Differing:
-        """Try a wish, and take what is refused out of it.
-
-        Where two bodies would overlap, one target is named, and it takes long to say which. So
-        places and sizes are left out where leaving out one of them does not suffice.
-        """
-        for attempt in range(ATTEMPTS):
-            try:
-                return differing(wish)
-            except EngineFailure:
-                break
-            except InterventionError as error:
-                problems = error.problems if isinstance(error, SeveralProblems) else (error,)
-                refused = {problem.variable for problem in problems}
-                if attempt or not refused & wish.keys():
-                    refused |= self._geometry
-                for name in refused & wish.keys():
-                    del wish[name]
-        return {}
+    def _size(
+        self,
+        effect: Effect,
+        changed: Mapping[str, Value],
+        differing: Callable[[Changed], dict[Effect, float]],
+        names: list[str],
+    ) -> float:
+        """Compute the effect of some of the changes; 0 if they are refused."""
+        try:
+            return differing({name: changed[name] for name in names}).get(effect, 0.0)
+        except (InterventionError, EngineFailure):
+            return 0.0
 
 
-def fewest(names: list[str], differs: Callable[[list[str]], bool]) -> list[str]:
+def fewest(names: list[str], differs: Callable[[list[str]], object]) -> list[str]:
     """Leave out names as long as something still differs; no further one can be left out then.
 
     Example:

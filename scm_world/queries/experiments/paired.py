@@ -14,19 +14,20 @@ Equations have the first kind only, so that everything here serves them, too.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from typing import Any, NamedTuple, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.errors import EngineFailure, InterventionError, SnapshotMismatch
+from scm_world.errors import EngineFailure, InterventionError, SnapshotMismatch, UnknownOption
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier
 from scm_world.policies.planning import action_range
 from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.experiments.effects import RESOLUTION, EdgeKey, Effects, ProbeSetting, gap
-from scm_world.queries.experiments.probes import Probe, ProbeGenerator, drawn, touching_pairs
-from scm_world.variables import Action, Exogenous, Measured, Noise, Rotations
+from scm_world.queries.experiments.probes import Probe, Random, another, touching_pairs
+from scm_world.variables import Action, Exogenous, Measured, Noise
 from scm_world.world import Simulation
 
 SCALES = (0.1, 0.03, 0.01, 0.003, 0.001)
@@ -35,18 +36,9 @@ SCALES = (0.1, 0.03, 0.01, 0.003, 0.001)
 FAR = (1.0, 0.3)
 """How far it is moved first, in every fourth probe state: what has a threshold shows there."""
 
-REMEMBERED = 6
-"""How many probe states lend their values to the causes of mechanisms, the present one included."""
-
 
 class Instant(NamedTuple):
-    """What mechanisms are evaluated with.
-
-    Attributes:
-        values: Of the variables.
-        previous: Of one control step ago; None where there is no time.
-        key: Of the noise; None where there is none.
-    """
+    """What mechanisms are evaluated with: values, those of one step ago, and the key of noise."""
 
     values: Values
     previous: Values | None
@@ -55,265 +47,250 @@ class Instant(NamedTuple):
 
 @final
 class Paired:
-    """Experiments in which one variable is changed.
+    """A system that is run twice from one state: as it is, and with something changed.
 
     Args:
         system: A world, which is restored to the probe state before every experiment, or equations.
         seed: Of the values that are given to variables.
 
     Attributes:
+        world: The world; None of equations.
+        model: The causal model.
         targets: The variables that are set; of equations all.
         states: The variables that the backend decides.
+        actions: Where each variable of the action is.
         exact: Whether any difference counts; see ``Effects``.
+        probe: The present probe state.
+        here: What mechanisms are evaluated with in it.
+        first: The values in it, actions included.
+        setting: Its number and kind.
     """
 
     def __init__(self, system: Simulation | SCM, seed: int) -> None:
-        self._system: Any = system
-        self._world = system if isinstance(system, Simulation) else None
-        self._model = model = system if isinstance(system, SCM) else system.model
-        self._noise = Noise(seed)
-        self._kept: list[Instant] = []
-        self.states: tuple[str, ...] = ()
-        self.targets = tuple(model)
-        self.exact = False
-        if self._world is None:
-            compiled = CompiledModel(model)
+        self.world: Any = None if isinstance(system, SCM) else system
+        self.model: SCM = system if isinstance(system, SCM) else system.model
+        self.seed, self._noise = seed, Noise(seed)
+        self.states, self.targets, self.exact = tuple[str, ...](), tuple(self.model), False
+        self.actions: Mapping[str, Any] = {}
+        if self.world is None:
+            compiled = CompiledModel(self.model)
             self._idle = compiled.split(Equations(compiled).idle())
         else:
-            self.states = engine_decided(model)
-            self.targets = settable(model)
-            self.exact = self._world.task.generated_graph
+            self.states, self.targets = engine_decided(self.model), settable(self.model)
+            self.actions, self.exact = self.world.compiled.actions, self.world.task.generated_graph
         self._causes: dict[str, list[tuple[str, int]]] = {}
-        for edge in model.edges:
+        for edge in self.model.edges:
             if edge.effect not in self.states:
                 self._causes.setdefault(edge.effect, []).append((edge.cause, edge.lag))
 
-    def run(self, number: int, probe: Any, wanted: Collection[EdgeKey] | None = None) -> Effects:
-        """Do all experiments of one probe state.
+    def run(self, number: int, probe: Probe, wanted: Collection[EdgeKey] | None = None) -> Effects:
+        """Do all experiments of one probe state in which one variable is changed.
 
         Args:
             number: Of the probe state.
-            probe: The probe state; of equations anything.
+            probe: The probe state.
             wanted: The declared edges that are looked for; all edges if None.
         """
-        effects = Effects(exact=self.exact)
+        effects, rng = Effects(exact=self.exact), np.random.default_rng((self.seed, number))
+        self.probe, self.setting = probe, ProbeSetting(number, probe.kind)
+        if self.world is None:
+            first = self.model.solve(self._idle, key=NoiseKey(self._noise, number, 0))
+            key = NoiseKey(self._noise, number, 1)
+            unit = self.model.solve(self._idle, previous=first, key=key)
+            self.here = Instant(unit, first, key)
+            self._see_mechanisms([self.here], wanted, effects, rng)
+            return effects
         try:
-            instants = self.look(number, probe)
+            self.world.restore(probe.snapshot)
         except SnapshotMismatch:
-            if not self._is_worn(effects):
+            self._see_worn(effects)
+            if not effects.unstable:
                 raise
             return effects
+        self.here = Instant(self.world.values(), self.world.previous())
+        actions = {name: probe.action[at] for name, at in self.actions.items()}
+        self.first = {**self.here.values, **actions}
+        self.world.step(probe.action)
+        later = Instant(self.world.values(), self.world.previous())
         effects.rollouts += 1
-        self._see_mechanisms(ProbeSetting(number, probe.kind), instants, wanted, effects)
-        if self._world is not None:
-            effects.touched |= {body for pair in touching_pairs(self._world) for body in pair}
-            self._see_states(number, probe, instants, wanted, effects)
+        effects.touched |= {body for pair in touching_pairs(self.world) for body in pair}
+        self._see_mechanisms([later, self.here], wanted, effects, rng)
+        causes = None if wanted is None else {c for c, effect, _ in wanted if effect in self.states}
+        for name in (*self.targets, *self.actions):
+            if causes is None or name in causes:
+                self._vary(name, later.values, effects, rng)
+        self.world.step(self.at({}))
+        for name, value in self.world.values().items():
+            effects.see_unstable(name, gap(value, later.values[name]))
         return effects
 
-    def _is_worn(self, effects: Effects) -> bool:
+    def _see_worn(self, effects: Effects) -> None:
         """Note the parameters that the backend has changed by itself; no state comes back then."""
-        world: Any = self._world
-        now, names = world.row, {k: n for n, k in world.compiled.parameter_keys.items()}
-        for key, value in world.backend.parameters(names).items():
-            effects.see_unstable(names[key], gap(value, now[names[key]]))
-        return bool(effects.unstable)
+        now, names = self.world.row, self.world.compiled.parameter_keys
+        found = self.world.backend.parameters(names.values())
+        for name, key in names.items():
+            effects.see_unstable(name, gap(found[key], now[name]))
 
-    def look(self, number: int, probe: Any) -> list[Instant]:
-        """Return two instants of a probe state, the later one first, and three that are drawn.
+    def at(self, changed: Mapping[str, Value]) -> Floats:
+        """Go to the probe state and change some variables; return the action, changed likewise.
 
-        In the last one, each cause of a mechanism is moved by itself.
+        Raises:
+            InterventionError: That is impossible.
         """
-        if self._world is None:
-            first = self._model.solve(self._idle, key=NoiseKey(self._noise, number, 0))
-            key = NoiseKey(self._noise, number, 1)
-            unit = self._model.solve(self._idle, previous=first, key=key)
-            instants = [Instant(unit, first, key)]
-        else:
-            self._world.restore(probe.snapshot)
-            here = Instant(self._world.values(), self._world.previous())
-            self._world.step(probe.action)
-            instants = [Instant(self._world.values(), self._world.previous()), here]
-        self._kept = [*self._kept, *instants][-2 * REMEMBERED :]
-        now, rng = instants[-1], ProbeGenerator(self._noise, number)
-        moved = {
-            name: value
-            for name in {cause: None for causes in self._causes.values() for cause, _ in causes}
-            for value in (another(self._model, name, now.values, rng, "moved", 1.0),)
-            if value is not None
-        }
-        others = [self._drawn(number, turn, now) for turn in (0, 1)]
-        return [*instants, *others, now._replace(values=moved)]
+        self.world.restore(self.probe.snapshot)
+        request = {name: value for name, value in changed.items() if name not in self.actions}
+        if request:
+            self.world.do(request)
+        action = np.array(self.probe.action)
+        for name in self.actions.keys() & changed.keys():
+            action[self.actions[name]] = changed[name]
+        return action
 
-    def _drawn(self, number: int, turn: int, now: Instant) -> Instant:
-        """Draw everything that has no parents, and compute what follows from it.
+    def other(self, name: str, values: Values, rng: Random, scale: float = 1.0) -> Any:
+        """Move a variable towards another value of its spaces; None if there is none."""
+        if name not in self.actions:
+            return another(self.model.declared(name), values, rng, scale)
+        low, high = (end[self.actions[name]] for end in action_range(self.world))
+        return np.asarray(values[name] + scale * (rng.uniform(low, high) - values[name]))
 
-        Some causes show in other circumstances only: the noise of a wall where walls are random.
-        """
-        rng, model = ProbeGenerator(self._noise, number, turn), self._model
-        names = tuple(model) if self._world is None else self._world.static_names
-        values = {name: now.values[name] for name in names}
-        roots = {
-            v.name: other
-            for v in model.variables
-            if isinstance(v, Exogenous | Action) and v.name in values
-            for other in (drawn(v, values[v.name], values, rng, "roots"),)
-            if other is not None
-        }
-        if self._world is not None:
-            return Instant(model.solve({**values, **roots}, only=names), None)
-        known = {**self._idle, **roots}
-        return now._replace(values=model.solve(known, previous=now.previous, key=now.key))
+    def gaps(self, names: Iterable[str], base: Values) -> dict[str, float]:
+        """Compute by how much present values differ; what has another shape by now is left out."""
+        now = self.world.row
+        alike = (n for n in names if n in now and np.shape(now[n]) == np.shape(base[n]))
+        return {name: gap(now[name], base[name]) for name in alike}
 
     # --- mechanisms -------------------------------------------------------------------------------
 
     def _see_mechanisms(
         self,
-        setting: ProbeSetting,
         instants: list[Instant],
         wanted: Collection[EdgeKey] | None,
         effects: Effects,
+        rng: Random,
     ) -> None:
-        """Evaluate each mechanism with one cause as it is at another instant.
+        """Evaluate each mechanism with one cause as it is at another instant, or is drawn.
 
-        In the end each is evaluated once more, with everything else as it is at another instant:
-        the same has to come out.
+        In the end each is evaluated once more, with everything else drawn: the same has to come
+        out.
         """
-        others = [*instants, *self._kept]
-        bases = instants[:3]
-        if self._world is None:  # experiments are counted, and every unit is another circumstance
-            bases = [bases[setting.probe % 2]]
+        bases = [*instants, self._drawn(rng)]
+        lent = [base.values for base in (*bases, self._drawn(rng))]
+        causes = dict.fromkeys(cause for found in self._causes.values() for cause, _ in found)
+        drawn = {n: another(self.model.declared(n), self.here.values, rng) for n in causes}
+        lent.append({name: value for name, value in drawn.items() if value is not None})
+        if self.world is None:  # experiments are counted, and every unit is another circumstance
+            bases = [bases[self.setting.probe % 2]]
         done = set[tuple[str, int, int]]()
         for base in bases:
             solved: dict[str, Value] = {}
-            for child, causes in self._causes.items():
-                if any(not lag and cause not in base.values for cause, lag in causes):
+            for child, found in self._causes.items():
+                if any(not lag and cause not in base.values for cause, lag in found):
                     continue
-                solved[child] = self._evaluated(child, base)
-                for cause, lag in causes:
+                solved[child] = self.evaluated(child, base)
+                for cause, lag in found:
                     if wanted is not None and (cause, child, lag) not in wanted:
                         continue
-                    for turn, known in enumerate(_otherwise(base, cause, lag, others)):
-                        size = gap(self._evaluated(child, known), solved[child])
-                        effects.see((cause, child, lag), size, setting)
+                    for turn, known in enumerate(_otherwise(base, cause, lag, lent)):
+                        size = gap(self.evaluated(child, known), solved[child])
+                        effects.see((cause, child, lag), size, self.setting)
                         done.add((cause, lag, turn))
                         if size > RESOLUTION:
                             break
             for child in reversed(solved):
                 held = {cause: base.values[cause] for cause, lag in self._causes[child] if not lag}
-                known = base._replace(values={**base.values, **others[-1].values, **held})
-                effects.see_unstable(child, gap(self._evaluated(child, known), solved[child]))
+                known = base._replace(values={**base.values, **lent[-1], **held})
+                effects.see_unstable(child, gap(self.evaluated(child, known), solved[child]))
         effects.changed.update({cause for cause, *_ in done})
-        if self._world is None:  # without the graph, every variable would have to be moved
+        if self.world is None:  # without the graph, every variable would have to be moved
             effects.rollouts += 1 + max(len(done), len(self.targets))
 
-    def _evaluated(self, name: str, at: Instant) -> Value:
-        solve = self._model.solve
+    def _drawn(self, rng: Random) -> Instant:
+        """Draw everything that has no parents, and compute what follows: some causes show only so.
+
+        The noise of a wall, for one, shows where walls are random.
+        """
+        model, now = self.model, self.here
+        names = tuple(model) if self.world is None else self.world.compiled.static_names
+        values = {name: now.values[name] for name in names}
+        roots = {
+            name: another(model.declared(name), values, rng)
+            for name in names
+            if isinstance(model.declared(name), Exogenous | Action)
+        }
+        roots = {name: value for name, value in roots.items() if value is not None}
+        if self.world is not None:
+            return Instant(model.solve({**values, **roots}, only=names), None)
+        known = {**self._idle, **roots}
+        return now._replace(values=model.solve(known, previous=now.previous, key=now.key))
+
+    def evaluated(self, name: str, at: Instant) -> Value:
+        """Evaluate the mechanism of a variable."""
+        solve = self.model.solve
         return solve(at.values, previous=at.previous, key=at.key, only=(name,))[name]
 
     # --- states that a backend decides ------------------------------------------------------------
 
-    def _see_states(
-        self,
-        number: int,
-        probe: Probe,
-        instants: list[Instant],
-        wanted: Collection[EdgeKey] | None,
-        effects: Effects,
-    ) -> None:
-        """Set one variable at a time; compare the states, at once and one control step later."""
-        world: Any = self._world
-        self._probe, self._later, self._first = probe, instants[0].values, instants[1].values
-        causes = None if wanted is None else {c for c, effect, _ in wanted if effect in self.states}
-        for target in self.targets:
-            if causes is None or target in causes:
-                self._vary(number, target, effects)
-        rng, (low, high) = ProbeGenerator(self._noise, number), action_range(world)
-        for name, where in world.compiled.actions.items():
-            if causes is None or name in causes:
-                action = np.array(probe.action)
-                elsewhere = low[where] + rng.random(name, len(low[where])) * (high - low)[where]
-                action[where] += SCALES[0] * (elsewhere - action[where])
-                world.restore(probe.snapshot)
-                change = action - probe.action
-                self._see_later(name, ProbeSetting(number, probe.kind, change), action, effects)
-                effects.changed[name] += bool(change.any())
-        world.restore(probe.snapshot)
-        world.step(probe.action)
-        for name, value in world.values().items():
-            effects.see_unstable(name, gap(value, self._later[name]))
-
-    def _vary(self, number: int, target: str, effects: Effects) -> None:
+    def _vary(self, name: str, later: Values, effects: Effects, rng: Random) -> None:
         """Try other values of a variable until one is feasible."""
-        rng, refused = ProbeGenerator(self._noise, number), False
-        for attempt, scale in enumerate((*FAR, *SCALES) if number % 4 == 3 else SCALES):
-            value = self._other(target, rng, attempt, scale)
-            if value is None or gap(value, self._first[target]) == 0.0:
+        task, near, refused = self.world.task, list[Value](), False
+        if name in task.decided_by:  # the structure is changed a little
+            near = [one[name] for one in task.nearby(self.first) if name in one]
+        for attempt, scale in enumerate((*FAR, *SCALES) if self.setting.probe % 4 == 3 else SCALES):
+            value = self.other(name, self.first, rng, scale)
+            value = near[attempt % len(near)] if near else value
+            if value is None or gap(value, self.first[name]) == 0.0:
                 continue
             try:
-                self._see_target(number, target, value, effects)
+                self._see_target(name, value, later, effects)
             except (InterventionError, EngineFailure):
                 refused = True
                 continue
-            effects.changed[target] += 1
+            effects.changed[name] += 1
             return
-        effects.refused[target] += refused
+        effects.refused[name] += refused
 
-    def _other(self, target: str, rng: ProbeGenerator, attempt: int, scale: float) -> Value | None:
-        """Choose another value; of what decides the structure, one that changes it a little."""
-        world: Any = self._world
-        if target in world.task.decided_by:
-            nearby: list[Value] = [r[target] for r in world.task.nearby(self._first) if target in r]
-            if nearby:
-                return nearby[attempt % len(nearby)]
-        return another(self._model, target, self._first, rng, f"other {attempt}", scale)
-
-    def _see_target(self, number: int, target: str, value: Value, effects: Effects) -> None:
+    def _see_target(self, name: str, value: Value, later: Values, effects: Effects) -> None:
         """Set a variable, hold what follows, and take a control step.
 
         A change of structure is an effect like any other: what is there before and after it is
         held, and compared.
         """
-        world: Any = self._world
-        change = np.ravel(value) - np.ravel(self._first[target])
-        setting = ProbeSetting(number, self._probe.kind, change)
-        held: dict[str, Value] = {}
-        while moved := self._moved({target: value, **held}):
-            held |= {name: self._first[name] for name in moved}
-            for name in (name for name in moved if name in self.states):
-                others = {other: at for other, at in held.items() if other != name}
-                self._moved({target: value, **others})
-                if self._alike(name):
-                    effects.see((target, name, 0), gap(world[name], self._first[name]), setting)
-        self._see_later(target, setting, self._probe.action, effects)
-
-    def _moved(self, request: Mapping[str, Value]) -> list[str]:
-        """Intervene in the probe state; name what could be held, and is not as it was."""
-        world: Any = self._world
-        world.restore(self._probe.snapshot)
-        world.do(request)
-        now = world.row
-        return [
-            name
-            for name in self.targets
-            if name not in request and self._alike(name) and gap(now[name], self._first[name]) > 0.0
-        ]
-
-    def _alike(self, name: str) -> bool:
-        """Check whether a variable is there in the present structure, and has the same shape."""
-        world: Any = self._world
-        now = world.row
-        return name in now and np.shape(now[name]) == np.shape(self._first[name])
-
-    def _see_later(
-        self, cause: str, setting: ProbeSetting, action: Floats, effects: Effects
-    ) -> None:
-        """Take a control step, and compare the states with those of the unchanged run."""
-        world: Any = self._world
-        world.step(action)
+        first, request = self.first, {name: value}
+        setting = self.setting._replace(change=np.ravel(value) - np.ravel(first[name]))
+        while True:
+            action = self.at(request)
+            gaps = self.gaps((n for n in self.targets if n not in request), first)
+            moved = [other for other, size in gaps.items() if size > 0.0]
+            if not moved:
+                break
+            request |= {other: first[other] for other in moved}
+            for state in (other for other in moved if other in self.states):
+                self.at({other: held for other, held in request.items() if other != state})
+                for size in self.gaps((state,), first).values():
+                    effects.see((name, state, 0), size, setting)
+        self.world.step(action)
         effects.rollouts += 1
-        now = world.row
-        for name in filter(self._alike, self.states):
-            effects.see((cause, name, 1), gap(now[name], self._later[name]), setting)
+        for state, size in self.gaps(self.states, later).items():
+            effects.see((name, state, 1), size, setting)
+
+
+@contextmanager
+def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM]:
+    """Give a world that is afterwards as it was, one that is made and closed, or equations.
+
+    Raises:
+        UnknownOption: There are options for a world that is made.
+    """
+    if options and isinstance(system, Simulation | SCM):
+        raise UnknownOption("option for a world that is made", next(iter(options)), ())
+    if isinstance(system, SCM):
+        yield system
+    elif isinstance(system, Simulation):
+        with system.unchanged():
+            yield system
+    else:
+        with closing(Simulation(system, **options)) as world:
+            yield world
 
 
 def settable(model: SCM) -> tuple[str, ...]:
@@ -330,26 +307,14 @@ def engine_decided(model: SCM) -> tuple[str, ...]:
     return tuple(v.name for v in model.variables if isinstance(v, Measured) and v.mechanism is None)
 
 
-def another(
-    model: SCM, name: str, values: Values, rng: ProbeGenerator, stream: str, scale: float
-) -> Value | None:
-    """Move a variable towards another value of its spaces; None if there is none."""
-    variable, present = model.declared(name), values[name]
-    value = drawn(variable, present, values, rng, stream)
-    if value is None or variable.dtype != "real":
-        return value
-    moved = np.asarray(present + scale * (value - present))
-    return variable.bounds.nearest(moved) if isinstance(variable.bounds, Rotations) else moved
-
-
-def _otherwise(base: Instant, cause: str, lag: int, others: Iterable[Instant]) -> Iterator[Instant]:
-    """Give a cause the values that it has at other instants."""
+def _otherwise(base: Instant, cause: str, lag: int, lent: Iterable[Values]) -> Iterator[Instant]:
+    """Give a cause the values that were lent to it."""
     name = earlier(cause, lag) if lag else cause
     now = base.previous if lag else base.values
     if now is None or (lag == 0 and cause not in now):
         return
-    for other in others:
-        value = other.values.get(cause)
+    for other in lent:
+        value = other.get(cause)
         if value is None or (name in now and np.shape(value) != np.shape(now[name])):
             continue
         if name not in now or gap(value, now[name]) > 0.0:
