@@ -34,6 +34,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 import scm_world as sw
+from benchmarks import as_json
 from scm_world.backends import make_backend
 from scm_world.backends.base import Backend, BackendWrapper, EngineSnapshot
 from scm_world.graph import SCM, NoiseKey
@@ -1254,7 +1255,7 @@ def main() -> None:
         rows = {tuple(old[key] for key in keys): old for old in known[kind]}
         rows[tuple(row[key] for key in keys)] = row
         known[kind] = list(rows.values())
-        given.out.write_text(json.dumps(known, indent=1) + "\n")
+        given.out.write_text(as_json(known) + "\n")
         print(row, flush=True)
 
     for system in HONEST:
