@@ -73,7 +73,7 @@ def watched(env: ScmWorldEnv, watch: Stopwatch) -> None:
         "reading the state": (world.backend, "read"),
         "mechanisms": (world, "evaluate"),
         "observation": (env._observer, "observe"),
-        "info": (env, "_info"),
+        "info": (env._observer, "info"),
         "command": (env, "command"),
         REST: (env, "step"),
     }

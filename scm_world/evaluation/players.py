@@ -513,7 +513,7 @@ def _description(policy: Any) -> About:
     try:
         found = Function(name).resolve()
         found = found.policy if isinstance(found, WorldPolicy) else found
-    except (ImportError, AttributeError, ModelError):
+    except (ImportError, AttributeError, ValueError):  # a ModelError is one
         found = None
     is_found = named is inside is found and named.__module__ != "__main__"
     return {"kind": "function" if is_found else "object", "name": name, **_library(name)}

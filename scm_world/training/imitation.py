@@ -343,8 +343,8 @@ def demonstrated(
         for number in numbers:
             protocol = taught[number % len(taught)]
             random = np.random.default_rng([seed, round_, number])
-            turn, observation = runner.begin(protocol, seed=SEED + seed, episode=number)
-            pairs, info = _episode(lesson, env, turn, observation, random, learner, metrics[0])
+            _, observation = runner.begin(protocol, seed=SEED + seed, episode=number)
+            pairs, info = _episode(lesson, env, observation, random, learner, metrics[0])
             shown.append([np.array(one, np.float32) for one in zip(*pairs, strict=True)])
             scores.append(float(info[metrics[0]]))
     finally:
@@ -360,7 +360,6 @@ def demonstrated(
 def _episode(
     lesson: Lesson,
     env: ScmWorldEnv,
-    turn: Any,
     observation: Any,
     random: np.random.Generator,
     learner: MlpPolicy | None,
@@ -394,8 +393,6 @@ def _episode(
         observation, _, terminated, truncated, info = env.step(given)
         row = row + 1 if float(info[metric]) >= lesson.keep else 0
         over = terminated or truncated or row == lesson.settled
-        if not over and turn.stepped(env, env.world.index) and turn.act(env):
-            observation = env.observe()
     return pairs, info
 
 

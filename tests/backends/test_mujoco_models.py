@@ -554,6 +554,6 @@ def test_what_touches_in_stages_is_not_recorded() -> None:
     world = World.from_mjcf(
         f'<mujoco><option integrator="RK4"/><worldbody>{balls}</worldbody></mujoco>'
     )
-    with pytest.raises(ModelError, match="any edge by contact may act"):
+    with pytest.raises(ModelError, match="any edge may act"):
         collect(world, Design(), 1, steps=2, contacts=True)
     assert any(edge.when == "contact" for edge in world.model.edges)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
+from types import SimpleNamespace
 from typing import Any
 
 import networkx as nx
@@ -27,7 +28,7 @@ class Blind:
     """A world of which only the step and the mode can be seen."""
 
     def __init__(self, index: int, action_mode: str) -> None:
-        self.index, self.action_mode = index, action_mode
+        self.index, self.options = index, SimpleNamespace(action_mode=action_mode)
 
 
 def way(policy: str, mode: str, steps: int = 20) -> Floats:

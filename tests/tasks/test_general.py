@@ -89,7 +89,7 @@ def test_one_seed_gives_one_goal_on_every_engine() -> None:
 def test_the_pile_has_the_causes_that_falling_has() -> None:
     """Gravity and friction are ancestors of the goal; the robot is not."""
     world = general()
-    ancestors = world.model.structure.ancestors("goal_0.cartesian_position")
+    ancestors = world.model.ancestors("goal_0.cartesian_position")
     assert {"gravity", "floor_friction", "tool_3.friction", "blocks_mass", "drop_positions"} <= (
         ancestors
     )

@@ -12,6 +12,7 @@ from scm_world.errors import (
     ActionError,
     InterventionError,
     MissingEngine,
+    ModelError,
     UnknownOption,
     UnknownVariable,
     WrongValue,
@@ -245,7 +246,7 @@ def test_what_is_no_task_and_no_backend_is_refused(options: dict[str, Any], word
 )
 def test_what_is_no_intervention_is_refused_at_once(make: Any) -> None:
     """With what it can be."""
-    with pytest.raises(UnknownOption, match="it can be"):
+    with pytest.raises((UnknownOption, ModelError), match="it can be"):
         make()
 
 
