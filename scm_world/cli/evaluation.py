@@ -200,7 +200,7 @@ def explain(
         try:
             chosen.append(found.the(name, given))
         except UnknownOption as error:
-            said = "choose one" if given is None else f"{given!r} is none"
+            said = "there are several: choose one" if given is None else f"{given!r} is none"
             message = f"{said} of {', '.join(error.choices)}"
             raise typer.BadParameter(message, param_hint=flag) from None
     agent, engine = chosen

@@ -54,7 +54,9 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
             to ``load_episode``.
         UnwritableFolder: There is no such folder, no room, or no permission.
     """
-    target = Path(path)
+    if not isinstance(episode, Episode):
+        raise UnknownOption("episode", episode, ("an episode of rollout or live",))
+    episode, target = episode.episode(), Path(path)
     if target.suffix != ".npz":
         target = target.with_name(target.name + ".npz")
     made = io.BytesIO()

@@ -26,7 +26,7 @@ from scm_world.policies.scripted import Policy, as_policy
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.equations import System
 from scm_world.queries.local import contacts_of
-from scm_world.queries.plans import Key, Plan, at_once
+from scm_world.queries.plans import Key, Plan, at_once, check_names
 from scm_world.variables import Draw, Natural
 from scm_world.world import Audit, Simulation
 
@@ -296,6 +296,8 @@ class Episode:
         """
         world, step = self._under_way(), self.steps
         model = world.model
+        if isinstance(world, Simulation):
+            check_names(world, Plan(request))
         more = Plan().then(request, model, at=step)
         due = more.due(world, step, {})
         audit = world.do(due) if due else None

@@ -257,7 +257,10 @@ class Equations:
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
+            ModelError: The model has no lagged edges, so that it has one instant.
         """
+        if not self.model.is_temporal:
+            raise ModelError(["a model without lagged edges has one instant, and takes no step"])
         if self._is_one or np.ndim(action) != 2:
             given = self.compiled.clipped(action)
         else:

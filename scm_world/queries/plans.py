@@ -9,7 +9,13 @@ from typing import Any, final
 import numpy as np
 from pydantic import TypeAdapter
 
-from scm_world.errors import DAMAGED, InterventionError, ModelError, UnknownOption
+from scm_world.errors import (
+    DAMAGED,
+    InterventionError,
+    ModelError,
+    UnknownOption,
+    UnknownVariable,
+)
 from scm_world.graph import SCM, flatten
 from scm_world.models import Model
 from scm_world.queries.equations import System
@@ -363,6 +369,22 @@ def numbered(model: SCM, request: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(bounds, Categories) and value in bounds.labels:
             found[name] = int(bounds.numbers(value))
     return found
+
+
+def check_names(world: Simulation, plan: Plan) -> None:
+    """Refuse names of a plan that nothing in a world will ever have.
+
+    Where variables decide which bodies there are, a name may come within the episode.
+
+    Raises:
+        UnknownVariable: With the names that there are.
+    """
+    compiled = world.compiled
+    refused = dict(compiled.composition.system.refused)
+    for name in dict.fromkeys(name for name, _ in plan.timed()):
+        known = name in world.model or name in compiled.entity_names or name in refused
+        if not known and not world.structures.deciding:
+            raise UnknownVariable(name, tuple(world.model))
 
 
 def targets(model: SCM, name: str) -> tuple[str, ...]:

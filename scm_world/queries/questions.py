@@ -92,7 +92,11 @@ class Questions(ABC):
         action.
         """
         made = Episode.live(self._asked()[0], Unit(seed, episode, self._with(do), policy, 1))
-        made.begin()
+        try:
+            made.begin()
+        except BaseException:
+            made.close()
+            raise
         return made
 
     def see(self, n: int, **options: Any) -> Samples:

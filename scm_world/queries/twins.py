@@ -84,7 +84,7 @@ class Twins:
 
     def _clear(self) -> None:
         self._free: list[Any] = []
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # the collector may give a twin back within it
         self._members: list[Simulation] = []  # of batches
         self._batching = threading.RLock()
         self._pool: tuple[int, ProcessPoolExecutor] | None = None
@@ -109,7 +109,9 @@ class Twins:
     def twin(self) -> Iterator[Any]:
         """Lend a twin; it may be given back in any state."""
         with self._lock:
-            system = self._free.pop() if self._free else self._make()
+            system = self._free.pop() if self._free else None
+        if system is None:
+            system = self._make()
         try:
             yield system
         finally:

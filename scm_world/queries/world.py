@@ -12,16 +12,17 @@ import networkx as nx
 
 from scm_world._types import ArrayLike
 from scm_world.backends import Backend
+from scm_world.errors import NotReset, UnknownOption
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import CompiledModel, Equations, System
 from scm_world.queries.local import local_graph
-from scm_world.queries.plans import Key, Plan, has_times
+from scm_world.queries.plans import Key, Plan, check_names, has_times
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions, planned
 from scm_world.queries.twins import Twins, twins_of
 from scm_world.tasks import ModelTask, StepTask
-from scm_world.variables.subsets import AnyRegion
+from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, WorldSnapshot
 from scm_world.world.interventions import merged
 
@@ -58,8 +59,12 @@ class World(Simulation, Questions):
 
     def __new__(cls, *args: Any, num_worlds: int | None = None, **options: Any) -> Self:
         """Make one world, or several; of a causal model an ``EquationWorld``."""
-        if args and isinstance(args[0], SCM):
-            equations: Any = EquationWorld(CompiledModel(args[0]))
+        task, *others = (*args, *((options.pop("task"),) if "task" in options else ())) or (None,)
+        if isinstance(task, SCM):
+            if others or options or num_worlds is not None:
+                given = [*others, *options, *(() if num_worlds is None else ("num_worlds",))]
+                raise UnknownOption("option of a world of equations", given[0], ("none",))
+            equations: Any = EquationWorld(CompiledModel(task))
             return equations  # type: ignore[no-any-return] # as below
         if num_worlds is None:
             return super().__new__(cls)
@@ -309,12 +314,18 @@ class World(Simulation, Questions):
 
         What has a time is done within the episode, where it must lie in ``space`` too.
         """
-        self._running, self._fired, self._space, self._acted = Plan(), {}, space, -1
-        if not (len(self._standing) or (do and has_times(do))):
-            return super().reset(seed=seed, episode=episode, do=do, space=space)
+        plan, region = Plan(), as_region("space", space)
+        if len(self._standing) or (do and has_times(do)):
+            plan = self._with(do)
         super().reset(seed=seed, episode=episode)
-        self._running = self._with(do)
-        return self.act()
+        self._running, self._fired, self._space, self._acted = plan, {}, region, -1
+        try:
+            if len(plan):
+                return self.act()
+            return self.do(do, space=space) if do else None
+        except BaseException:
+            self._running = Plan()
+            raise
 
     def step(self, action: ArrayLike) -> None:
         """Advance one control step, after what is due at its beginning; see ``Simulation.step``."""
@@ -330,6 +341,10 @@ class World(Simulation, Questions):
     def may_act(self, step: int) -> bool:
         """Return whether the plan of the episode may still do something at a control step."""
         return step != self._acted and self._running.concerns(self, step, self._fired)
+
+    def is_due(self) -> bool:
+        """Return whether the plan of the episode may contain something for this instant."""
+        return self.is_planned and self.may_act(self.index)
 
     def act(self) -> Audit | None:
         """Do what the plan of the episode contains for this instant, as the next step would.
@@ -363,6 +378,7 @@ class World(Simulation, Questions):
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
         """Add something to what is given; of two names of one quantity the later one counts."""
         plan = Plan(do)
+        check_names(self, plan)
         return Plan(merged(self.model, self._standing, plan)) if len(self._standing) else plan
 
     def _asked(self) -> tuple[Twins, System]:
@@ -389,6 +405,16 @@ class EquationWorld(Equations, Questions):
         >>> world.effect("y", do={"x": 1.0}, versus={"x": 0.0}, n=10).mean.round(3)
         np.float64(2.0)
     """
+
+    counterfactual = World.counterfactual
+
+    def _now(self) -> dict[str, Any]:
+        if not self.has_begun:
+            raise NotReset
+        return super()._now()
+
+    def close(self) -> None:
+        """Free nothing: there is no engine."""
 
     def given(self, do: Mapping[str, Any]) -> Self:
         """Return another world in which this is done too, at the same instant; see ``World``."""

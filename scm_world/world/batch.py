@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from inspect import signature
-from typing import Any, final
+from typing import Any, Self, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +63,9 @@ class Batch:
         kinds = {(world.identity, world.engine) for world in self._worlds}
         if len(kinds) > 1:
             raise UnknownOption("worlds", kinds, ("worlds of one task, options and engine",))
-        count = cores() if threads is None else whole_number("threads", threads, least=1)
+        count = self._threads = (
+            cores() if threads is None else whole_number("threads", threads, least=1)
+        )
         backends = [world.backend for world in self._worlds]
         self._engine = backends[0].batch(backends, count)
         self._names, n = tuple(names), len(self._worlds)
@@ -198,11 +201,12 @@ class Batch:
 
     def _everywhere(self, which: Any, act: Callable[[int], Any]) -> dict[int, Any]:
         """Change some worlds, all of them or none."""
+        rows = np.flatnonzero(read_mask("which", which, len(self))).tolist()
         found: dict[int, Any] = {}
         back: list[Callable[[], None]] = []
         row = 0
         try:
-            for row in np.flatnonzero(read_mask("which", which, len(self))).tolist():
+            for row in rows:
                 back.append(self._worlds[row].way_back())
                 found[row] = act(row)
         except BaseException as error:
@@ -222,18 +226,27 @@ class Batch:
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite. No world was stepped.
+            InterventionError: What the plan of a world does now was refused. Nothing has changed.
             NotReset: One of them has no episode yet.
             EngineFailure: The backend lost a state; all other worlds are one step further.
         """
         mask = read_mask("which", which, len(self))
         given = read_actions(actions, mask, self._worlds[0].compiled.n_actions, "world")
-        for row in np.flatnonzero(mask).tolist():
-            self._worlds[row].act()
+        due = [bool(i) and world.is_due() for i, world in zip(mask, self._worlds, strict=True)]
+        if any(due):
+            self._everywhere(np.array(due), lambda row: self._worlds[row].act())
         low, high = self._worlds[0].compiled.action_bounds
         self.advance(np.clip(given, low, high), None if which is None else mask)
 
     def world(self, index: int) -> Simulation:
-        """Give a world."""
+        """Return a world by its number.
+
+        Raises:
+            UnknownOption: There is no such world.
+        """
+        if whole_number("world", index, least=0) >= len(self):
+            allowed = (f"any whole number from 0 to {len(self) - 1}",)
+            raise UnknownOption("world", index, allowed)
         return self._worlds[index]
 
     def table(self, index: int) -> Rows:
@@ -338,6 +351,16 @@ class Batch:
             self._tables = {**kept, compiled: Rows(compiled.mechanisms, start)}
         return self._tables[compiled]
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle the worlds."""
+        return partial(Batch, threads=self._threads, names=self._names), (self._worlds,)
+
     def close(self) -> None:
         """Free the backends of all worlds."""
         for world in self._worlds:
@@ -354,7 +377,7 @@ def located(error: ScmWorldError, index: int, what: str) -> ScmWorldError:
         >>> print(located(ScmWorldError("the block is in the table"), 3, "world"))
         world 3: the block is in the table
     """
-    error.args = (f"{what} {index}: {error}",)
+    error.args = (f"{what} {index}: {error.args[0]}", *error.args[1:])
     return error
 
 

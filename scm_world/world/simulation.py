@@ -236,8 +236,8 @@ class Simulation:
             InterventionError: The intervention was refused. The episode has begun without it.
         """
         if seed is not None:
-            self.noise = CompiledNoise(seed)
-            self.episode = whole_number("episode", episode, least=0)
+            number = whole_number("episode", episode, least=0)
+            self.noise, self.episode = CompiledNoise(seed), number
         elif not self._started:
             self.noise, self.episode = CompiledNoise(secrets.randbits(63)), 0
         else:
@@ -437,6 +437,10 @@ class Simulation:
         places = self.composition.system.layout.slices.items()
         name = next((name for name, where in places if where.start <= worst < where.stop), "")
         return f"before that step, the largest number was {vector[worst]:.3g}, of {name}"
+
+    def is_due(self) -> bool:
+        """Return whether the plan of the episode may contain something for this instant."""
+        return False
 
     def act(self) -> Audit | None:
         """Do what the plan of the episode contains for this instant: there is none here."""
