@@ -7,6 +7,7 @@ lies on the floor is half its size.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from functools import cached_property, lru_cache
 from math import isnan, prod
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, final
@@ -183,13 +184,13 @@ class Sampler(Frozen):
         """Return how many uniform numbers one draw takes: one for each component."""
         return prod(shape)
 
+    @abstractmethod
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
         """Turn uniform numbers in [0, 1), shape ``(..., n)``, into draws, ``(..., *shape)``."""
-        raise NotImplementedError
 
+    @abstractmethod
     def describe(self, shape: tuple[int, ...], values: Values) -> str:
         """Write it down for a message."""
-        raise NotImplementedError
 
 
 class Set(Sampler):
@@ -203,13 +204,13 @@ class Set(Sampler):
         """Return whether a value lies inside, borders included."""
         return bool(np.all(self.nearest(value, values) == value))
 
+    @abstractmethod
     def nearest(self, value: Value, values: Values | None = None) -> Value:
         """Find the point that is nearest to a value."""
-        raise NotImplementedError
 
+    @abstractmethod
     def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
         """Return the volume, or the number of values, shape ``(...)``."""
-        raise NotImplementedError
 
 
 @final
