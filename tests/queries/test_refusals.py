@@ -108,13 +108,12 @@ def test_many_worlds_are_copied_and_pickled(backend: str) -> None:
     worlds.reset(seed=0)
     worlds.step(worlds["joint_positions"] + 0.1)
     sent = pickle.loads(pickle.dumps(worlds))  # noqa: S301 # what was written a moment ago
-    for other in (sent, copy.deepcopy(worlds)):
-        for one in (worlds, other):
-            one.step(np.full((2, 9), 0.1))
-        place = "tool_block.cartesian_position"
-        if other is sent:
-            assert worlds[place].tobytes() == other[place].tobytes()
-    for one in (worlds, sent):
+    everywhere = (worlds, sent, copy.deepcopy(worlds))
+    for one in everywhere:
+        one.step(np.full((2, 9), 0.1))
+    places = {one["joint_positions"].tobytes() for one in everywhere}
+    assert len(places) == 1
+    for one in everywhere:
         one.close()
 
 
