@@ -17,12 +17,12 @@ from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world.backends import backends
 from scm_world.errors import DAMAGED, Diverged, UnknownOption, UnreadableFile
-from scm_world.evaluation.setups import EvaluationPlace
 from scm_world.output.durable import is_draft, locked, made, write_whole
 from scm_world.output.reading import read_bytes, read_text
 from scm_world.policies import file_of, load_policy
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress, Tell
+from scm_world.tasks import make_task
 from scm_world.training.recipe import Recipe
 
 FORMAT = "scm_world/run/1"
@@ -230,8 +230,7 @@ def identity_of(recipe: Recipe, start: Path | None, **more: Any) -> dict[str, An
         except OSError as error:
             advice = "give a policy file to start from"
             raise UnreadableFile(str(start), str(error), advice) from None
-    options = recipe.env.get("task_options")
-    made = EvaluationPlace(recipe.task, {"task_options": options}).made
+    made = make_task(recipe.task, **(recipe.env.get("task_options") or {}))
     return {
         "fingerprint": fingerprint(made, libraries=False),
         "recipe": recipe.as_dict(),
