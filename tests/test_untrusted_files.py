@@ -19,9 +19,8 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import ScmWorldError
 from scm_world.evaluation import Evaluation, evaluate
 from scm_world.evaluation import files as evaluation_files
-from scm_world.evaluation.preparation import again
+from scm_world.evaluation.preparation import again, task_of
 from scm_world.evaluation.recording import Recording, record
-from scm_world.evaluation.setups import task_of
 from scm_world.graph.files import from_json
 from scm_world.policies import MlpPolicy, save_policy
 from scm_world.queries import Episode, Plan, load_episode, save_episode
