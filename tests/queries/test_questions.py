@@ -27,6 +27,7 @@ from scm_world import (
     graph,
     verify,
 )
+from scm_world.discovery.data import Design, collect
 from scm_world.errors import (
     InterventionError,
     ModelError,
@@ -660,3 +661,13 @@ def test_equations_are_a_world() -> None:
         assert (world.noise.seed, world.episode) == (3, 1)
         with pytest.raises(SnapshotMismatch):
             world.restore(SCM([]))
+
+
+def test_equations_of_a_world_are_verified_identified_collected_and_discovered() -> None:
+    """As those of their model are."""
+    world = World(pair())
+    assert world.verify(probes=10).outcome == "confirmed"
+    assert world.identify("x", "y").backdoor == ()
+    design = Design("single", ("x",), Box(0.0, 1.0))
+    assert collect(world, design, 4)["y"].shape == (4,)
+    assert discover(world, probes=8).score.shd == 0
