@@ -153,8 +153,10 @@ def collect(
     title = f"Collected from {tag(task)} on {found.about.get('engine', used)}, seed {seed}"
     console.table(("", "episodes", "rows"), rows, title=title)
     if contacts and found.truth is not None:
-        acting = len(found.truth.for_rows(found).edges)
-        console.say(f"{acting} of {len(found.truth.edges)} edges could act in these rows")
+        acting, edges = found.acting().truth, len(found.truth.edges)
+        console.say(
+            f"{len(acting.edges) if acting else 0} of {edges} edges could act in these rows"
+        )
         most = sorted(found.contacts.items(), key=lambda item: -item[1])[:SHOWN]
         shares = [(f"{one}, {other}", f"{share:.1%}") for (one, other), share in most]
         console.table(("bodies that touched", "steps"), shares)
@@ -275,7 +277,7 @@ def sweep(
         do: Further intervention at every point; repeat it for more.
     """
     from scm_world.discovery.data import sweep as swept
-    from scm_world.discovery.data.sweeps import ENDS, SUMMARY, TABLE, points_of
+    from scm_world.discovery.data.sweeps import ENDS, TABLE, points_of
 
     grid, held = read_over(over), parse_assignments(do, "'--do'")
     measured = [parse_outcome(text) for text in outcome or ()] or None
@@ -327,7 +329,7 @@ def sweep(
         title=f"Sweep of {tag(task)} on {used}, seed {seed}, with 95 % intervals",
         caption=f"and {len(rows) - POINTS} more points, see {TABLE}" if len(rows) > POINTS else "",
     )
-    console.written(folder / TABLE, folder / SUMMARY)
+    console.written(folder / TABLE)
 
 
 def read_over(texts: Iterable[str]) -> dict[str, Any]:

@@ -13,10 +13,9 @@ import numpy as np
 
 from scm_world._arguments import typed, whole_number
 from scm_world._fingerprint import changes
-from scm_world.discovery.data.dataset import Column, Dataset, Regime
+from scm_world.discovery.data.dataset import Column, Dataset, Regime, check_names
 from scm_world.discovery.data.pictures import ENDINGS
 from scm_world.discovery.data.shards import (
-    check_names,
     checksum,
     decoded,
     encoded,

@@ -11,17 +11,11 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.discovery.data.dataset import Column, Dataset, Ints, Regime
+from scm_world.discovery.data.dataset import NUMBERS, RESERVED, TARGETS, Dataset, Ints, Regime
 from scm_world.discovery.data.sources import SourceRows
-from scm_world.errors import ModelError
 from scm_world.output.reading import read_table
 from scm_world.queries.plans import FORMAT as PLAN
 from scm_world.queries.plans import Plan
-
-NUMBERS = ("episode", "step", "regime")
-TARGETS = "intervention_targets"
-RESERVED = (*NUMBERS, TARGETS)
-"""Columns of every file beside those of the data."""
 
 KEY = b"scm_world"
 FORMAT = "scm_world/shard/1"
@@ -125,17 +119,6 @@ def checksum(raw: Raw) -> str:
         found.update(np.ascontiguousarray(raw.numbers[name], dtype="<i8").tobytes())
     found.update(np.ascontiguousarray(raw.values, dtype="<f8").tobytes())
     return found.hexdigest()
-
-
-def check_names(columns: Sequence[Column]) -> None:
-    """Refuse columns that are named like those of every file.
-
-    Raises:
-        ModelError: One is.
-    """
-    taken = [column.name for column in columns if column.name in RESERVED]
-    if taken:
-        raise ModelError([f"a column cannot be named {name!r} in a file" for name in taken])
 
 
 # --- regimes ----------------------------------------------------------------------------------
