@@ -45,7 +45,7 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
     """Return a checked intervention: type, shape, finite, fixed bounds, known parents.
 
     Raises:
-        InterventionError: What is wrong with it.
+        InterventionError: It is refused, with the reason.
     """
     name, said = variable.name, ""
     kind = type(value)  # the classes of interventions are final

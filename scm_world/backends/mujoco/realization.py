@@ -50,7 +50,7 @@ class Realization:
     The parameters that it is made with are all that differ from it, and all that are compared.
 
     Attributes:
-        structure: What was compiled.
+        structure: The compiled structure.
         model: With the present parameters.
         data: With the present state.
         kept: The parameters in force; at first, none has been written.
@@ -103,7 +103,7 @@ class Realization:
             into[self._spins] = self._written[self._spins]
 
     def place(self, vector: Floats) -> None:
-        """Write a state; all else stays as it is. What is as the last step left it stays exact."""
+        """Write a state; all else stays as it is. Values that the last step left stay exact."""
         motion = vector[self._places]
         if self._names:
             names, known, exact = self._remembered()
@@ -140,7 +140,7 @@ class Realization:
         self._counts[:] = 1
 
     def forget(self) -> None:
-        """Forget what was before a step that is made now."""
+        """Forget the state before a step that is made now."""
         self.replay = self._last = self._written = None
 
     def step(self, command: Floats, substeps: int) -> str:
@@ -188,11 +188,11 @@ class Realization:
         return numbers
 
     def memory(self) -> Any:
-        """Return what has to be kept in addition to ``mjSTATE_INTEGRATION``; it can be pickled."""
+        """Return the state beside ``mjSTATE_INTEGRATION``; it can be pickled."""
         return None if self.lean else (self._forces.copy(), self._last, self._written)
 
     def recall(self, numbers: Floats, memory: Any) -> None:
-        """Restore what was kept."""
+        """Restore the state that was kept."""
         mujoco.mj_setState(self.model, self.data, numbers, STATE)
         self._counts[:] = 1
         self.replay = None
