@@ -20,7 +20,7 @@ from scm_world.cli.arguments import (
     refused,
     tag,
 )
-from scm_world.output.remote import Location
+from scm_world.runs.files import Location
 
 Describe = Annotated[
     bool,
@@ -87,7 +87,7 @@ def collect(
     """
     from scm_world.discovery.data import Design, Pictures, default_causes
     from scm_world.discovery.data import collect as collected
-    from scm_world.discovery.data.folders import SIDECAR
+    from scm_world.discovery.data.files import COUNT
     from scm_world.discovery.data.recorded import settable
     from scm_world.queries import SCM
     from scm_world.variables.kinds import SPACES
@@ -120,7 +120,7 @@ def collect(
             targets = settable(system, patterns) if patterns else default_causes(system)
         with (
             console.resumable(folder, "shard-*.*", f"of {-(-n // shard)} files"),
-            options.open_executor(executor, workers, address, "episodes") as (pool, tell),
+            options.open_pool(executor, workers, address, "episodes") as (pool, tell),
         ):
             found = collected(
                 system,
@@ -149,7 +149,7 @@ def collect(
         rows.append((f"and {len(names) - SHOWN} more targets", "", ""))
     rows.append(("columns", "", len(found.columns)))
     if impossible := found.about.get("refused"):
-        rows.append(("refused", len(impossible), f"see {SIDECAR}"))
+        rows.append(("refused", len(impossible), ""))
     title = f"Collected from {tag(task)} on {found.about.get('engine', used)}, seed {seed}"
     console.table(("", "episodes", "rows"), rows, title=title)
     if contacts and found.truth is not None:
@@ -161,7 +161,7 @@ def collect(
         shares = [(f"{one}, {other}", f"{share:.1%}") for (one, other), share in most]
         console.table(("bodies that touched", "steps"), shares)
     shards = list[Location](folder.glob("shard-*.*"))
-    console.written(folder / SIDECAR, *sorted(shards, key=str)[:1], *described(folder, croissant))
+    console.written(folder / COUNT, *sorted(shards, key=str)[:1], *described(folder, croissant))
 
 
 def described(folder: Location, wanted: bool) -> list[Location]:
@@ -224,7 +224,7 @@ def triplets(
         with (
             plain.given(parse_assignments(given, "'--do'")) as system,
             console.resumable(folder, "triplets-*.*", "files"),
-            options.open_executor(executor, workers, address, "pairs") as (pool, tell),
+            options.open_pool(executor, workers, address, "pairs") as (pool, tell),
         ):
             written(
                 system,
@@ -291,7 +291,7 @@ def sweep(
         whole = -(-n * len(points_of(grid, system.graph)) // shard)
         with (
             console.resumable(folder, "shard-*.*", f"of {whole} files"),
-            options.open_executor(executor, workers, address, "episodes") as (pool, tell),
+            options.open_pool(executor, workers, address, "episodes") as (pool, tell),
         ):
             found = swept(
                 system,

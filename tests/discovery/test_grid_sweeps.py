@@ -266,7 +266,7 @@ def test_workers_change_nothing(world: World, tmp_path: Path) -> None:
 
 def test_what_other_processes_cannot_have_is_refused(world: World, tmp_path: Path) -> None:
     """A policy without a name, and a laboratory, which keeps a log."""
-    with pytest.raises(UnknownOption, match="source of episodes with several workers cannot be"):
+    with pytest.raises(UnknownOption, match="work cannot be"):
         sweep(world, OVER, n=1, policy=lambda world: np.zeros(9), workers=2)
     from scm_world.queries import Laboratory
 

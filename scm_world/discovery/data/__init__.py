@@ -4,7 +4,7 @@ from scm_world.discovery.data.collect import collect
 from scm_world.discovery.data.croissant import as_huggingface
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
 from scm_world.discovery.data.designs import DESIGNS, Design
-from scm_world.discovery.data.folders import load, save
+from scm_world.discovery.data.files import batches, load, save
 from scm_world.discovery.data.pictures import Pictures
 from scm_world.discovery.data.recorded import default_causes, default_outcomes
 from scm_world.discovery.data.sweeps import Levels, Swept, sweep
@@ -43,6 +43,7 @@ __all__ = [
     "as_huggingface",
     "as_numpy",
     "as_tigramite",
+    "batches",
     "collect",
     "default_causes",
     "default_outcomes",

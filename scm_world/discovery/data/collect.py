@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping
-from contextlib import nullcontext
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypedDict, Unpack
 
 from scm_world._arguments import typed, whole_number
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.data.designs import Design
-from scm_world.discovery.data.folders import Folder, Head, refusals, together
-from scm_world.discovery.data.pictures import Pictures
-from scm_world.discovery.data.sources import SourceRows
+from scm_world.discovery.data.files import (
+    COUNT,
+    KIND,
+    count_in,
+    decoded,
+    encoded,
+    settings_of,
+    shard_name,
+    together,
+    write_count,
+)
+from scm_world.discovery.data.pictures import ENDINGS, Pictures
 from scm_world.discovery.data.worlds import LaboratoryRows, ModelRows, WorldRows
 from scm_world.errors import Forbidden, InterventionError, UnknownOption
 from scm_world.graph import SCM
-from scm_world.output.remote import Location
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
-from scm_world.work.executors import Executor, opened
+from scm_world.runs.files import Location, removed, write_whole
+from scm_world.runs.pool import Pool, pool_of
+from scm_world.runs.study import Study
 from scm_world.world import Simulation
 
 ENOUGH = 20
@@ -52,7 +59,7 @@ def collect(
     shard: int | None = None,
     progress: Progress | None = None,
     workers: int | None = None,
-    engine: Executor | str | None = None,
+    engine: Pool | str | None = None,
     **circumstances: Unpack[Circumstances],
 ) -> Dataset:
     """Collect episodes under a design, as a table with regimes.
@@ -75,8 +82,8 @@ def collect(
             shard.
         workers: How many shards are made at the same time. None is one, in this process; with an
             engine it is as many as there are cores.
-        engine: What makes them: ``"serial"``, ``"process"``, ``"ray"``, or an executor; see
-            ``engine_of``. A laboratory, which keeps a log, has the first one only.
+        engine: What makes them: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster,
+            or a ``Pool``. A laboratory, which keeps a log, has the first one only.
         circumstances: ``steps`` of an episode, 25 in a world. For a world also ``policy`` and
             ``nature`` (see ``Setting``), ``causes`` (patterns of parameters), ``outcomes`` (names
             or ``Outcome``), ``every_step``: a row for each control step, with the action,
@@ -129,19 +136,28 @@ def collect(
         steps = whole_number("steps", given.pop("steps", STEPS), least=1)
         policy, nature = given.pop("policy", "random"), given.pop("nature", None)
         made = WorldRows(source, design, Setting(policy, nature, steps, seed), **given)
-    return collected(made, count, out, shard, progress, workers, engine, design.modules)
+    return collected(
+        made,
+        count,
+        out=out,
+        shard=shard,
+        progress=progress,
+        workers=workers,
+        engine=engine,
+        trusted=design.modules,
+    )
 
 
 def collected(
     source: ModelRows | WorldRows | LaboratoryRows,
     count: int,
+    *,
     out: Location | str | None,
     shard: int | None,
     progress: Progress | None,
     workers: int | None,
-    engine: Executor | str | None,
-    trusted: Iterable[str] = (),
-    *,
+    engine: Pool | str | None,
+    trusted: Sequence[str] = (),
     at_end: bool = False,
 ) -> Dataset:
     """Read or make the rows of episodes; see ``collect``.
@@ -150,53 +166,46 @@ def collected(
     episodes counts only when all are done.
     """
     size = source.shard if shard is None else whole_number("shard", shard, least=1)
-    about = json.loads(json.dumps(source.about))
-    if out is None and "pictures" in about:
+    taken: Any = source.about.get("pictures")
+    if out is None and taken is not None:
         raise UnknownOption("out", None, ("a folder, since there are pictures",))
-    head = Head(about, source.columns, count, size)
-    folder = None if out is None else Folder(out, head, (*trusted,))
-    ranges, parts, done = head.ranges(), dict[int, SourceRows](), 0
-    with opened(engine, workers) as executor, nullcontext() if folder is None else folder.opened():
-        for index, numbers in enumerate(ranges):
-            part = None if folder is None else folder.read(index, numbers)
-            if part is not None:
-                parts[index] = part
-                done += len(numbers)
-        if progress is not None and done:
-            progress(done, count)
-        missing = [index for index in range(len(ranges)) if index not in parts]
-        executor.check("source of episodes with several workers", source)
-        refused = [pair for part in parts.values() for pair in part.refused]
-        for place, one in executor.run(_Maker(source), [ranges[index] for index in missing]):
-            index = missing[place]
-            parts[index] = part = replace(one, table=replace(one.table, about=about))
-            refused += part.refused
-            done += len(ranges[index])
-            is_known = done >= ENOUGH and (done == count or not at_end)
-            if is_known and 2 * len(refused) > done:
-                number, why = refused[-1]
-                said = f"{len(refused)} of {done} episodes were refused; number {number} because"
+    starts = range(0, count, size)
+    cells = {shard_name(i): range(at, min(at + size, count)) for i, at in enumerate(starts)}
+    end = ENDINGS[taken["format"]] if taken else ""
+    seen = {name: f"pictures-{i:05d}.{end}" for i, name in enumerate(cells) if taken}
+    settings = settings_of(source.about, source.columns, size)
+    parts = dict[str, Dataset]()
+    done = lost = 0
+    with Study(out, KIND, settings) as study, pool_of(engine, workers) as pool:
+        folder = study.folder
+        if folder is not None:
+            there = count_in(folder)["episodes"] if (folder / COUNT).exists() else 0
+            if there > count:
+                allowed = (f"{there} or more: {folder} has so many already",)
+                raise UnknownOption("number of episodes", count, allowed)
+            if there < count and there % size:  # the last file was not full
+                removed(folder / shard_name(there // size))
+            for name in seen:  # a process can be killed between the two
+                if not (folder / seen[name]).exists():
+                    removed(folder / name)
+            write_count(folder, count, len(cells))
+        for name, (part, pictures) in study.map(
+            cells,
+            source.rows,
+            read=lambda data: (decoded(data, source.columns, trusted), b""),
+            write=lambda made: encoded(made[0]),
+            pool=pool,
+        ):
+            parts[name] = part
+            if pictures and folder is not None:
+                write_whole(folder / seen[name], pictures)
+            done += len(cells[name])
+            refused = part.about.get("refused", {})
+            lost += len(refused)
+            if refused and 2 * lost > done >= ENOUGH and (done == count or not at_end):
+                number, why = [*refused.items()][-1]
+                said = f"{lost} of {done} episodes were refused; number {number} because"
                 raise InterventionError(f"{said}: {why}", variable="")
-            if folder is not None:
-                folder.write(index, ranges[index], part)
-                parts[index] = replace(part, pictures=b"")
             if progress is not None:
                 progress(done, count)
-        found = [parts[index] for index in range(len(ranges))]
-        if folder is not None:
-            folder.note(refusals(found), complete=True)
-    return together(head, found)
-
-
-class _Maker:
-    def __init__(self, source: Any) -> None:
-        self.source = source
-
-    def __call__(self) -> Any:
-        return self.make
-
-    def make(self, numbers: range) -> SourceRows:
-        table, pictures = self.source.rows(numbers)
-        refused = tuple((int(k), v) for k, v in table.about.get("refused", {}).items())
-        touching = table.about.get("touching", {})
-        return SourceRows(replace(table, about={}), refused, pictures, touching)
+    return together(settings, [parts[name] for name in cells])

@@ -19,15 +19,14 @@ from scm_world.discovery.data.designs import Grid
 from scm_world.discovery.data.worlds import WorldRows
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
-from scm_world.output.durable import write_durably
-from scm_world.output.remote import Location, located
 from scm_world.queries.estimates import difference
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import Setting
 from scm_world.queries.twins import asked
+from scm_world.runs.files import Location, located, write_whole
+from scm_world.runs.pool import Pool
 from scm_world.variables import Box, Categories, Either, Integers, Variable
 from scm_world.variables.kinds import SPACES
-from scm_world.work.executors import Executor
 from scm_world.world import Simulation
 
 TABLE = "sweep.csv"
@@ -198,7 +197,7 @@ class Swept:
         import pandas
 
         text = pandas.DataFrame(self.rows()).to_csv(index=False, lineterminator="\n")
-        write_durably(folder / TABLE, text.encode())
+        write_whole(folder / TABLE, text)
         return folder / TABLE
 
 
@@ -223,7 +222,7 @@ def sweep(
     out: Location | str | None = None,
     shard: int | None = None,
     workers: int | None = None,
-    engine: Executor | str | None = None,
+    engine: Pool | str | None = None,
     progress: Progress | None = None,
     **setting: Any,
 ) -> Swept:
@@ -272,11 +271,11 @@ def sweep(
     data = collected(
         rows,
         count * len(points),
-        out,
-        shard,
-        progress,
-        workers,
-        engine,
+        out=out,
+        shard=shard,
+        progress=progress,
+        workers=workers,
+        engine=engine,
         at_end=True,  # points that are impossible may be neighbors
     )
     found = Swept(points, data)
