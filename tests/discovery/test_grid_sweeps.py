@@ -270,7 +270,7 @@ def test_what_other_processes_cannot_have_is_refused(world: World, tmp_path: Pat
         sweep(world, OVER, n=1, policy=lambda world: np.zeros(9), workers=2)
     from scm_world.queries import Laboratory
 
-    with pytest.raises(UnknownOption, match="keeps its log in one process"):
+    with pytest.raises(UnknownOption, match="keeps its budget in one process"):
         collect(Laboratory(world), Design(), 2, workers=2)
 
 

@@ -23,13 +23,13 @@ from scm_world.discovery.data.pictures import ENDINGS, Pictures
 from scm_world.discovery.data.worlds import LaboratoryRows, ModelRows, WorldRows
 from scm_world.errors import Forbidden, InterventionError, UnknownOption
 from scm_world.graph import SCM
+from scm_world.queries.equations import Equations, System
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.runs.files import Location, removed, write_whole
 from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.study import Study
-from scm_world.world import Simulation
 
 ENOUGH = 20
 """After so many episodes the share of refused ones is checked."""
@@ -50,7 +50,7 @@ class Circumstances(TypedDict, total=False):
 
 @typed
 def collect(
-    source: SCM | Simulation | Laboratory,
+    source: SCM | System | Laboratory,
     design: Design,
     n: int,
     *,
@@ -83,7 +83,7 @@ def collect(
         workers: How many shards are made at the same time. None is one, in this process; with an
             engine it is as many as there are cores.
         engine: What makes them: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster,
-            or a ``Pool``. A laboratory, which keeps a log, has the first one only.
+            or a ``Pool``. A laboratory, which keeps a budget, has the first one only.
         circumstances: ``steps`` of an episode, 25 in a world. For a world also ``policy`` and
             ``nature`` (see ``Setting``), ``causes`` (patterns of parameters), ``outcomes`` (names
             or ``Outcome``), ``every_step``: a row for each control step, with the action,
@@ -110,6 +110,7 @@ def collect(
         >>> [table.regimes[i].targets for i in table.regime]
         [(), ('tool_block.mass',), (), ('floor_friction',)]
     """
+    source = source.model if isinstance(source, Equations) else source
     count, given = whole_number("n", n, least=1), dict[str, Any](circumstances)
     whole_number("seed", seed, least=0)
     kinds: dict[Any, Any] = {SCM: ("model", ("steps",)), Laboratory: ("laboratory", ())}
@@ -121,10 +122,10 @@ def collect(
             raise UnknownOption(f"circumstance of a {kind}", name, choices)
     if isinstance(source, Laboratory):
         if out is not None:
-            choices = ("None with a laboratory: give it a log, and save the dataset",)
+            choices = ("None with a laboratory: save the dataset",)
             raise UnknownOption("out", str(out), choices)
         if engine not in (None, "serial") or workers not in (None, 1):
-            choices = ("'serial' with one worker: a laboratory keeps its log in one process",)
+            choices = ("'serial' with one worker: a laboratory keeps its budget in one process",)
             raise UnknownOption("engine of work", engine or workers, choices)
         left = source.remaining
         if left is not None and count > left:

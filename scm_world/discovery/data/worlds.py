@@ -443,7 +443,7 @@ class LaboratoryRows:
             except InterventionError as problem:
                 refused[str(number)] = str(problem)
             else:
-                (row,) = found.matrix()[0]
+                row = np.concatenate([np.ravel(values) for values in found.values()])
                 names = reached(self._model, targets, self.columns, first=True)
                 rows.append((found.numbers[0], 0, replace(regime, targets=names), row))
         return Dataset.stacked(self.columns, rows, {"refused": refused, "touching": {}}), b""
