@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 from collections.abc import Iterable, Mapping
@@ -36,7 +37,6 @@ from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.training.export import mean, scored, words
 from scm_world.training.loop import open_folder, torch_threads
 from scm_world.training.settings import (
-    LESSONS,
     Count,
     Network,
     NotNegative,
@@ -49,6 +49,7 @@ from scm_world.training.settings import (
     merged,
     nested,
     observed,
+    presets,
     refused,
 )
 from scm_world.variables.spaces import Frozen
@@ -202,7 +203,7 @@ def lesson(task: str, **changes: Any) -> Lesson:
         40
     """
     fields: dict[str, Any] = Lesson.model_construct(task=task).model_dump(mode="json")
-    fields |= LESSONS.get(task, {})
+    fields |= copy.deepcopy(presets()["lessons"].get(task, {}))
     made = make_task(known_task(task))
     fields["env"] = {**made.training.get("env", {}), **fields["env"]}
     known = protocols_of(made)
