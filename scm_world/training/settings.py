@@ -256,7 +256,7 @@ def presets() -> Mapping[str, Any]:
 
 def tuned(task: Task, algo: str) -> dict[str, Any]:
     """Return the fields of a recipe that work for a task, as far as it or we know."""
-    found = copy.deepcopy(presets()["algorithms"][algo])
+    found: dict[str, Any] = copy.deepcopy(presets()["algorithms"][algo])
     mine = {name: value for name, value in task.training.items() if name not in ALGORITHMS}
     is_ours = type(task) is TASKS.get(task.name)
     ours = presets()["recipes"].get(task.name, {}) if is_ours else {}

@@ -86,9 +86,9 @@ def test_ppo_balances_a_pole_from_its_recipe(tmp_path: Path) -> None:
     assert time.process_time() - before < 180.0
     found = evaluate({"trained": trained.best, "random": "random"}, "P0,A", task=task, n=20)
     for protocol in ("P0", "A"):
-        lengths = found.only(agent="trained", protocol=protocol).columns["steps"]
+        lengths = found.only(agent="trained", protocol=protocol).frame["steps"]
         assert lengths.mean() > 450.0
-    assert found.only(agent="random").columns["steps"].mean() < 50.0
+    assert found.only(agent="random").frame["steps"].mean() < 50.0
 
 
 @pytest.mark.parametrize("kind", ["Balance", "Falling"])
