@@ -20,7 +20,7 @@ from scm_world.discovery.data.files import (
     write_count,
 )
 from scm_world.discovery.data.pictures import ENDINGS, Pictures
-from scm_world.discovery.data.worlds import LaboratoryRows, ModelRows, WorldRows
+from scm_world.discovery.data.worlds import EpisodeRows, LaboratoryRows
 from scm_world.errors import Forbidden, InterventionError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.equations import Equations, System
@@ -32,7 +32,7 @@ from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.study import Study
 
 ENOUGH = 20
-"""After so many episodes the share of refused ones is checked."""
+"""After so many episodes, or all, the share of refused ones is checked."""
 
 
 class Circumstances(TypedDict, total=False):
@@ -132,11 +132,12 @@ def collect(
             raise Forbidden(f"run {count} more episodes", [f"{left} episodes"])
         made: Any = LaboratoryRows(source, design, seed)
     elif isinstance(source, SCM):
-        made = ModelRows(source, design, seed, given.get("steps"))
+        setting = Setting(None, None, given.get("steps"), seed)
+        made = EpisodeRows(source, design, setting, every_step=True)
     else:
         steps = whole_number("steps", given.pop("steps", STEPS), least=1)
         policy, nature = given.pop("policy", "random"), given.pop("nature", None)
-        made = WorldRows(source, design, Setting(policy, nature, steps, seed), **given)
+        made = EpisodeRows(source, design, Setting(policy, nature, steps, seed), **given)
     return collected(
         made,
         count,
@@ -150,7 +151,7 @@ def collect(
 
 
 def collected(
-    source: ModelRows | WorldRows | LaboratoryRows,
+    source: EpisodeRows | LaboratoryRows,
     count: int,
     *,
     out: Location | str | None,
@@ -203,7 +204,7 @@ def collected(
             done += len(cells[name])
             refused = part.about.get("refused", {})
             lost += len(refused)
-            if refused and 2 * lost > done >= ENOUGH and (done == count or not at_end):
+            if refused and 2 * lost > done >= min(ENOUGH, count) and (done == count or not at_end):
                 number, why = [*refused.items()][-1]
                 said = f"{lost} of {done} episodes were refused; number {number} because"
                 raise InterventionError(f"{said}: {why}", variable="")

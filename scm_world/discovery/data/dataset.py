@@ -92,8 +92,8 @@ class Regime:
         return cls(plan, tuple(map(str, data["targets"])))
 
 
-Row = tuple[int, int, Regime, Floats]
-"""Episode, control step, regime and values, shape (p,)."""
+EpisodePart = tuple[int, Regime, Regime, Floats]
+"""Number, regime of the first row and of the others, and values, shape (rows, p)."""
 
 
 @final
@@ -203,15 +203,20 @@ class Dataset:
         )
 
     @classmethod
-    def stacked(
-        cls, columns: tuple[Column, ...], rows: Sequence[Row], about: dict[str, Any]
+    def of_episodes(
+        cls, columns: tuple[Column, ...], episodes: Iterable[EpisodePart], about: dict[str, Any]
     ) -> Dataset:
-        """Build a table of rows; regimes are numbered as they occur."""
+        """Build a table of whole episodes, sorted by their numbers."""
         regimes: dict[Regime, int] = {}
-        numbers = [(e, s, regimes.setdefault(regime, len(regimes))) for e, s, regime, _ in rows]
-        episode, step, regime = np.array(numbers, dtype=np.int64).reshape(-1, 3).T.copy()
-        values = np.array([row for *_, row in rows], dtype=np.float64).reshape(-1, len(columns))
-        return cls(values, columns, tuple(regimes), regime, episode, step, about)
+        kinds, steps, numbers, parts = [], [], [], [np.empty((0, len(columns)))]
+        for number, first, other, values in sorted(episodes, key=lambda episode: episode[0]):
+            at = [regimes.setdefault(regime, len(regimes)) for regime in (first, other)]
+            kinds += [at[0], *[at[1]] * (len(values) - 1)]
+            steps += range(len(values))
+            numbers += [number] * len(values)
+            parts.append(values)
+        regime, episode, step = np.array([kinds, numbers, steps], dtype=np.int64)
+        return cls(np.concatenate(parts), columns, tuple(regimes), regime, episode, step, about)
 
     # --- reading ------------------------------------------------------------------------------
 
