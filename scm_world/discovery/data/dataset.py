@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable
-from scm_world.queries.plans import Plan
+from scm_world.queries.plans import FORMAT, Plan
 from scm_world.variables import SOFT, Mechanism
 
 if TYPE_CHECKING:
@@ -81,15 +82,27 @@ class Regime:
             if isinstance(act, SOFT) or (isinstance(act, Mechanism) and act.function is None)
         )
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return it as plain data."""
-        return {"plan": self.plan.as_dict(), "targets": list(self.targets)}
 
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Regime:
-        """Read what ``as_dict`` wrote."""
-        plan = Plan.from_dict(data["plan"], trusted=trusted)
-        return cls(plan, tuple(map(str, data["targets"])))
+def regimes_as_dict(regimes: Iterable[Regime]) -> dict[str, Any]:
+    """Return regimes as plain data; many share interventions, each of which is written once."""
+    acts: dict[str, int] = {}
+    found = []
+    for regime in regimes:
+        done = (json.dumps(act) for act in regime.plan.as_dict()["do"].items())
+        found.append([[acts.setdefault(act, len(acts)) for act in done], list(regime.targets)])
+    return {"acts": [json.loads(act) for act in acts], "regimes": found}
+
+
+def regimes_from_dict(data: Mapping[str, Any], trusted: Sequence[str]) -> tuple[Regime, ...]:
+    """Read what ``regimes_as_dict`` returned."""
+    acts = [
+        (name, Plan.from_dict({"format": FORMAT, "do": {name: parts}}, trusted=trusted)[name])
+        for name, parts in data["acts"]
+    ]
+    return tuple(
+        Regime(Plan(dict(acts[number] for number in numbers)), tuple(targets))
+        for numbers, targets in data["regimes"]
+    )
 
 
 EpisodePart = tuple[int, Regime, Regime, Floats]
@@ -208,7 +221,8 @@ class Dataset:
     ) -> Dataset:
         """Build a table of whole episodes, sorted by their numbers."""
         regimes: dict[Regime, int] = {}
-        kinds, steps, numbers, parts = [], [], [], [np.empty((0, len(columns)))]
+        kinds, steps, numbers = list[int](), list[int](), list[int]()
+        parts = [np.empty((0, len(columns)))]
         for number, first, other, values in sorted(episodes, key=lambda episode: episode[0]):
             at = [regimes.setdefault(regime, len(regimes)) for regime in (first, other)]
             kinds += [at[0], *[at[1]] * (len(values) - 1)]
