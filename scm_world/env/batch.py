@@ -306,8 +306,10 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
     def _write(self, rows: Any, observation: Any, info: Mapping[str, Any]) -> None:
         """Write what one environment shows into its row, or several into theirs."""
-        if observation is not None:
-            _put({"": self._observations}, rows, {"": observation}, self.num_envs)
+        if isinstance(observation, dict):
+            _put(self._observations, rows, observation, self.num_envs)
+        elif observation is not None:
+            self._observations[rows] = observation
         _put(self._known, rows, info, self.num_envs)
 
     def _read_alone(self, rows: Integers) -> None:
@@ -415,7 +417,7 @@ def _shapes(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
 def _put(columns: dict[str, Any], rows: Any, values: Mapping[str, Any], size: int) -> None:
     """Write one row of columns, or several; columns that are missing begin as zeros."""
     for name, value in values.items():
-        if isinstance(value, Mapping):
+        if isinstance(value, dict):
             _put(columns.setdefault(name, {}), rows, value, size)
             continue
         if name not in columns:

@@ -7,7 +7,7 @@ from typing import Any, final
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from scm_world._arguments import missing, one_of
@@ -60,7 +60,7 @@ class Sb3VecEnv(VecEnv):
             ``info`` has such a name.
     """
 
-    def __init__(self, envs: VectorEnv[Any, Any, Any], infos: Sequence[str] | None = USUAL) -> None:
+    def __init__(self, envs: Any, infos: Sequence[str] | None = USUAL) -> None:
         mode = envs.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise UnknownOption("autoreset_mode", mode, (AutoresetMode.SAME_STEP.value,))
