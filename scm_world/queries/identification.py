@@ -13,7 +13,6 @@ import networkx as nx
 from scm_world._arguments import load, one_of
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM, episode_outcome
-from scm_world.graph.evaluate import AppliedIntervention, source_of
 from scm_world.graph.views import to_dag
 from scm_world.queries.episodes import as_names
 from scm_world.queries.equations import System
@@ -94,7 +93,7 @@ def nature_graph(
         if isinstance(act, Mechanism):
             followed = frozenset(parent.name for parent in act.parents)
         elif isinstance(act, Draw):
-            followed = source_of(AppliedIntervention(act, model.declared(name))).parents()
+            followed = act.drawn_from(model.declared(name)).parents()
         causes = [n if n in graph else f"{n}@0" for n in sorted(followed)]
         graph.add_edges_from((n, f"{target}@0") for target in model.targets(name) for n in causes)
     return graph

@@ -22,8 +22,7 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.acceptance import refuse_time
-from scm_world.graph.evaluate import AppliedIntervention, noise_of, source_of
+from scm_world.graph.evaluate import noise_of
 from scm_world.models import Difference
 from scm_world.models.scene import SURFACES, Overlap
 from scm_world.variables import (
@@ -41,7 +40,7 @@ from scm_world.variables import (
     divided,
     whole_of,
 )
-from scm_world.variables.checks import check_bounds, check_space, coerce
+from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import CompiledTask, PendingInterventions, StepBase
 from scm_world.world.mechanisms import Rows
@@ -237,8 +236,9 @@ class Transaction:
         return found
 
     def _source(self, name: str, act: Any) -> Distribution:
-        declared = self.compiled.model.declared(whole_of(act, name))
-        return source_of(AppliedIntervention(act, declared))
+        variable = self.compiled.model.declared(whole_of(act, name))
+        source: Distribution = act.drawn_from(variable)
+        return source
 
     @cached_property
     def _boxes(self) -> Any:

@@ -23,6 +23,7 @@ from scm_world.variables import (
     Bernoulli,
     Box,
     Categories,
+    Continuous,
     Derived,
     Discrete,
     Draw,
