@@ -17,6 +17,7 @@ from scm_world.variables.noise import Noise
 from scm_world.variables.spaces import Categories, Space
 from scm_world.variables.subsets import Subset
 
+_REFUSED = np.asarray("")
 _LARGEST = 2.0**53  # up to here every whole number is a float, so JSON keeps it
 
 
@@ -25,29 +26,35 @@ def coerce(variable: Variable, value: Any) -> Value:
 
     Another kind or shape, and numbers that are not finite, raise ``WrongValue``.
     """
-    name, labels = variable.name, getattr(variable.bounds, "labels", ())
-    if labels and isinstance(variable.bounds, Categories):
+    if isinstance(variable.bounds, Categories) and variable.bounds.labels:
         with suppress(KeyError, ValueError, TypeError):  # refused below
             value = variable.bounds.numbers(value)
-    given = np.asarray("")
-    if not np.ma.isMaskedArray(value):  # which hides numbers under its mask
-        with suppress(ValueError, TypeError):  # a ragged list, or an object that refuses
-            given = np.asarray(value)
-    whole = variable.dtype != "real"
-    fits = given.dtype.kind in "iuf"
-    if fits and given.shape != variable.shape:
-        raise WrongValue(name, value, variable.shape, given.shape)
-    if fits and not np.isfinite(given).all():
-        raise WrongValue(name, value)
-    if fits and whole:
-        numbers = given.astype(np.float64)
-        fits = bool((numbers == np.rint(numbers)).all() and (np.abs(numbers) < _LARGEST).all())
-    if not fits:
-        expected = "numbers" if not whole else " or ".join(map(repr, labels)) or "whole numbers"
-        expected += f" of shape {variable.shape}" * bool(variable.shape)
-        drawn = [f'Draw("{space}")' for space in SPACES if variable.space(space) is not None]
-        raise WrongValue(name, value, expected + (f", or {', '.join(drawn)}" if drawn else ""))
-    return given.astype(np.int64 if whole else np.float64)
+    try:
+        given = np.asarray(value)
+    except (ValueError, TypeError):  # a ragged list, or an object that refuses
+        given = _REFUSED
+    # A masked array hides numbers under its mask.
+    if given.dtype.kind not in "iuf" or isinstance(value, np.ma.MaskedArray):
+        raise WrongValue(variable.name, value, _expected(variable))
+    if given.shape != variable.shape:
+        raise WrongValue(variable.name, value, variable.shape, given.shape)
+    if not np.isfinite(given).all():
+        raise WrongValue(variable.name, value)
+    if variable.dtype == "real":
+        return given.astype(np.float64)
+    whole = given.dtype.kind != "f" or (given == np.rint(given)).all()
+    if not whole or (np.abs(given.astype(np.float64)) >= _LARGEST).any():
+        raise WrongValue(variable.name, value, _expected(variable))
+    return given.astype(np.int64)
+
+
+def _expected(variable: Variable) -> str:
+    noun = "numbers" if variable.dtype == "real" else "whole numbers"
+    if isinstance(variable.bounds, Categories) and variable.bounds.labels:
+        noun = " or ".join(map(repr, variable.bounds.labels))
+    where = f" of shape {variable.shape}" if variable.shape else ""
+    drawn = [f'Draw("{name}")' for name in SPACES if variable.space(name) is not None]
+    return f"{noun}{where}" + (f", or {', '.join(drawn)}" if drawn else "")
 
 
 def _out_of_bounds(
@@ -158,7 +165,7 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
         number, bounds = coerce(variable, value), variable.bounds
         if bounds is not None and not bounds.parents() and not bounds.contains(number, {}):
             check_bounds(variable, number, {})
-        return Hard(number.tolist())
+        return Hard.of(number)
     if kind is Draw:
         check_draw(variable, value)
         follows = sorted(value.drawn_from(variable).parents())

@@ -82,11 +82,11 @@ def test_files_without_an_end_are_not_opened(reader: str, tmp_path: Path) -> Non
     ending, read = READERS[reader]
     path = tmp_path / (f"it{ending}" if reader != "dataset" else SIDECAR)
     os.mkfifo(path)
-    with pytest.raises(ScmWorldError, match="no regular file"):
+    with pytest.raises(ScmWorldError, match="not a regular file"):
         read(path)
     path.unlink()
     path.symlink_to("/dev/zero")
-    with pytest.raises(ScmWorldError, match="no regular file"):
+    with pytest.raises(ScmWorldError, match="not a regular file"):
         read(path)
     path.unlink()
     with path.open("wb") as stream:

@@ -19,6 +19,7 @@ from scm_world.discovery.data.worlds import Experiments, WorldSource
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.output.remote import Location
+from scm_world.queries.equations import Equations, System
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
@@ -45,7 +46,7 @@ class Circumstances(TypedDict, total=False):
 
 @typed
 def collect(
-    source: SCM | Simulation | Laboratory | DataSource,
+    source: SCM | System | Laboratory | DataSource,
     design: Design,
     n: int,
     *,
@@ -115,14 +116,14 @@ def collect(
     if out is None:
         size = count if made.at_once else size
     elif isinstance(source, Laboratory):
-        allowed = ("None with a laboratory: give it a log, and save the dataset",)
+        allowed = ("None with a laboratory: save the dataset",)
         raise UnknownOption("out", str(out), allowed)
     head = Head(about, made.columns, count, size, made.edges)
     if out is not None:
         folder = Folder(out, head, design.modules)
     with opened(engine, workers) as executor:
         if isinstance(source, Laboratory) and not isinstance(executor, Serial):
-            allowed = ("'serial' with one worker: a laboratory keeps its log in one process",)
+            allowed = ("'serial' with one worker: a laboratory keeps its budget in one process",)
             raise UnknownOption("engine of work", executor.engine, allowed)
         with nullcontext() if folder is None else folder.opened():
             parts = _gathered(made, head, folder, executor, progress)
@@ -132,7 +133,7 @@ def collect(
 
 
 def source_of(
-    source: SCM | Simulation | Laboratory | DataSource,
+    source: SCM | System | Laboratory | DataSource,
     design: Design,
     n: int,
     *,
@@ -144,6 +145,8 @@ def source_of(
     Raises:
         UnknownOption: It is none of the kinds, or is given arguments that it does not take.
     """
+    if isinstance(source, Equations):
+        source = source.model
     match source:
         case SCM():
             _refuse_others(given, ("steps",), "a model")

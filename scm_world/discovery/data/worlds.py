@@ -425,7 +425,7 @@ class Experiments:
             except InterventionError as problem:
                 refused.append((number, str(problem)))
             else:
-                (row,) = found.matrix()[0]
+                row = np.concatenate([np.ravel(values) for values in found.values()])
                 rows.append((found.numbers[0], 0, self._named(regime), row))
             tell(1)
         return SourceRows(Dataset.stacked(self.columns, rows, self.about), tuple(refused))

@@ -24,7 +24,7 @@ from scm_world.errors import EngineFailure, InterventionError, SnapshotMismatch,
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier
 from scm_world.policies.planning import action_range
-from scm_world.queries.equations import CompiledModel, Equations, System
+from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.experiments.effects import RESOLUTION, EdgeKey, Effects, ProbeSetting, gap
 from scm_world.queries.experiments.probes import Probe, Random, another, touching_pairs
 from scm_world.variables import Action, Exogenous, Measured, Noise
@@ -263,10 +263,11 @@ class Paired:
 @contextmanager
 def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM]:
     """Give a world that is afterwards as it was, one that is made and closed, or equations."""
-    if options and isinstance(system, System | SCM):
+    system = system.model if isinstance(system, Equations) else system
+    if options and isinstance(system, Simulation | SCM):
         raise UnknownOption("option for a world that is made", next(iter(options)), ())
-    if isinstance(system, SCM | Equations):
-        yield system if isinstance(system, SCM) else system.model
+    if isinstance(system, SCM):
+        yield system
     elif isinstance(system, Simulation):
         with system.unchanged():
             yield system
