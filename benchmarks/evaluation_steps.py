@@ -13,7 +13,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.evaluation.episodes import EpisodeRunner, Fingerprint
 from scm_world.evaluation.players import as_player
 from scm_world.evaluation.protocols import Protocol, protocols_of
-from scm_world.world import WorldSnapshot
+from scm_world.world import Snapshot
 
 
 class Recorder:
@@ -53,7 +53,7 @@ def shares(task: str, episodes: int) -> dict[str, float]:
 
 def split(arena: EpisodeRunner, protocol: Protocol, episode: int) -> dict[str, float]:
     """Play an episode, and then its parts alone, from the same beginning."""
-    recorder, beginning = Recorder(), list[WorldSnapshot]()
+    recorder, beginning = Recorder(), list[Snapshot]()
 
     def watch(env: ScmWorldEnv) -> None:
         if not beginning:
