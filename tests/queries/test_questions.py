@@ -35,8 +35,8 @@ from scm_world.errors import (
     SnapshotMismatch,
     UnknownOption,
 )
-from scm_world.evaluation import as_player
 from scm_world.graph import from_json, to_json
+from scm_world.policies import as_agent
 from scm_world.queries import (
     Effect,
     Episode,
@@ -628,7 +628,7 @@ def test_an_episode_of_equations_is_no_policy(tmp_path: Path) -> None:
     saved = save_episode(SCM([RATE]).rollout(), tmp_path / "episode")
     for policy in (episode, saved):
         with pytest.raises(UnknownOption, match="an array of actions"):
-            as_player(policy)
+            as_agent(policy)
 
 
 def test_the_world_is_one_of_a_step_function() -> None:
