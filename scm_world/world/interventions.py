@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import chain
@@ -30,6 +30,7 @@ from scm_world.variables import (
     SOFT,
     Draw,
     Hard,
+    Intervention,
     Mechanism,
     Natural,
     Null,
@@ -76,6 +77,22 @@ def merged(model: SCM, *requests: Mapping[str, Any]) -> dict[str, Any]:
         kept = {n: a for n, a in found.items() if not mine.issuperset(targets(n))}
         found = {**kept, **acts}
     return found
+
+
+def fixed_action(name: str, acts: Sequence[Intervention]) -> Value:
+    """Return the action that is taken from now on, given the interventions on its parts.
+
+    Raises:
+        InterventionError: It is another action at every step.
+    """
+    values = [np.asarray(act.value) for act in acts if isinstance(act, Hard)]
+    if len(values) == len(acts):
+        return values[0] if len(values) == 1 else np.concatenate([v.ravel() for v in values])
+    raise InterventionError(
+        f"do({name}): {acts[0]!r} is another action at every step, so it cannot be compared "
+        "with a space; leave out `space`, or give one action as numbers",
+        variable=name,
+    )
 
 
 @final
@@ -401,8 +418,10 @@ class Transaction:
             if not unknown.isdisjoint({name, *targets, *chain(*spaces)}):
                 continue
             try:
-                acts = targets[0] in actions
-                value = self._held(name) if acts else self.compiled.coordinates(name, self.row)
+                if targets[0] in actions:
+                    value = fixed_action(name, [self.acts[target][1] for target in targets])
+                else:
+                    value = self.compiled.coordinates(name, self.row)
                 check_space(requested, value, space, self.row)
             except InterventionError as problem:
                 if not self._asked_within(requested, space):
@@ -420,18 +439,6 @@ class Transaction:
         except InterventionError:
             return False
         return True
-
-    def _held(self, name: str) -> Value:
-        """Return the action that is to be taken from now on."""
-        acts = [self.acts[target][1] for target in self.compiled.model.targets(name)]
-        values = [np.asarray(act.value) for act in acts if isinstance(act, Hard)]
-        if len(values) == len(acts):
-            return values[0] if len(values) == 1 else np.concatenate([v.ravel() for v in values])
-        raise InterventionError(
-            f"do({name}): {acts[0]!r} is another action at every step, so it cannot be compared "
-            "with a space; leave out `space`, or give one action as numbers",
-            variable=name,
-        )
 
     def _as_asked(self) -> list[InterventionError]:
         """Say of a bundle, if that was asked for, what is wrong with its parts."""
