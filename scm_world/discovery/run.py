@@ -18,6 +18,7 @@ from scm_world.graph import SCM
 from scm_world.output.durable import made, removed, write_durably, write_whole
 from scm_world.output.reading import read_text
 from scm_world.output.remote import Location, located
+from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import probes as probe_states
@@ -28,8 +29,6 @@ from scm_world.queries.verification import (
     Outcome,
     Row,
     arrow,
-    counted,
-    edge_reports,
     listed,
     outcome,
 )
@@ -86,7 +85,7 @@ class DiscoveryReport(GraphReport):
         good = {"confirmed": True, "refuted": False}
         return (
             ("outcome", self.outcome, good.get(self.outcome)),
-            *counted(self.provenance),
+            *self.counted(),
             ("backend", f"{self.backend} {version}, preset {self.preset}", None),
             *((("options", ", ".join(self.arguments), None),) if self.arguments else ()),
             ("probe states", states, None if complete else False),
@@ -115,7 +114,7 @@ class DiscoveryReport(GraphReport):
 
 @typed
 def discover(
-    system: Simulation | SCM | str,
+    system: System | SCM | str,
     *,
     probes: int = 32,
     seed: int = 0,
@@ -184,7 +183,6 @@ def discover(
         return DiscoveryReport.of(
             there,
             effects,
-            edge_reports(paired.model, effects),
             seed=seed,
             probes=done,
             planned=probes,

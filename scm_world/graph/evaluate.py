@@ -39,7 +39,7 @@ class NoiseKey:
         step: The control step.
         count: For how many episodes in a row; None for a single one without a batch axis.
         origin: The control step at which variables got their own noise, if that was another one:
-            what was drawn at the start of an episode stays, however late one intervenes.
+            noise drawn at the start of an episode stays, however late one intervenes.
         attempt: How many draws were rejected before, because they were infeasible.
         kept: Variables that are not drawn again at another attempt.
         given: Noise that is known: of some variables, instead of draws.
@@ -102,23 +102,13 @@ class AppliedIntervention:
     """An intervention on a variable.
 
     Attributes:
-        intervention: What is done.
+        intervention: The intervention.
         requested: The variable it was requested of: the variable itself, other coordinates of it,
             or a bundle that it is a part of.
     """
 
     intervention: Intervention
     requested: Variable
-
-
-def source_of(act: AppliedIntervention) -> Distribution:
-    """Return the distribution that a draw is taken from."""
-    draw: Any = act.intervention
-    named = isinstance(draw.source, str)
-    space = act.requested.space(draw.source) if named else draw.source
-    if space is None:
-        raise ModelError([f"{act.requested.name!r} has no space {draw.source}"])
-    return space
 
 
 def noise_of(
@@ -200,7 +190,8 @@ class Evaluator:
         else:
             if getattr(requested, "per", "step") == "episode" and key.origin is None:
                 key = replace(key, step=0)
-            source, stream = source_of(act), getattr(act.intervention, "stream", None)
+            draw: Any = act.intervention
+            source, stream = draw.drawn_from(requested), draw.stream
             if stream is None and key.origin is None and key.given is None:
                 stream = "do"  # of a model; a world counts its draws
             value = key.draw(source, requested.name, requested.shape, values, stream)

@@ -3,8 +3,13 @@
 from scm_world.policies.scripted import Random
 from scm_world.queries.abduction import Counterfactuals
 from scm_world.queries.comparison import Comparison
-from scm_world.queries.consequences import Consequence, Consequences, consequences
-from scm_world.queries.differences import ButFor, Divergence, EpisodeDifference, but_for, compare
+from scm_world.queries.differences import (
+    Consequences,
+    EpisodeDifference,
+    but_for,
+    compare,
+    consequences,
+)
 from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.estimates import Effect
@@ -14,18 +19,14 @@ from scm_world.queries.outcomes import Outcome
 from scm_world.queries.plans import Plan, do
 from scm_world.queries.questions import SCM
 from scm_world.queries.samples import Samples, Setting
-from scm_world.queries.verification import Verification
-from scm_world.queries.verify import verify
+from scm_world.queries.verification import Verification, verify
 from scm_world.queries.world import World
 
 __all__ = [
     "SCM",
-    "ButFor",
     "Comparison",
-    "Consequence",
     "Consequences",
     "Counterfactuals",
-    "Divergence",
     "Effect",
     "Episode",
     "EpisodeDifference",

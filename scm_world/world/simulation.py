@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
-import gymnasium
 import numpy as np
 
-from scm_world._arguments import whole_number
 from scm_world._types import ArrayLike, Floats, Value
 from scm_world.backends import Backend, backends, make_backend
 from scm_world.backends.base import EngineSnapshot
@@ -45,13 +41,14 @@ from scm_world.world.compiled_task import (
 from scm_world.world.interventions import Transaction, difference, feasible, overlaps
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
-from scm_world.world.snapshot import WorldSnapshot
+from scm_world.world.snapshot import Snapshot
 from scm_world.world.structures import StructureCache, as_task
+from scm_world.world.system import CausalSystem
 
 READ_BACK = 1e-6  # how far a backend may report a number from what it was given
 
 
-class Simulation:
+class Simulation(CausalSystem):
     """The causal model of a task, stepped by a physics backend; ``scm_world.World`` adds questions.
 
     Args:
@@ -91,6 +88,8 @@ class Simulation:
         1
     """
 
+    compiled: CompiledTask
+
     def __init__(
         self,
         task: Task | StructureCache | str = "pushing",
@@ -123,8 +122,7 @@ class Simulation:
             name, allowed = "options of a world with these structures", (str(shared.options),)
             raise UnknownOption(name, self.options, allowed)
         self.structures = shared or StructureCache(kind, self.options)
-        self._checked = self._closed = False
-        self.version = 0  # counts changes of anything but what physics moves
+        self._checked = False
         self._origin: EngineSnapshot | None = None
         self._origin_row: Rows | None = None
         self._have_no_episode()
@@ -159,26 +157,6 @@ class Simulation:
         """How many control steps of the episode are over."""
         return int(self.row.numbers[self.row.mechanisms.clock])
 
-    @property
-    def has_begun(self) -> bool:
-        """Whether there is an episode."""
-        return self._started
-
-    def __getitem__(self, name: str) -> Value:
-        """Give the present value of one variable.
-
-        Raises:
-            UnknownVariable: No variable has this name.
-            NotReset: There is no episode yet.
-        """
-        self.model.declared(name)
-        return np.array(self.evaluate((name,))[name])
-
-    def values(self) -> dict[str, Value]:
-        """Give the present value of every variable, as copies."""
-        row = self.evaluate()
-        return {name: np.array(row[name]) for name in self.model}
-
     def previous(self) -> dict[str, Value]:
         """Give the values of one control step ago that present variables depend on."""
         self._require_episode()
@@ -189,7 +167,7 @@ class Simulation:
         }
 
     def evaluate(self, names: tuple[str, ...] | None = None) -> Rows:
-        """Compute some variables, all if None, and give all present values without copying them.
+        """Compute some variables, all if None, and return all present values without copying them.
 
         For loops that cannot wait; the values change with the next step.
 
@@ -211,40 +189,6 @@ class Simulation:
         self._require_episode()
         return self.composition.cameras(self.row.copy())
 
-    def reset(
-        self,
-        *,
-        seed: int | None = None,
-        episode: int = 0,
-        do: Mapping[str, Any] | None = None,
-        space: AnyRegion | None = None,
-    ) -> Audit | None:
-        """Begin an episode. Nothing that was done in the last one remains.
-
-        Args:
-            seed: Of the noise. Without it the next episode of the same noise begins, or of a
-                fresh seed if there was none.
-            episode: Number of the episode, with a seed.
-            do: An intervention that takes part in the beginning: a block of another size stands
-                on the floor. It holds until the next reset.
-            space: In which every target of it must lie; see ``do``.
-
-        Returns:
-            The audit of the intervention, or None if there was none.
-
-        Raises:
-            InterventionError: The intervention was refused. The episode has begun without it.
-        """
-        if seed is not None:
-            number = whole_number("episode", episode, least=0)
-            self.noise, self.episode = CompiledNoise(seed), number
-        elif not self._started:
-            self.noise, self.episode = CompiledNoise(secrets.randbits(63)), 0
-        else:
-            self.episode += 1
-        self._begin()
-        return self.do(do, space=space) if do else None
-
     def _begin(self) -> None:
         self._lost, self._offset = "", 0
         origin = self.structures.natural(None)
@@ -254,11 +198,12 @@ class Simulation:
         else:
             row = beginning(origin, None)
             self.backend.build(origin.scene(row))
+            self.backend.read(origin.state_of(row))
             self._origin, self._origin_row = self.backend.snapshot(), row
             self._started = True
         self._adopt(origin, origin.model, row)
         self._draw_nature()
-        self._forget()
+        self.row.remember()
         if not self._checked:
             check_functions(self.compiled, self.evaluate())
             self._checked = True
@@ -279,6 +224,7 @@ class Simulation:
                 raise Infeasible(compiled.random[0], Draw("A"), reasons)
         if change is not None:
             self.backend.apply(change)
+        self.backend.read(compiled.state_of(row))
         self._adopt(compiled, compiled.model, row, changed)
 
     def noise_key(self, index: int) -> NoiseKey:
@@ -321,11 +267,6 @@ class Simulation:
         return self.compiled.task
 
     @property
-    def model(self) -> SCM:
-        """The causal model of the present structure, without interventions."""
-        return self.compiled.model
-
-    @property
     def composition(self) -> Composition:
         """The entities."""
         return self.compiled.composition
@@ -341,32 +282,9 @@ class Simulation:
         return self.structures.steps
 
     @property
-    def action_low(self) -> Floats:
-        """Lower end of all actions, shape (n_actions,)."""
-        return self.compiled.action_bounds[0]
-
-    @property
-    def action_high(self) -> Floats:
-        """Upper end of all actions, shape (n_actions,)."""
-        return self.compiled.action_bounds[1]
-
-    @property
-    def action_space(self) -> gymnasium.spaces.Box:
-        """The space of actions in SI units."""
-        low, high = self.compiled.action_bounds
-        return gymnasium.spaces.Box(low, high, dtype=np.float64)
-
-    @property
-    def observation_space(self) -> gymnasium.spaces.Dict:
-        """The space of the observed variables by name, in SI units; nothing is clipped."""
-        names = (part.variable for part in self.task.observation.rows)
-        shapes = {name: self.model.declared(name).shape for name in names}
-        return gymnasium.spaces.Dict(
-            {
-                name: gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float64)
-                for name, shape in shapes.items()
-            }
-        )
+    def observed(self) -> tuple[str, ...]:
+        """The names of the observed variables."""
+        return tuple(part.variable for part in self.task.observation.rows)
 
     @property
     def identity(self) -> tuple[Any, ...]:
@@ -499,8 +417,7 @@ class Simulation:
             InterventionError: The request was refused; the world is bit-identical to before.
             NotReset: There is no episode yet.
         """
-        if not self._started or self._lost:
-            self._require_state()
+        self._require_state()
         problems: list[InterventionError] = []
         flat, before = flatten(request, problems), self._step_base()
         base = self.base or before
@@ -511,9 +428,10 @@ class Simulation:
         region = self.variables_space if space is None else as_region("space", space)
         key = self.noise_key(self.index)
         done = feasible(self.structures, base, before, flat, region, key, problems)
+        pending = done.kept()
         audit = self._commit(done, before, flat, check, at_start=base.at_start)
-        base = StepBase(base.compiled, base.model, base.row, done.kept(), drawn, base.at_start)
-        self._keep_base(base)
+        rest = (base.structure, pending, drawn, base.at_start)
+        self._keep_base(StepBase(base.compiled, base.model, base.row, *rest))
         return audit
 
     def _anew(
@@ -560,7 +478,8 @@ class Simulation:
         return problems
 
     def _step_base(self, *, at_start: bool = False) -> StepBase:
-        return StepBase(self.compiled, self.graph, self.row.copy(), at_start=at_start)
+        row = self.row.copy()
+        return StepBase(self.compiled, self.graph, row, self.structure, at_start=at_start)
 
     @property
     def base(self) -> StepBase | None:
@@ -580,59 +499,53 @@ class Simulation:
         at_start: bool,
     ) -> Audit:
         """Apply what was computed, and read it back; or put everything back and raise."""
-        index, change, backend = self.index, done.change, self.backend
-        compiled, keys = done.compiled, done.compiled.parameter_keys
-
-        def undo() -> None:
-            after = StepBase(compiled, self.graph, done.row)
-            lost = difference(after, before.compiled, before.row, done.changed)
-            if lost is not None:
-                backend.apply(lost)
-
-        with self._all_or_nothing(before, undo):
-            inertia: Parameters = {}
-            wanted = {keys[t] for n in done.asked for t in compiled.model.targets(n) if t in keys}
-            if change is not None:
+        index, row, offset = self.index, self.row, self._offset
+        change, backend, compiled = done.change, self.backend, done.compiled
+        keys, structure = compiled.parameter_keys, before.structure
+        if change is not None and change.structure is not None:
+            structure = change.structure
+        wanted = {keys[t] for n in done.asked for t in compiled.model.targets(n) if t in keys}
+        inertia: Parameters = {}
+        remarks: tuple[str, ...] = ()
+        try:
+            if change is None:
+                reported = backend.parameters(wanted)
+            else:
                 inertia = self._inertia(change)
                 backend.apply(change)
-                wanted.update(change.parameters, inertia)
-            reported, remarks = backend.parameters(wanted), tuple[str, ...]()
-            if change is not None:
-                self._refuse_other(change, reported)
-                set_here = () if change.structure is not None else change.parameters
-                if any(what.endswith("friction") for _, what in set_here):
-                    frictions = {keys[n]: before.row[n] for n in done.changed if n in keys}
-                    remarks = backend.capabilities.remarks(backend, frictions)
+                reported = backend.parameters({*wanted, *change.parameters, *inertia})
+                self._refuse_other(change, reported, done.row)
+                rubs = [k for k in change.parameters if k[1].endswith("friction")]
+                if rubs and change.structure is None:
+                    rubbing = [name for name in done.changed if keys.get(name) in rubs]
+                    old = {keys[name]: before.row[name] for name in rubbing}
+                    remarks = backend.capabilities.remarks(backend, old)
             clock = done.row.numbers[compiled.mechanisms.clock]
-            stays = compiled is before.compiled and clock == index
-            if stays and change is None and not done.changed:
+            if change is None and not done.changed and clock == index and self.compiled is compiled:
                 self._adopt_model(done.held())
                 self.version += 1
             else:
-                structure = change.structure if change is not None else None
-                structure = structure or self.structure
                 self._adopt(compiled, done.held(), done.row, done.changed, structure)
                 self._offset += self.index - index
                 if at_start:
-                    self._forget()
-            now = self.row.copy()
-            audit = Audit(partial(report, request, done, before, now, inertia, reported, remarks))
+                    self.row.remember()
+            audit = Audit(partial(report, request, done, before, inertia, reported, remarks))
             if check is not None:
                 check()
+        except BaseException:
+            after = StepBase(compiled, self.graph, done.row, structure)
+            lost = difference(after, before.compiled, before.row, done.changed)
+            if lost is not None:
+                backend.apply(lost)
+            self._put_back(before, row, offset)
+            raise
         return audit
 
-    @contextmanager
-    def _all_or_nothing(self, before: StepBase, undo: Callable[[], None]) -> Iterator[None]:
-        """Put everything back as it was before, should something fail half way."""
-        row, offset = self.row, self._offset
-        try:
-            yield
-        except BaseException:
-            undo()
-            self._hold(before.compiled, row)
-            self._adopt(before.compiled, before.model, before.row, moved=False)
-            self._offset = offset
-            raise
+    def _put_back(self, before: StepBase, row: Rows, offset: int) -> None:
+        """Be as before, should something fail half way; the backend is back already."""
+        self._hold(before.compiled, row)
+        self._adopt(before.compiled, before.model, before.row, before.compiled.static_names)
+        self._offset = offset
 
     def _inertia(self, change: Difference) -> Parameters:
         """Read the moments of inertia that a change of masses and sizes will change."""
@@ -643,15 +556,16 @@ class Simulation:
         bodies.difference_update(n for n in compiled.composition.bodies if n not in compiled.movers)
         return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
-    def _refuse_other(self, change: Difference, reported: Parameters) -> None:
-        """Refuse what the backend did not take over."""
+    def _refuse_other(self, change: Difference, reported: Parameters, row: Rows) -> None:
+        """Refuse what the backend did not take over; write the state that it reports."""
         values = change.parameters.items()
         wrong = [".".join(key) for key, value in values if not _close(value, reported[key])]
         if change.state is not None:
-            got = change.state.copy()
+            asked, got = change.state.settable(), change.state.copy()
             self.backend.read(got)
-            if not _close(change.state.settable(), got.settable()):
+            if not _close(asked, got.settable()):
                 wrong.append("the state")
+            row.numbers[: row.mechanisms.state_size] = got.vector
         if wrong:
             problem = f"the engine did not take over {', '.join(wrong)}"
             raise EngineFailure(problem, self.backend.name)
@@ -663,10 +577,8 @@ class Simulation:
         row: Rows,
         changed: Iterable[str] | None = None,
         structure: Structure | None = None,
-        *,
-        moved: bool = True,
     ) -> None:
-        """Take over what an intervention decided; the backend has taken over its part.
+        """Take over a model and values; the backend has taken over its part.
 
         Args:
             compiled: The task in the structure that there is now.
@@ -674,7 +586,6 @@ class Simulation:
             row: The values.
             changed: What only interventions decide and differs from the present, if known.
             structure: Of the row, if known.
-            moved: Whether the backend reports where everything is; else the row does.
         """
         last, anew = self.row, compiled is not self.compiled
         changed = last.differing(row) if changed is None else changed
@@ -685,10 +596,8 @@ class Simulation:
         if changed or anew:
             self._adopt_structure(structure or compiled.composition.structure(row))
         self.version += 1
-        if moved:
-            self.backend.read(self.state)
         if anew:
-            self._forget()
+            self.row.remember()
             kept, before = self.row.earlier(), last.earlier()
             for name in kept.keys() & before.keys():
                 kept[name][...] = before[name]
@@ -705,10 +614,6 @@ class Simulation:
         acts = (held[name] for name in self._held_actions)
         self._inputs = tuple(p.name for a in acts if isinstance(a, Mechanism) for p in a.parents)
 
-    def _forget(self) -> None:
-        """Take the present as the step before, where there is none."""
-        self.row.remember()
-
     # --- state ------------------------------------------------------------------------
 
     @property
@@ -716,7 +621,7 @@ class Simulation:
         """The live state, flat, shape (size,)."""
         return self.state.vector
 
-    def snapshot(self) -> WorldSnapshot:
+    def snapshot(self) -> Snapshot:
         """Save everything that decides the future of the world. It can be pickled.
 
         Raises:
@@ -724,7 +629,7 @@ class Simulation:
             EngineFailure: The backend has lost the state.
         """
         self._require_state()
-        return WorldSnapshot(
+        return Snapshot(
             engine=self.backend.snapshot(),
             present=self._step_base(),
             base=self.base,
@@ -735,7 +640,7 @@ class Simulation:
             world=self.identity,
         )
 
-    def restore(self, snapshot: WorldSnapshot) -> None:
+    def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot, bit for bit.
 
         Raises:
@@ -743,7 +648,7 @@ class Simulation:
                 was.
             EngineFailure: The backend failed on the way; the world needs a reset or a snapshot.
         """
-        if not isinstance(snapshot, WorldSnapshot):
+        if not isinstance(snapshot, Snapshot):
             raise SnapshotMismatch(f"{snapshot!r} is no snapshot of a world")
         if snapshot.world != self.identity:
             raise SnapshotMismatch(
@@ -752,67 +657,31 @@ class Simulation:
         if not self._started:
             self._begin()
         before = self.backend.snapshot() if isinstance(snapshot.engine, bytes) else None
-
-        def undo() -> None:
-            if before is not None:
-                self.backend.restore(before)
-            else:
-                self._lost = "a snapshot was restored in part"
-
+        now, row, offset = self._step_base(), self.row, self._offset
+        is_touched = False
         try:
             engine, present, base = snapshot.opened(self.structures, self.structure)
             engine.opened(self.backend)
             noise = CompiledNoise(snapshot.seed)
-            with self._all_or_nothing(self._step_base(), undo):
-                self.backend.restore(engine)
-                self._adopt(present.compiled, present.model, present.row, moved=False)
-                self.row.numbers[:] = present.row.numbers
-        except (SnapshotMismatch, EngineFailure):
-            raise
-        except Exception as error:
+            is_touched = True
+            self.backend.restore(engine)
+            self._adopt(present.compiled, present.model, present.row)
+            self.row.numbers[:] = present.row.numbers
+        except BaseException as error:
+            if is_touched and before is not None:
+                self.backend.restore(before)
+            elif is_touched:
+                self._lost = "a snapshot was restored in part"
+            if is_touched:
+                self._put_back(now, row, offset)
+            if isinstance(error, SnapshotMismatch | EngineFailure) or not isinstance(
+                error, Exception
+            ):
+                raise
             raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
         self._lost, self._offset = "", snapshot.offset
         self.noise, self.episode = noise, snapshot.episode
         self._keep_base(base)
-
-    @contextmanager
-    def unchanged(self) -> Iterator[None]:
-        """Go back to the present afterwards, bit for bit, also after an error or Ctrl-C.
-
-        A world without an episode has none afterwards. One whose backend has lost the state still
-        needs a reset or a snapshot.
-
-        Example:
-            >>> world = Simulation("pushing", backend="fake")
-            >>> world.reset(seed=5)
-            >>> with world.unchanged():
-            ...     world.reset(seed=0)
-            ...     world.step(np.zeros(9))
-            >>> world.noise.seed, world.index
-            (5, 0)
-        """
-        back = self.way_back()
-        try:
-            yield
-        finally:
-            back()
-
-    def way_back(self) -> Callable[[], None]:
-        """Return what goes back to the present, bit for bit; see ``unchanged``."""
-        started, lost = self._started, self._lost
-        noise = self.noise, self.episode, self._offset
-        before = self.snapshot() if started and not lost else None
-
-        def back() -> None:
-            if before is not None:
-                self.restore(before)
-            elif not started:
-                self._have_no_episode()
-            else:
-                self._lost, self._base = lost, None
-                self.noise, self.episode, self._offset = noise
-
-        return back
 
     def close(self) -> None:
         """Free the engine. There is no episode any more."""
@@ -820,10 +689,6 @@ class Simulation:
         self._started = False
         self.version += 1
         self.backend.close()
-
-    def _require_episode(self) -> None:
-        if not self._started:
-            raise NotReset(closed=self._closed)
 
     def _require_state(self) -> None:
         """Refuse to continue without an episode, or from a state that the backend has lost."""
