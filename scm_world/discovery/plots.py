@@ -172,9 +172,10 @@ def draw_verification(found: Verification, path: Location | str) -> None:
     title: Any = {"fontsize": 18, "weight": "bold"}
     figure.text(0.02, 0.945, f"Verification of {found.task}", color=INK, **title)
     figure.text(0.98, 0.945, found.outcome, ha="right", color=OUTCOMES[found.outcome], **title)
+    backend = f"{found.backend} {found.versions.get(found.backend, '')}".strip()
     words = (
-        f"{found.backend} {found.versions.get(found.backend, '')}: {len(found.undeclared)} "
-        f"undeclared, {len(found.never_fired)} never seen, {found.rollouts:,} rollouts"
+        f"{backend}: {len(found.undeclared)} undeclared, {len(found.never_fired)} never seen, "
+        f"{found.rollouts:,} rollouts"
     )
     figure.text(0.02, 0.9, words, fontsize=11, color=INK)
     _coverage(figure.add_axes((0.055, 0.09, 0.36, 0.72)), found)
@@ -184,16 +185,16 @@ def draw_verification(found: Verification, path: Location | str) -> None:
 
 def _coverage(ax: Axes, found: Verification) -> None:
     """Draw the share of the declared edges that had fired after each probe state."""
-    from matplotlib.ticker import MaxNLocator
+    from matplotlib.ticker import MaxNLocator, MultipleLocator, PercentFormatter
 
     declared = len(found.declared)
     share = [count / declared if declared else 1.0 for count in found.coverage]
     label = f"{found.backend}: {len(found.fired)} of {declared}"
     ax.step(range(1, len(share) + 1), share, where="mid", color=MATCHED, lw=2.2, label=label)
-    lowest = min(1.0, *share)
     ax.axhline(1.0, color=FAINT, lw=1.0, zorder=0)
-    ax.set_ylim(lowest - 0.08 * (1.02 - lowest) - 0.002, 1.0 + 0.06 * (1.02 - lowest))
-    ax.yaxis.set_major_formatter(lambda y, _: f"{round(100 * y, 3):g} %" if y <= 1.0 else "")
+    ax.set_ylim(0.0, 1.05)
+    ax.yaxis.set_major_locator(MultipleLocator(0.2))
+    ax.yaxis.set_major_formatter(PercentFormatter(1.0))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_title("declared edges seen", loc="left", fontsize=13, color=INK)
     ax.set_xlabel("probe states", fontsize=11, color=INK)

@@ -90,6 +90,21 @@ def test_worlds_can_be_asked_one_by_one() -> None:
     assert [len(done) for done in mine.get_attr("interventions")] == [0, 0, 1, 0]
 
 
+def test_worlds_in_processes_do_the_same() -> None:
+    """What changes a world is called in all of them; what is read is read of some."""
+    envs, _ = both(2, workers=2, **GOALS)
+    envs.seed(0)
+    shown = envs.reset()
+    assert envs.get_attr("action_mode", 1) == ["joint_positions"]
+    goals = shown["achieved_goal"], shown["desired_goal"]
+    assert envs.env_method("compute_reward", *goals, [{}] * 2, indices=[0])[0].shape == (2,)
+    with pytest.raises(UnknownOption, match="workers=1"):
+        envs.env_method("do", {"floor_friction": 0.3}, indices=[0])
+    envs.env_method("do", {"floor_friction": 0.3})
+    assert [len(done) for done in envs.get_attr("interventions")] == [1, 1]
+    envs.close()
+
+
 def test_pictures_are_put_side_by_side() -> None:
     """``render`` tiles them, as with its own kind."""
     mine, other = both(2, render_mode="rgb_array")
@@ -118,8 +133,9 @@ def test_what_it_cannot_adapt_is_refused() -> None:
     """Another autoreset mode, worlds of another kind, and infos that nobody tells."""
     with pytest.raises(UnknownOption, match="SameStep"):
         Sb3VecEnv(gymnasium.make_vec(PUSHING, 2, backend="fake"))
-    how: dict[str, Any] = {"vectorization_mode": "sync", "backend": "fake"}
-    others = gymnasium.make_vec(PUSHING, 2, vector_kwargs={"autoreset_mode": "SameStep"}, **how)
+    how: dict[str, Any] = {"vectorization_mode": "sync"}
+    how["vector_kwargs"] = {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}
+    others = gymnasium.make_vec("CartPole-v1", 2, **how)
     with pytest.raises(UnknownOption, match="make_vec"):
         Sb3VecEnv(others)
     with pytest.raises(UnknownOption, match="is_success"):
