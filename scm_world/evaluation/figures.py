@@ -133,11 +133,7 @@ class MetricComparison:
 
 
 def comparisons_of(evaluation: Evaluation, metric: str) -> dict[str, MetricComparison]:
-    """Compare the agents on each backend over all protocols.
-
-    Raises:
-        UnknownOption: Agents have not played the same protocols, or one episode only.
-    """
+    """Compare the agents on each backend over all protocols."""
     return {
         engine: _compared(evaluation.only(engine=engine), metric) for engine in evaluation.engines
     }

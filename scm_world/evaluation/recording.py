@@ -580,11 +580,7 @@ class _Shown(Hook):
 
 
 def _refuse_changes(env: gymnasium.Env[Any, Any], inside: ScmWorldEnv) -> None:
-    """Refuse wrappers below a recorder that change actions, observations or rewards.
-
-    Raises:
-        UnknownOption: There is one.
-    """
+    """Refuse wrappers below a recorder that change actions, observations or rewards."""
     layer = env
     while isinstance(layer, gymnasium.Wrapper):
         same = layer.action_space == inside.action_space

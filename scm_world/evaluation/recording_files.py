@@ -126,11 +126,7 @@ def _whole(arrays: Mapping[str, Any]) -> Any:
 
 
 def as_data(made_with: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of an environment as plain data.
-
-    Raises:
-        ModelError: Some cannot be written; all of them are named.
-    """
+    """Return the arguments of an environment as plain data."""
     arguments, problems = dict(made_with), []
     task = arguments["task"]
     if isinstance(task, Task):
@@ -191,10 +187,6 @@ def to_parquet(about: Mapping[str, Any], episodes: Sequence[Recorded]) -> bytes:
     Args:
         about: Plain data for the header: environment, fingerprint, versions, policy.
         episodes: The episodes.
-
-    Raises:
-        ModelError: There is no episode, some have other parts of the observation than others, or
-            something is not plain data.
     """
     import pyarrow as arrow
     from pyarrow import parquet
@@ -251,12 +243,7 @@ def to_parquet(about: Mapping[str, Any], episodes: Sequence[Recorded]) -> bytes:
 def from_parquet(
     data: bytes, path: str, trusted: Sequence[str]
 ) -> tuple[dict[str, Any], list[Recorded]]:
-    """Read the header and the episodes of a Parquet file.
-
-    Raises:
-        UnreadableFile: It is something else, or cut.
-        ModelError: A mechanism is a function of no trusted package.
-    """
+    """Read the header and the episodes of a Parquet file."""
     advice = "give one that a Recording was saved to"
     try:
         table = read_table(data).combine_chunks()

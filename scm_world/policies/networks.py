@@ -130,11 +130,6 @@ class MlpPolicy:
         Returns:
             Shape (..., n_actions), in [-1, 1], dtype float32; each observation of a batch gets, bit
             for bit, the action that it gets alone.
-
-        Raises:
-            ActionError: The observation has another number of components, or other parts; or the
-                policy has a memory.
-            UnknownOption: There is a generator, but the standard deviations are not known.
         """
         found = self.mean(observation)
         if generator is not None:
