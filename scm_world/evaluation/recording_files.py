@@ -118,7 +118,8 @@ def parts(observation: Observation) -> dict[str, NDArray[Any]]:
     return {ONLY: observation}
 
 
-def _whole(arrays: Mapping[str, Any]) -> Any:
+def whole(arrays: Mapping[str, Any]) -> Any:
+    """Return the observation that has such parts."""
     return arrays[ONLY] if ONLY in arrays else dict(arrays)
 
 
@@ -284,7 +285,7 @@ def _episode(
             for step, plan in known["interventions"]
         ),
         observations=tuple(
-            _whole({name: arrays[at] for name, arrays in seen.items()})
+            whole({name: arrays[at] for name, arrays in seen.items()})
             for at in range(rows.num_rows)
         ),
         actions=np.array(_rows(steps["action"])),
@@ -334,7 +335,7 @@ def to_minari(
     seen = []
     for episode in episodes:
         rows = [parts(observation) for observation in episode.observations]
-        seen.append(_whole({name: np.stack([row[name] for row in rows]) for name in rows[0]}))
+        seen.append(whole({name: np.stack([row[name] for row in rows]) for name in rows[0]}))
     kind: np.dtype[Any] = np.result_type(*(episode.actions for episode in episodes))
     actions = env.action_space
     if kind != actions.dtype and isinstance(actions, gymnasium.spaces.Box):
