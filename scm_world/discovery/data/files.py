@@ -133,14 +133,11 @@ def decoded(data: bytes, columns: Sequence[Column], trusted: Sequence[str]) -> D
 def together(settings: Mapping[str, Any], parts: Sequence[Dataset]) -> Dataset:
     """Return the rows of all files as one table, with all that is said of its episodes."""
     about = {name: value for name, value in settings.items() if name != ABOUT}
-    said = {
-        name: {number: each for part in parts for number, each in part.about.get(name, {}).items()}
-        for name in ("refused", "touching")
-    }
-    about |= {"refused": said["refused"]} if said["refused"] else {}
-    if "contacts" in about and "touching" not in about:  # a saved table has it
-        whole = about["contacts"] == "episodes"
-        about["touching"] = {"whole": whole, "episodes": said["touching"]}
+    for name in ("refused", "touching"):
+        found = {
+            number: each for part in parts for number, each in part.about.get(name, {}).items()
+        }
+        about |= {name: found} if found else {}
     return replace(Dataset.joined([replace(part, about={}) for part in parts]), about=about)
 
 

@@ -382,14 +382,12 @@ def touches(table: Dataset) -> Iterator[list[Touch]]:
     record = table.about.get("touching")
     if record is None:
         raise ModelError(["the table does not say what touched: collect it with contacts=True"])
-    lags = table.about.get("lags", 1)
+    lags, whole = table.about.get("lags", 1), table.about["contacts"] == "episodes"
     for episode in np.unique(table.episode).tolist():
-        given = record["episodes"][str(episode)]
-        pairs = [(one, other) for one, other in given["pairs"]]
-        steps = [frozenset(pairs[i] for i in which) for n, which in given["runs"] for _ in range(n)]
+        steps = [frozenset((one, other) for one, other in step) for step in record[str(episode)]]
         rows = table.step[table.episode == episode].tolist()
         behind = {i for row in rows for i in range(max(row - lags, 0), row)}
-        yield steps if record["whole"] else [steps[i] for i in sorted(behind)]
+        yield steps if whole else [steps[i] for i in sorted(behind)]
 
 
 def acting_edges(table: Dataset) -> list[list[Any]]:
@@ -406,7 +404,7 @@ def acting_edges(table: Dataset) -> list[list[Any]]:
     if by_contact:
         seen = set[Touch]()
         for steps in touches(table):
-            whole = table.about["touching"]["whole"]
+            whole = table.about["contacts"] == "episodes"
             seen.update([frozenset[tuple[str, str]]().union(*steps)] if whole else steps)
         for touch in sorted(seen, key=sorted):
             acts = holds(written["contact"], touch)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
-from itertools import groupby
 from typing import Any, final
 
 import numpy as np
@@ -209,10 +208,11 @@ class EpisodeRows:
 
         def finish(_: int, result: Result) -> Any:
             if isinstance(result, InterventionError):
-                return str(result), [], {}
+                return str(result), [], []
             if isinstance(result, Exception):
                 raise result
-            return self._values(result), self._look(result), _runs(result.touched)
+            touched = [[list(pair) for pair in sorted(step)] for step in result.touched]
+            return self._values(result), self._look(result), touched
 
         written = {*self._watched} - {*world.compiled.slices, *world.static_names}
         names = tuple(name for name in self._watched if name in written)
@@ -228,14 +228,14 @@ class EpisodeRows:
                     kinds[id(regime)] = replace(unit, listens=self._contacts), rows
             units = [replace(kinds[id(regime)][0], number=number) for _, number, regime in cases]
             found = self._twins.run(units, finish, self._setting.workers)
-            for (number, _, regime), (values, seen, runs) in zip(cases, found, strict=True):
+            for (number, _, regime), (values, seen, touched) in zip(cases, found, strict=True):
                 if isinstance(values, str):
                     refused[str(number)] = values
                     continue
                 episodes.append((number, *kinds[id(regime)][1], values))
                 shots += ({"episode": number, **shot} for shot in seen)
-                touching[str(number)] = runs
-        about = {"refused": refused, "touching": touching if self._contacts else {}}
+                touching |= {str(number): touched} if self._contacts else {}
+        about = {"refused": refused, "touching": touching}
         table = Dataset.of_episodes(self.columns, episodes, about)
         keys = [f"{shot['episode']:08d}-{shot['step']:06d}" for shot in shots]
         return table, b"" if self._pictures is None else self._pictures.encoded(shots, keys)
@@ -292,20 +292,6 @@ class EpisodeRows:
             drawn = noise.draw(NORMAL, stream, shape, {}, episode=episode.number, step=step)
             values[step] += float(strength[step]) * half.reshape(shape) * drawn[0]
         return values
-
-
-def _runs(steps: Sequence[frozenset[tuple[str, str]]]) -> dict[str, Any]:
-    """Return which bodies touched in each control step, as plain data.
-
-    Example:
-        >>> _runs([frozenset({("a", "b")}), frozenset({("a", "b")}), frozenset()])
-        {'pairs': [['a', 'b']], 'runs': [[2, [0]], [1, []]]}
-    """
-    pairs = sorted(frozenset[tuple[str, str]]().union(*steps))
-    runs = [
-        [len([*same]), [pairs.index(p) for p in sorted(which)]] for which, same in groupby(steps)
-    ]
-    return {"pairs": [list(pair) for pair in pairs], "runs": runs}
 
 
 def half_range(world: Simulation, name: str) -> Floats:
