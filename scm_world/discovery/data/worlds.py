@@ -67,23 +67,8 @@ class EpisodeRows:
     With ``every_step`` a row of a causal model has all variables at an instant; that of a model
     without lagged edges is ``model.do(regime(i).plan.at_start()).draw(1, seed=seed, first=i)``.
 
-    Args:
-        system: A world or an SCM. It is not changed; interventions given to it hold in every
-            episode.
-        design: The interventions at the beginning.
-        setting: Policy, context distribution, steps and seed.
-        causes: Patterns of the parameters that have columns; ``default_causes`` if None. The
-            targets of the design are among them.
-        outcomes: Names of variables or ``Outcome``; ``default_outcomes`` if None.
-        every_step: One row for each control step in place of one for each episode.
-        pictures: To take at each control step, or at the beginning and at the end; none if None.
-        contacts: Whether to record which bodies touch.
-
-    Raises:
-        InterventionError: A target, or a variable of the context, cannot be set to its values.
-        UnknownVariable: No variable has this name.
-        UnknownOption: An outcome is a function, sums up an episode with ``every_step``, or has a
-            column as a cause already; or there is no such camera.
+    Interventions given to the system hold in every episode; the targets of the design have columns
+    in any case. Arguments are those of ``collect``.
     """
 
     def __init__(
@@ -347,11 +332,6 @@ class LaboratoryRows:
 
     Its permissions and its budget hold, and its errors are raised. A row has its outcomes as it
     reports them; its number of the unit is the number of the episode.
-
-    Args:
-        laboratory: Has the policy, the context distribution and the outcomes.
-        design: The interventions.
-        seed: Seed of the random choices of the design.
     """
 
     shard = 100
