@@ -26,8 +26,7 @@ from scm_world.discovery.data import Dataset
 from scm_world.discovery.data.truth import Pair
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import SOURCES, Learner, Source, learn, learner
-from scm_world.discovery.metrics import effect_rmse, evaluate, evaluate_marks, sortability
-from scm_world.discovery.physics import PHYSICS
+from scm_world.discovery.metrics import MARKS, effect_rmse, evaluate, sortability
 from scm_world.discovery.problems import GroundTruth, Problem, TaskView, problem, problem_label
 from scm_world.errors import (
     DAMAGED,
@@ -45,8 +44,6 @@ from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
-from scm_world.tasks import TASKS
-from scm_world.tasks.factories import FILES
 from scm_world.work.executors import Executor, Processes, opened
 from scm_world.work.processes import PROCESS, Ended, TookTooLong, Worker
 
@@ -268,7 +265,7 @@ def benchmark(
         ScmWorldError: A problem cannot be made, or data cannot be collected or written.
 
     Example:
-        >>> result = benchmark(["pooled"], ["er2:4"], budgets=[40, 80], seeds=1)
+        >>> result = benchmark(["paired"], ["er2:4"], budgets=[40, 80], seeds=1)
         >>> [run.scores["shd"] for run in result.runs]
         [0, 0]
     """
@@ -351,16 +348,6 @@ def _kinds(chosen: Learner, problems: Sequence[str | SCM], wanted: Sequence[str]
     """Return the kinds of data for a learner, by default the richest that it takes."""
     if not chosen.is_installed:
         raise MissingExtra(chosen.package, chosen.extra)
-    refused = ""
-    if chosen.claims:
-        refused = "a learner that is not given the graph; 'coloring' checks one"
-    elif chosen.on == "models" and any(
-        isinstance(n, str) and (n in TASKS or n.endswith(FILES) or n.partition(":")[0] in PHYSICS)
-        for n in problems
-    ):
-        refused = "'paired' for a world; this one needs families of models or files of SCMs"
-    if refused:
-        raise UnknownOption("learner in a benchmark", chosen.name, (refused,))
     given: list[Source] = []
     for kind in wanted:
         if kind not in SOURCES:
@@ -610,14 +597,13 @@ class _Runner:
             found = learn(chosen, made.simulator(run.seed), seed=run.seed, budget=run.budget)
         else:
             found = learn(chosen, table, seed=run.seed)
+        compared = evaluate(found, truth, marks=marked).as_dict()
+        numbers = {k: v for k, v in compared.items() if isinstance(v, int | float | None)}
         scores: dict[str, Any] = {}
         if found.marks is None:  # a partial ancestral graph is no estimate of a directed one
-            compared = evaluate(found, truth.edges, names=truth.names, pairs=truth.pairs)
-            plain = compared.as_dict()
-            scores = {k: v for k, v in plain.items() if isinstance(v, int | float | None)}
-            scores["sid"] = compared.sid
+            scores = {k: v for k, v in numbers.items() if k not in MARKS}
         if marked or found.marks is not None:
-            scores |= asdict(evaluate_marks(found, truth))
+            scores |= {k: numbers[k] for k in MARKS}
         if table is not None and found.marks is None and not run.standardised:
             if not self._held_out:
                 self._held_out.append(made.held_out(run.seed))

@@ -27,11 +27,10 @@ from scm_world.discovery.data.truth import (
     truth_of_model,
     truth_of_steps,
 )
-from scm_world.discovery.learners.simulators import (
+from scm_world.discovery.learners.paired import (
     EpisodeSimulator,
     PairedSimulator,
-    SCMSimulator,
-    StepSimulator,
+    SystemSimulator,
 )
 from scm_world.discovery.physics import PHYSICS, ServoProblem, Springs, numbers_of, servo
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
@@ -357,7 +356,7 @@ class SCMProblem:
         if self._hidden:
             what = f"{self.truth.name} hides variables, which paired experiments would set"
             raise ModelError([f"{what}; take data='observational' or 'interventional'"])
-        return SCMSimulator(self._scm, seed)
+        return SystemSimulator(self._scm, seed)
 
     def close(self) -> None:
         """Do nothing: there is no backend."""
@@ -585,7 +584,7 @@ class WorldProblem:
         that are thrown at the wall: past the fingers, and so hard that they come back and hit one.
         """
         if self._by_step:
-            return StepSimulator(self._world, seed)
+            return SystemSimulator(self._world, seed)
         contexts = {n: act for n, act in self._contexts.items() if n != "sensor_noise"}
         length, blocks = self._view.steps, [n for n in self._causes if self._is_start(n)]
         settings = [Setting(self._policy, contexts, length, seed)]

@@ -12,7 +12,7 @@ from typing import Any, Literal, final
 from pydantic import computed_field
 
 from scm_world._arguments import typed, whole_number
-from scm_world.discovery.metrics import GraphScore, score
+from scm_world.discovery.metrics import Scores, evaluate
 from scm_world.errors import DAMAGED, UnreadableFile
 from scm_world.graph import SCM
 from scm_world.output.durable import made, removed, write_durably, write_whole
@@ -57,9 +57,9 @@ class DiscoveryReport(GraphReport):
 
     @computed_field  # type: ignore[prop-decorator]
     @cached_property
-    def score(self) -> GraphScore:
+    def score(self) -> Scores:
         """The comparison of the estimated with the declared graph."""
-        return score(self.found, self.declared)
+        return evaluate(self.found, self.declared)
 
     @property
     def threshold(self) -> float:
