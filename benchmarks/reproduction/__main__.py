@@ -6,7 +6,7 @@
     python -m benchmarks.reproduction --table pushing --algos ppo --seeds 0 --scale 0.01
     python -m benchmarks.reproduction --recipe pushing-ppo-c1 > recipe.json
 
-See ``docs/benchmarks/reproduction.md``.
+See ``docs/causal_world.md``.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ hover. A softer friction reference for contacts without fingers, elliptic cones 
 ``impratio`` mend all three. Fingers keep the hard reference: they have to grip.
 
 Source:
-    Measured; see the parity table in ``docs/design``.
+    Measured; see ``docs/decisions.md``.
 
 Every binding is a pure function of the values in force afterwards, so that any order of changes
 ends in the same model bit for bit. Frictions of pairs follow with ``couple``, derived constants of
