@@ -263,7 +263,7 @@ def _keys(names: tuple[str, ...], edges: Bools) -> tuple[EdgeKey, ...]:
 
 def _within_an_instant(edges: Bools, true: Bools, counts: Bools) -> dict[str, Any]:
     """Compute what is defined for acyclic graphs of one instant only."""
-    reason = ""
+    reason = "" if edges.size else "there are no variables"
     if edges[1:].any() or true[1:].any():
         reason = "there are edges through time"
     elif counts[0].sum() < counts[0].size - len(counts[0]):
