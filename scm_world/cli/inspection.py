@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 KIND_STYLE = {"exogenous": "yellow", "derived": "green", "measured": "blue", "action": "magenta"}
 LONG = 80  # [characters] what is longer is written once
-Format = StrEnum("Format", ["table", "json", "png", "html", "graphml"])
+Format = StrEnum("Format", ["table", "json", "png", "graphml"])
 """How a graph is written down."""
 
 
@@ -49,7 +49,7 @@ def graph(
 ) -> None:
     """Show the declared causal graph of a system.
 
-    Example: scm-world graph pushing --out graph.html
+    Example: scm-world graph pushing --out graph.png
 
     Args:
         format_: How to write it.
@@ -82,10 +82,6 @@ def graph(
             _parents_table(model, None if out is None else page)
         case "json":
             page.write(to_json(model) + "\n")
-        case "html":
-            from scm_world.discovery.model_pictures import to_html
-
-            page.write(to_html(model, title=title))
         case "graphml":
             import networkx as nx
 

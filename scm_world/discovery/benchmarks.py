@@ -38,6 +38,7 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM
+from scm_world.output.canvas import save
 from scm_world.output.durable import is_draft, locked, made, write_whole
 from scm_world.output.reading import read_text
 from scm_world.output.remote import Location, located
@@ -51,6 +52,8 @@ FORMAT = "scm_world/benchmark/1"
 SHARES = (8, 4, 2, 1)
 """A single budget N is spent as N/8, N/4, N/2 and N, so that there is a curve."""
 LONGEST = 1e6  # [s] of one wait
+GRAPHS = ("found", "edges", "confounded", "scores")
+"""Fields of a run that are no cells of a table."""
 
 # --- results --------------------------------------------------------------------------------------
 
@@ -108,8 +111,7 @@ class BenchmarkRun:
     def record(self) -> dict[str, Any]:
         """Everything but the graphs: a row of the table."""
         facts = {f.name: getattr(self, f.name) for f in fields(self)}
-        graphs = [facts.pop(name) for name in ("found", "edges", "confounded", "scores")]
-        return {**facts, **graphs[-1]}
+        return {**{k: v for k, v in facts.items() if k not in GRAPHS}, **self.scores}
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data."""
@@ -166,11 +168,16 @@ class BenchmarkResult:
         """Return the rows as a ``pandas.DataFrame``."""
         import pandas
 
-        return pandas.DataFrame(self.records)
+        from scm_world.discovery.benchmark_summary import COLUMNS
+
+        given = {name for run in self.runs for name in run.scores}
+        known = [column.key for column in COLUMNS if column.key in given]
+        names = [f.name for f in fields(BenchmarkRun) if f.name not in GRAPHS]
+        return pandas.DataFrame(self.records, columns=[*names, *known, *sorted(given - {*known})])
 
     def write(self, folder: Location | str) -> None:
-        """Write ``benchmark.json``, ``results.csv``, a picture and a report."""
-        from scm_world.discovery.benchmark_summary import write_files
+        """Write ``benchmark.json``, ``results.csv`` and a picture, ``budget.png``."""
+        from scm_world.discovery.benchmark_summary import draw_budgets
 
         plain = {
             "format": FORMAT,
@@ -178,8 +185,10 @@ class BenchmarkResult:
             "problems": [asdict(truth) for truth in self.problems.values()],
             "runs": [run.as_dict() for run in self.runs],
         }
-        write_whole(_as_json(plain), located(folder) / "benchmark.json")
-        write_files(self, located(folder))
+        home = located(folder)
+        write_whole(_as_json(plain), home / "benchmark.json")
+        write_whole(self.to_dataframe().convert_dtypes().to_csv(index=False), home / "results.csv")
+        save(draw_budgets(self), home / "budget.png")
 
     @classmethod
     @typed
