@@ -48,7 +48,7 @@ def register(kind: Kind) -> Kind:
         The same class.
 
     Raises:
-        ModelError: It is no class of backends, methods are missing, or it has no name.
+        ModelError: It is not a class of backends, methods are missing, or it has no name.
         UnknownOption: Another one has this name.
     """
     enter(_REGISTERED, kind, Backend, what="backend", taken=BACKENDS, check=lambda kind: ())
@@ -104,8 +104,8 @@ def read_model(source: Any, **options: Any) -> Model:
 
     Raises:
         MissingEngine: MuJoCo, which reads the files for all engines, is not installed.
-        UnreadableFile: There is no such file, or it is no text.
-        ModelError: It is no model, or one that cannot be a causal model.
+        UnreadableFile: There is no such file, or it is not text.
+        ModelError: It is not a model, or one that cannot be a causal model.
 
     Example:
         >>> ball = "<body name='ball'><freejoint/><geom size='0.1'/></body>"

@@ -32,9 +32,9 @@ class ContactPoint:
     """One point where two bodies touch.
 
     Attributes:
-        bodies: Names of the two bodies. Of a ``Model`` as in its file, ``"world"`` for what is
-            fixed to it; of other structures as they say.
-        position: Of the point, shape (3,) [m].
+        bodies: Names of the two bodies. In a ``Model`` as in its file, ``"world"`` for shapes fixed
+            to it; in other structures as they say.
+        position: Place of the point, shape (3,) [m].
         normal: Unit vector from the first body to the second, shape (3,).
         depth: How deep they intersect [m]; negative while they are apart.
         force: Normal force [N].
@@ -150,11 +150,11 @@ class Backend(ABC):
     change that is taken back leaves no trace, bit for bit.
 
     Attributes:
-        name: Of the engine.
-        capabilities: What it can do beyond these methods; what most can if a class says nothing.
+        name: Name of the engine.
+        capabilities: Abilities beyond these methods; by default those of most backends.
         batch: Made of backends of this class and a number of threads, it steps several scenes.
-        version: Of the engine.
-        structure: What was compiled: it says how large states and commands are.
+        version: Version of the engine.
+        structure: The compiled structure: it says how large states and commands are.
     """
 
     name: ClassVar[str]
@@ -171,7 +171,7 @@ class Backend(ABC):
     def apply(self, difference: Difference) -> None:
         """Change structure, parameters and state without advancing time.
 
-        What is not mentioned stays as it is, bit for bit; all of it where an error is raised.
+        Everything else stays as it is, bit for bit; all of it where an error is raised.
 
         Raises:
             UnknownOption: There is no such parameter.
@@ -214,7 +214,7 @@ class Backend(ABC):
 
     @abstractmethod
     def restore(self, snapshot: EngineSnapshot) -> None:
-        """Go back to a snapshot.
+        """Restore a snapshot.
 
         Raises:
             SnapshotMismatch: It was taken by another engine.
@@ -280,7 +280,7 @@ class BackendWrapper(Backend, ABC):
         return EngineSnapshot.of(self, self.engine.snapshot())
 
     def restore(self, snapshot: EngineSnapshot) -> None:
-        """Go back to a snapshot; one of the engine inside alone is refused."""
+        """Restore a snapshot; one of the engine inside alone is refused."""
         self.engine.restore(snapshot.opened(self))
 
     def close(self) -> None:
@@ -311,7 +311,7 @@ class InMemory(Backend, ABC):
             now = Scene(self.structure, self._parameters, self._state)
             difference = complete(now, structure, difference)
             self.structure, self._state = structure, structure.empty_state()
-            self._state.carry(now.state)  # what is reported stays
+            self._state.carry(now.state)  # reported values stay
             self._parameters = {}
         else:
             for key in difference.parameters:
@@ -347,7 +347,7 @@ class InMemory(Backend, ABC):
         return EngineSnapshot.of(self, scene)
 
     def restore(self, snapshot: EngineSnapshot) -> None:
-        """Go back to a snapshot."""
+        """Restore a snapshot."""
         scene: Scene = snapshot.opened(self)
         self.structure, self._state = scene.structure, scene.state.copy()
         self._parameters = {}
@@ -358,7 +358,7 @@ class InMemory(Backend, ABC):
             self._parameters[key] = np.array(value, dtype=np.float64)
 
     def _place(self, state: State) -> None:
-        """Put everything where a state says; what is only reported stays."""
+        """Write a state; values that are only reported stay."""
         np.copyto(self._state.vector, state.vector, where=self._state.layout.can_be_set)
 
     def _known(self, key: ParameterKey) -> Floats:

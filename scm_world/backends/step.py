@@ -23,7 +23,7 @@ class Quantity:
     """Something that a step function is given, or that it gives.
 
     Attributes:
-        name: Of the variable.
+        name: Name of the variable.
         shape: Of one value.
         default: One number, or one for each component.
         integer: Whether the function is given whole numbers (int64), and has to give such.
@@ -61,20 +61,20 @@ class StepModel:
     (NumPy scalars where the shape is ``()``), and gives a dict with the new value of every state.
     With ``"arrays"`` it is given four flat arrays of floats, in the order of declaration, and
     gives the new state as one: compiled functions take that. In both cases it must not change
-    what it is given, must keep no memory from one call to the next, and must draw no random
-    numbers of its own: ``verify`` finds what it depends on in addition.
+    its arguments, must keep no memory from one call to the next, and must draw no random
+    numbers of its own: ``verify`` finds further dependences.
 
     A command is the action followed by the noise. Two models are equal if they have the same
     function and tables; it can be pickled if the function can.
 
     Attributes:
-        name: Of the system.
+        name: Name of the system.
         function: The step.
         timestep: What one call of the function advances [s].
         parameters: What holds until it is set again.
         states: What the function moves, in the order of the state vector.
         actions: What a policy decides, in the order of the command.
-        noise: What is random in every step; it follows the actions in a command.
+        noise: Distributions of the noise of every step; it follows the actions in a command.
         vectorized: Whether the function takes many systems together: every value has a leading
             axis, and no row may depend on another one, to the last bit.
         signature: How the function is called.
@@ -135,7 +135,7 @@ class StepModel:
         Parameters are flat, in the order of declaration, shape (m, p).
 
         Raises:
-            EngineFailure: The function raised an error, changed what it was given, or gave
+            EngineFailure: The function raised an error, changed its arguments, or gave
                 something else than finite numbers of the declared names, shapes and kinds.
         """
         if self.vectorized:
@@ -161,7 +161,7 @@ class StepModel:
                 known = (f"{kind} {', '.join(named)}" for kind, named in names.items() if named)
                 advice = f"; it is given {'; '.join(known)}"
             elif "read-only" in str(error):
-                advice = "; what it is given must not be changed: let it work on a copy"
+                advice = "; its arguments must not be changed: let it work on a copy"
             raise self._failure(f"raised {type(error).__name__}: {error}{advice}") from error
         if self.signature == "arrays":
             kinds = ("parameters", "state", "action", "noise")
@@ -202,7 +202,7 @@ class StepModel:
             problems = [f"it must be a dict of the states by name: {result!r}"]
         else:
             problems = [f"{name!r} is missing" for name in places if name not in result]
-            problems += [f"{name!r} is no state" for name in result if name not in places]
+            problems += [f"{name!r} is not a state" for name in result if name not in places]
             given = [
                 (repr(q.name), result[q.name], places[q.name], (*lead, *q.shape))
                 for q in (self.states if not problems else ())

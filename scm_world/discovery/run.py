@@ -18,6 +18,7 @@ from scm_world.graph import SCM
 from scm_world.output.durable import made, removed, write_durably, write_whole
 from scm_world.output.reading import read_text
 from scm_world.output.remote import Location, located
+from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import probes as probe_states
@@ -115,7 +116,7 @@ class DiscoveryReport(GraphReport):
 
 @typed
 def discover(
-    system: Simulation | SCM | str,
+    system: System | SCM | str,
     *,
     probes: int = 32,
     seed: int = 0,

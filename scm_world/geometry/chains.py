@@ -18,7 +18,7 @@ from scm_world._types import Floats
 
 OFFSET, HINGE, SLIDE, BALL, FREE = 0.0, 1.0, 2.0, 3.0, 4.0
 WIDTH = 9
-"""Numbers of a step: what it is, which number it begins with, and up to seven of its own."""
+"""Numbers of a step: its kind, which number it begins with, and up to seven of its own."""
 
 
 @final

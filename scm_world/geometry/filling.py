@@ -1,6 +1,6 @@
 """How much of the goals the blocks fill, exactly, also where goals or blocks intersect.
 
-What is filled counts once, for the goal and the block that come first:
+A filled part counts once, for the goal and the block that come first:
 
     V(∪G ∩ ∪B) = Σ_g Σ_b V(G_g ∩ B_b − (G_1 ∪ … ∪ G_{g-1} ∪ B_1 ∪ … ∪ B_{b-1})).
 
@@ -145,7 +145,7 @@ def remainder_kernel(edges: Floats, within: Floats, others: Floats) -> float:
     """Compute how much of a solid lies within some planes and in none of some other solids.
 
     Args:
-        edges: Of the solid, shape (n, 7) [m].
+        edges: Edges of the solid, shape (n, 7) [m].
         within: Planes, shape (m, 4).
         others: Planes of each of the others, shape (k, p, 4).
 
@@ -206,7 +206,7 @@ def overlap_fraction(
         volume, is fulfilled: 1.0.
 
     Example:
-        Two goals share a third of what they cover, and the block lies just there.
+        Two goals share a third of their volume, and the block lies just there.
 
         >>> upright = np.array([[0.0, 0.0, 0.0, 1.0]])
         >>> goals = np.full((2, 3), 2.0), np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])

@@ -19,7 +19,7 @@ Vector = tuple[float, float, float]
 
 MOST_VERTICES = 256
 FORMATS = ("obj", "stl")
-THINNEST = 1e-6  # of the greatest extent: what is thinner has no volume
+THINNEST = 1e-6  # of the greatest extent: a thinner solid has no volume
 ROUGHNESS = 3e-7  # of the greatest extent: what sticks out less is the rounding of a file
 SAME_MOMENT = 1e-6  # of the greatest second moment: axes of equal ones can be chosen freely
 
@@ -114,7 +114,7 @@ def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
 
     try:
         if not file.is_file():
-            raise FileNotFoundError("it is no regular file, or not there")
+            raise FileNotFoundError("it is not a regular file, or not there")
         with file.open("rb") as stream:
             mesh: Any = trimesh.load(stream, file_type=kind, force="mesh", process=False)
         return hull_of(scale * np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3))

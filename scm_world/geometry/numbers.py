@@ -58,7 +58,7 @@ def scale_rows(
 ) -> None:
     """Gather numbers of some rows, saturate them at their bounds, and scale them into 32 bits.
 
-    ``sources`` has the column of each number, ``shifts`` what is added to it first, ``scale`` the
+    ``sources`` has the column of each number, ``shifts`` the first summand, ``scale`` the
     lower and upper bounds, gains and offsets, shape (4, k).
     """
     for row in rows:

@@ -166,8 +166,8 @@ def extension(graph: Bools) -> Bools | None:
     while here.any():
         free = left & left.T
         # A sink has no edge out, and its undirected neighbors are adjacent to all its neighbors.
-        strangers = (meets(free, _apart(left)) & skeleton(left)).any(axis=1)
-        sinks = np.flatnonzero(here & ~(left & ~left.T).any(axis=1) & ~strangers)
+        adjacent = (meets(free, _apart(left)) & skeleton(left)).any(axis=1)
+        sinks = np.flatnonzero(here & ~(left & ~left.T).any(axis=1) & ~adjacent)
         if not len(sinks):
             return None
         sink = sinks[0]

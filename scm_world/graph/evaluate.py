@@ -39,7 +39,7 @@ class NoiseKey:
         step: The control step.
         count: For how many episodes in a row; None for a single one without a batch axis.
         origin: The control step at which variables got their own noise, if that was another one:
-            what was drawn at the start of an episode stays, however late one intervenes.
+            noise drawn at the start of an episode stays, however late one intervenes.
         attempt: How many draws were rejected before, because they were infeasible.
         kept: Variables that are not drawn again at another attempt.
         given: Noise that is known: of some variables, instead of draws.
@@ -102,7 +102,7 @@ class AppliedIntervention:
     """An intervention on a variable.
 
     Attributes:
-        intervention: What is done.
+        intervention: The intervention.
         requested: The variable it was requested of: the variable itself, other coordinates of it,
             or a bundle that it is a part of.
     """

@@ -26,8 +26,8 @@ class Camera:
         target: A point on its optical axis [m].
         up: A direction that points up in the picture.
         field_of_view: Vertical opening angle [deg].
-        width: Of the picture [pixels].
-        height: Of the picture [pixels].
+        width: Width of the picture [pixels].
+        height: Height of the picture [pixels].
         near: Nothing nearer than this is seen [m], along the optical axis.
         far: Nothing farther than this is seen [m], along the optical axis.
     """
@@ -61,7 +61,7 @@ class Camera:
 
         Returns:
             Column, row and depth, shape (..., 3) [pixels, pixels, m]. The pixel is
-            ``(floor(row), floor(column))``, row 0 at the top. What has no positive depth lies
+            ``(floor(row), floor(column))``, row 0 at the top. A point without positive depth lies
             behind the camera and is not seen.
         """
         seen = (np.asarray(points, dtype=np.float64) - self.eye) @ self.axes().T  # (..., 3)

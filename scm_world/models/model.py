@@ -91,7 +91,7 @@ class StateRow(ModelRow):
         trees: Numbers of the kinematic trees it belongs to.
         kind: ``"rotation"`` for a unit quaternion (x, y, z, w).
         array: The array of MuJoCo's data it is kept in: ``"qpos"``, ``"qvel"`` or ``"act"``, or
-            ``"qfrc_actuator"`` for what is only reported.
+            ``"qfrc_actuator"`` for a reported value.
         numbers: Its places in that array, in order.
         frame: ``"world"`` for the orientation and the angular velocity of a free body whose
             quaternion has w >= 0 and whose angular velocity is given in the world.
@@ -156,8 +156,8 @@ class Model:
     Two models are equal if their backends would compile the same from them.
 
     Attributes:
-        name: Of the system.
-        digest: Hash of everything that decides what is compiled.
+        name: Name of the system.
+        digest: Hash of everything that decides the compiled model.
         source: What a backend compiles: only the reader and its backend look into it.
         timestep: Physics step [s].
         parameters: What can be set and holds.

@@ -20,7 +20,7 @@ class StateLayout:
     """Where each state stands in the vector.
 
     Attributes:
-        names: Of the states, in their order.
+        names: Names of the states, in their order.
         sizes: How many numbers each of them has.
         start: The vector before anything is set, shape (size,).
         reported: Names of those that the engine reports and that cannot be set.
@@ -58,7 +58,7 @@ class State:
     """Where everything is and how it moves. All views write the vector.
 
     Args:
-        layout: Of the vector.
+        layout: Layout of the vector.
         vector: The numbers, shape (layout.size,); those of ``layout.start`` if not given.
     """
 
@@ -132,7 +132,7 @@ def reversed_ranges(parameters: Mapping[ParameterKey, Any]) -> list[ParameterKey
 
 
 Structure = Any
-"""What has to be compiled: it changes only when bodies come or go. Hashable, picklable.
+"""The part that has to be compiled: it changes only when bodies come or go. Hashable, picklable.
 
 It has the ``timestep`` [s], ``n_commands`` and ``layout`` of a ``Model``, ``empty_state()`` and
 ``default_scene()``.
@@ -159,7 +159,7 @@ class GoalRegion:
     """A place where something should be. Goals are never bodies: nothing can touch them.
 
     Attributes:
-        name: Of the entity.
+        name: Name of the entity.
         shape: ``"box"``, ``"sphere"`` or ``"hull"``.
         size: Full edge lengths, or three times the diameter, shape (3,) [m].
         position: Center, shape (3,) [m].

@@ -36,7 +36,7 @@ def regular(path: Location | str, largest: int = LARGEST) -> Location:
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(where))
     if not stat.S_ISREG(status.st_mode):
-        raise OSError("it is no regular file, but a device, a pipe or a socket")
+        raise OSError("it is not a regular file, but a device, a pipe or a socket")
     refuse_large("it", status.st_size, largest)
     return where
 

@@ -31,7 +31,7 @@ class StudioJob:
         other.close()
 
     def interrupt(self) -> None:
-        """Ask it to report what is finished, and to end."""
+        """Ask it to report the finished part, and to end."""
         if self._process.pid is not None and self._process.is_alive():
             os.kill(self._process.pid, signal.SIGINT)
 
@@ -43,7 +43,7 @@ class StudioJob:
 
 
 def _experiment(spec: str, kind: str, probes: int, seed: int, pipe: Connection) -> None:
-    """Run experiments and report what they find."""
+    """Run experiments and report their results."""
     from scm_world.discovery import discover
     from scm_world.queries import verify
 

@@ -47,7 +47,7 @@ class Spec(BaseModel):
         if self.system.endswith(".json"):
             made = model_of_file(self.system)
         elif ":" in self.system:
-            with suppress(Exception):  # ``make_task`` raises it again, and says what is wrong
+            with suppress(Exception):  # ``make_task`` raises it again, with the reason
                 made = load_factory(self.system)(**self._given)
         if not isinstance(made, graph.SCM):
             return World(make_task(self.system, **self._given), **self.settings)
@@ -87,7 +87,7 @@ class Spec(BaseModel):
 
 
 def plain(value: Any) -> Any:
-    """Return numbers as JSON can hold them; what is not finite becomes None."""
+    """Return numbers as JSON can hold them; None stands for numbers that are not finite."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, list | tuple):
@@ -95,8 +95,8 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def told(act: Any) -> str:
-    """Say what an intervention does in a few words."""
+def in_words(act: Any) -> str:
+    """Return an intervention in a few words."""
     return str(Plan({"x": act}))[len("do(x = ") : -1]
 
 
@@ -109,7 +109,7 @@ def audited(audit: Any) -> dict[str, Any]:
         "targets": [
             {
                 "name": name,
-                "requested": told(one.requested),
+                "requested": in_words(one.requested),
                 "applied": plain(one.applied),
                 "read_back": plain(one.read_back),
             }

@@ -63,7 +63,7 @@ def import_map(address: Callable[[str], str]) -> str:
 
 
 def page(imports: str, data: str = "null") -> str:
-    """Return the page, with its import map, its style and what it shows without a server."""
+    """Return the page, with its import map, its style and its content without a server."""
     parts = {"imports": imports, "style": read("studio.css"), "recording": data}
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], read("index.html"))
 
@@ -76,7 +76,7 @@ def standalone(recording: dict[str, Any]) -> str:
 
 
 def _refused(word: str) -> Any:
-    raise ValueError(f"{word} is no number")
+    raise ValueError(f"{word} is not a number")
 
 
 @final
@@ -84,7 +84,7 @@ class _Session:
     """A worker process, and the page that is connected to it.
 
     Attributes:
-        socket: Of the page; None while it is away.
+        socket: Socket of the page; None while it is away.
         left: When the page went away, in the time of the event loop.
     """
 
@@ -241,7 +241,7 @@ class Studio:
                     await asyncio.to_thread(one.close)
 
     def _allowed(self, request: Request | WebSocket) -> bool:
-        """Tell whether a request comes from our page: no other page may reach this one."""
+        """Return whether a request comes from our page: no other page may reach this one."""
         token = request.query_params.get("token", "")
         if self.token and not hmac.compare_digest(token.encode(), self.token.encode()):
             return False
@@ -312,7 +312,7 @@ def serve(
         host: Address to bind; one that others can reach gets a token.
         port: Number of the port; any free one if 0.
         open_: Whether to open a browser.
-        say: Told the address.
+        say: Called with the address.
 
     Raises:
         UnknownOption: The address is taken, or is none of this machine.

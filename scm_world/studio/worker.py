@@ -28,12 +28,12 @@ from scm_world.studio.reading import (
     Spec,
     audited,
     described,
+    in_words,
     lit_edges,
     marks,
     nearest,
     period,
     plain,
-    told,
 )
 from scm_world.studio.scene import SentShapes, frame, touching
 from scm_world.variables import Draw, Hard, Natural, Scale, Shift
@@ -55,10 +55,10 @@ class Act(BaseModel):
     """An intervention on one variable.
 
     Attributes:
-        kind: What is done.
+        kind: Kind of the intervention.
         value: The value, or by how much it is shifted or scaled: a number, numbers, a label.
         source: The space that is drawn from.
-        start: First control step of a window, or of what is done later; now if None.
+        start: First control step of a window, or of a later intervention; now if None.
         stop: Where the window ends; it has no end if None.
         window: Whether it is held during a window.
     """
@@ -96,7 +96,7 @@ class Act(BaseModel):
 
 @final
 class _LaneState:
-    """The factual or the counterfactual episode, and what was seen of it.
+    """The factual or the counterfactual episode, and its recorded values.
 
     Attributes:
         live: The episode.
@@ -291,7 +291,8 @@ class Session:
             "playing": self._playing,
             "past": self._looking is not None,
             "held": [
-                [[name, told(act)] for name, act in lane.live.held.items()] for lane in self._lanes
+                [[name, in_words(act)] for name, act in lane.live.held.items()]
+                for lane in self._lanes
             ],
             "twin": self._lanes[TWIN].first if len(self._lanes) > 1 else None,
             "values": values,
@@ -381,7 +382,7 @@ class Session:
 
     @validate_call
     def play(self, speed: Annotated[float, Field(gt=0.0, le=100.0)] = 1.0) -> None:
-        """Go on in real time, times a factor: with what is recorded, or with the world."""
+        """Play in real time, times a factor: the recorded part, then the world."""
         self._speed, self._playing, self._next = speed, True, time.monotonic()
 
     @validate_call
@@ -391,7 +392,7 @@ class Session:
 
     @validate_call
     def step(self, n: Annotated[int, Field(ge=1, le=1000)] = 1) -> None:
-        """Take control steps; in the past, go forward over what is recorded."""
+        """Take control steps; in the past, go forward over the recorded part."""
         self._playing = False
         if self._looking is not None:
             return self.look(min(self._looking + n, self._steps))
@@ -400,7 +401,7 @@ class Session:
 
     @validate_call
     def look(self, step: Step | None = None) -> None:
-        """Look at an instant of the episode; at the present one if None."""
+        """Show an instant of the episode; at the present one if None."""
         if step is not None and step > self._steps:
             raise UnknownOption("step", step, (f"a control step from 0 to {self._steps}",))
         self._playing = False
@@ -483,7 +484,9 @@ class Session:
         """Hand a variable back to its own mechanism."""
         chosen = self._lane(lane)
         if name not in chosen.live.held:
-            raise UnknownOption("what is in force", name, tuple(chosen.live.held) or ("nothing",))
+            raise UnknownOption(
+                "intervention in force", name, tuple(chosen.live.held) or ("nothing",)
+            )
         audit = chosen.live.do({name: Natural()})
         chosen.look()
         self._note(f"{('live', 'twin')[lane]}.do({{{name!r}: sw.Natural()}})")
@@ -548,7 +551,7 @@ class Session:
 
     @validate_call
     def cancel(self) -> None:
-        """Interrupt discovery or verification; the report covers what was finished."""
+        """Interrupt discovery or verification; the report covers the finished part."""
         if self._job is None:
             raise UnknownOption("job", None, ("one that runs",))
         self._job.interrupt()
@@ -597,7 +600,7 @@ class Session:
             values = self._series(lane, 0, lane.live.steps + 1)
             rows.append({"first": 0, "values": values})
         live = self._lanes[FACTUAL].live
-        held = [[[n, told(a)] for n, a in lane.live.held.items()] for lane in self._lanes]
+        held = [[[n, in_words(a)] for n, a in lane.live.held.items()] for lane in self._lanes]
         return {
             "hello": described(self._spec, live.world),
             "scenes": scenes,

@@ -46,7 +46,7 @@ class Observed:
 @final
 @dataclass(frozen=True)
 class Observation:
-    """What is observed and measured of a task, in one of its structures.
+    """The observed and measured variables of a task, in one of its structures.
 
     Attributes:
         rows: The parts of the structured observation, in order.
@@ -190,7 +190,7 @@ class Task(ABC):
         seconds: Length of an episode [s].
         weights: Weight of each reward term, by the name of its variable.
         goal: The variables that are achieved and desired, and their measures.
-        observation: What is observed and measured.
+        observation: The observed and measured variables.
         decided_by: The shared variables that decide which entities there are.
         plan: The structure, from ``arrange``; None where that is always the same.
         absent: Entities that an intervention took away.
@@ -250,7 +250,7 @@ class Task(ABC):
 
     @property
     def observation(self) -> Observation:
-        """What is observed and measured."""
+        """The observed and measured variables."""
         return Observation()
 
     @abstractmethod

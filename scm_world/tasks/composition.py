@@ -32,7 +32,7 @@ class Entity:
         name: Prefix of its variables.
         variables: Its declarations. A ``Measured`` variable without a mechanism is a state: its
             parents are those that act when something is set, and physics adds the others.
-        kind: What it is, such as ``"goal"``, where it can be taken away; else empty.
+        kind: Its kind, such as ``"goal"``, where it can be taken away; else empty.
         hull: The shape of a block or goal that is not a box.
         shape: The shape of a goal without a hull: ``"box"`` or ``"sphere"``.
     """

@@ -104,5 +104,5 @@ def refuse_untrusted(task: str, trusted: Sequence[str] | None) -> None:
         return
     if package in trusted or task in ("scm_world.tasks.model:ModelTask", *trusted):
         return
-    allowed = (f"task={task!r}, or trusted={(package,)}, to run what is in there",)
+    allowed = (f"task={task!r}, or trusted={(package,)}, to run its code",)
     raise UnknownOption("task that a file names", task, allowed)

@@ -40,7 +40,7 @@ CONTROL_DT = 0.02
 
 REWARD = "reward"
 START = "start"
-"""What is drawn for the beginning of an episode is ``"<state>.start"``."""
+"""The variable drawn for the beginning of an episode is ``"<state>.start"``."""
 
 _OVERRIDES = ("a", "b", "bounds", "default", "distribution", "doc")
 
@@ -135,7 +135,7 @@ class DeclaredTask(Task):
             UnknownOption: Something that is not a variable is to be observed, or begins.
         """
         system, (index, _) = self.system, clock(timing.steps, timing.control_period)
-        if self.commands is not None:  # noise goes by the control step: setting that is no cause
+        if self.commands is not None:  # noise goes by the control step: setting that is not a cause
             index = index.model_copy(update={"settable_state": False, "parents": ()})
         own = (one for one in self.outcomes if not isinstance(one, str))
         counted = {name: getattr(self, name) for name in (REWARD, SUCCESS, TERMINATED)}
@@ -276,7 +276,7 @@ class ModelTask(DeclaredTask):
         if len(kept) == len(self.system.parameters):
             return self
         gone = {row.name for row in self.system.parameters} - {row.name for row in kept}
-        reasons = tuple((name, f"is no parameter of {backend.name}") for name in sorted(gone))
+        reasons = tuple((name, f"is not a parameter of {backend.name}") for name in sorted(gone))
         other = self.at(self.plan, self.conventions, self.absent)
         refused = (*self.system.refused, *reasons)
         other.system = dataclasses.replace(self.system, parameters=kept, refused=refused)
@@ -319,7 +319,7 @@ class ModelTask(DeclaredTask):
             yield from beginning(state, self.start.get(row.name))
 
     def _fields(self, row: ModelRow, *more: str) -> dict[str, Any]:
-        """Return fields of a declaration, with what was asked for."""
+        """Return fields of a declaration, with the requested ones."""
         given, where = self.spaces.get(row.name, {}), f"spaces[{row.name!r}]"
         kind, shape = getattr(row, "kind", "real"), row.shape
         limited = np.isfinite(row.low).any() or np.isfinite(row.high).any()

@@ -143,7 +143,7 @@ def one_number(values: Values, name: str, terms: Iterable[str]) -> float:
     blamed = {term: values[term] for term in terms if term in values}
     wrong = {t: v for t, v in blamed.items() if np.shape(v) or not np.isfinite(v).all()}
     raise ModelError(
-        [f"{name} is no finite number, because of {wrong}; their mechanisms must give one each"]
+        [f"{name} is not a finite number, because of {wrong}; their mechanisms must give one each"]
     )
 
 
@@ -202,7 +202,7 @@ def declared(name: str, given: Any) -> Variable:
     if not (callable(function) or isinstance(function, Function | Linear)) or not parents:
         raise ModelError(
             [
-                f"{name}={given!r} is no declaration: give a function and the names of its "
+                f"{name}={given!r} is not a declaration: give a function and the names of its "
                 f"parents, ({name}_of, 'hinge.position'), or sw.Measured(name={name!r}, …)"
             ]
         )

@@ -69,13 +69,13 @@ class StepTask(DeclaredTask):
     ``verify`` hold the function against that.
 
     Args:
-        step: The function; see ``StepModel`` for what it is given and gives.
+        step: The function; see ``StepModel`` for its arguments and results.
         name: The name of the task; that of the function if None.
         parameters: ``Exogenous`` variables, or ``Derived`` and ``Fixed`` ones.
         states: ``Measured`` variables without a mechanism. ``do`` may set each of them.
         actions: ``Action`` variables. The command is one after another.
         control_dt: What one call of the function advances [s]: a control step.
-        noise: Distributions of the noise that the function is given in every step, by name. What is
+        noise: Distributions of the noise that the function gets in every step, by name. Noise
             named like a state has its shape; else it is a number, or has the shape of the ends
             of its box.
         outcomes: ``Measured`` or ``Derived`` variables that are computed from others.
@@ -144,7 +144,7 @@ class StepTask(DeclaredTask):
     def _of_another_kind(self, function: Any) -> Iterable[str]:
         """List arguments of which the type or the number is wrong."""
         if not callable(function):
-            yield f"step={function!r} is no function"
+            yield f"step={function!r} is not a function"
         elif hasattr(function, "py_func") and self.signature == "dicts":
             yield 'a compiled function takes no dicts: set signature="arrays"'
         if self.signature not in ("dicts", "arrays"):
@@ -163,20 +163,20 @@ class StepTask(DeclaredTask):
             if state.mechanism is not None:
                 yield (
                     f"{state.name!r} has a mechanism, but the step function moves it; "
-                    "what is computed from states belongs into outcomes="
+                    "variables computed from states belong into outcomes="
                 )
             for parent in state.parents:
                 if parent.name not in given and parent.when != "set":
                     yield (
-                        f"{parent.name!r}, a parent of {state.name!r}, is no parameter, state or "
-                        "action: the step function is not given it"
+                        f"{parent.name!r}, a parent of {state.name!r}, is not a parameter, state "
+                        "or action: the step function is not given it"
                     )
         for action in self.actions:
             if action.dtype != "real":
                 yield f"{action.name!r}: actions are real numbers; round it in the step function"
         for name, source in self.noise.items():
             if not hasattr(source, "n_uniforms"):
-                yield f"noise: {name!r} is no distribution: {source!r}"
+                yield f"noise: {name!r} is not a distribution: {source!r}"
             elif source.parents():
                 yield f"noise: {name!r} must not follow variables; scale it in the step function"
 

@@ -222,7 +222,7 @@ class BackendConformance(ABC):
         self.check_parameters(backend.parameters(keys), given)
 
     def test_a_state_is_read_back(self, backend: Backend) -> None:
-        """The engine reports the state as it was set; what it reports stays that of the step."""
+        """The engine reports the state as it was set; reported values stay those of the step."""
         before = backend.read()
         for changed in self.changed_states(before):
             backend.apply(Difference(state=changed))
@@ -314,7 +314,7 @@ class BackendConformance(ABC):
 
     @pytest.mark.parametrize("threads", [1, 2, 4])
     def test_a_batch_is_one_after_another(self, scene: Scene, threads: int) -> None:
-        """Scenes that are stepped together do, bit for bit, what they do alone.
+        """Scenes that are stepped together give the same bits as alone.
 
         Between two steps each can be read, changed, saved, restored and stepped by itself.
         """

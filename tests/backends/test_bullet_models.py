@@ -691,7 +691,7 @@ def test_parameters_that_bullet_lacks(backend: BulletBackend) -> None:
     expected = play(backend, 3)
     backend.build(scene)
     heavier = {("box", "mass"): np.array(2.0), ("", "impratio"): np.array(3.0)}
-    with pytest.raises(NotIntervenable, match=r"'impratio' is no parameter on Bullet"):
+    with pytest.raises(NotIntervenable, match=r"'impratio' is not a parameter on Bullet"):
         backend.apply(Difference(parameters=heavier))
     np.testing.assert_array_equal(play(backend, 3), expected)
     with pytest.raises(NotIntervenable, match="keeps its default"):

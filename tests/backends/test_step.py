@@ -328,7 +328,7 @@ def divides(parameters: Any, state: Any, action: Any, noise: Any) -> Mapping[str
     ("function", "message"),
     [
         (forgets, "'y' is missing; 'n' is missing"),
-        (invents, "'z' is no state"),
+        (invents, "'z' is not a state"),
         (flattens, r"'y' must have shape \(3,\), not \(2,\)"),
         (breaks, "'y' has a number that is not finite"),
         (halves, r"'n' must be whole numbers of at most 2\*\*53, not \[0.5\]"),

@@ -132,5 +132,5 @@ def test_what_fails_or_is_no_truth_value_is_named() -> None:
         env = gymnasium.make(MODEL, model=Falling(terminated=(wrong, PLACE)))
         with pytest.raises(FunctionFailure, match=words):
             env.reset(seed=0)
-    with pytest.raises(ModelError, match="terminated=3 is no declaration"):
+    with pytest.raises(ModelError, match="terminated=3 is not a declaration"):
         World(Falling(terminated=3))

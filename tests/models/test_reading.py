@@ -428,7 +428,7 @@ def test_the_root_of_a_urdf_can_be_free() -> None:
     ("source", "error", "message"),
     [
         ("nowhere.xml", UnreadableFile, "'nowhere.xml' cannot be read: no such file"),
-        (3, ModelError, "3 is no model: give the path of an .xml, .mjcf or .urdf file"),
+        (3, ModelError, "3 is not a model: give the path of an .xml, .mjcf or .urdf file"),
         ("<html/>", ModelError, "begins with <html>: give MJCF"),
         ("<mujoco><worldbody>", ModelError, "MuJoCo cannot read the XML text: XML parse error"),
         ("<mujoco><wordbody/></mujoco>", ModelError, "unrecognized element"),

@@ -467,13 +467,13 @@ PLACE = Measured(name="place", shape=(2,))
         ),
         ({"states": [Measured(name="place", parents=("wind",))]}, "'wind', a parent of 'place'"),
         ({"noise": 3}, "noise=3 is not a dict"),
-        ({"noise": {"place": 0.1}}, "'place' is no distribution: 0.1"),
+        ({"noise": {"place": 0.1}}, "'place' is not a distribution: 0.1"),
         (
             {"noise": {"place": Box(0.0, Affine(parent="drift", scale=1.0))}},
             "must not follow variables",
         ),
         ({"parameters": [Exogenous(name="place")], "states": [PLACE]}, "place"),
-        ({"reward": 3.0}, "reward=3.0 is no declaration"),
+        ({"reward": 3.0}, "reward=3.0 is not a declaration"),
     ],
 )
 def test_a_declaration_that_cannot_be_meant(options: dict[str, Any], message: str) -> None:

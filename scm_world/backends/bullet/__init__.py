@@ -31,7 +31,7 @@ class Record:
     Attributes:
         past: All up to the last step.
         last: The world after it.
-        now: The world with what was changed since.
+        now: The world with the changes since.
         world: That from which live bodies come to the present by taking on parameters alone: the
             past, or a canonical one.
         saved: The engine's own state after the last step, if one was kept.
@@ -46,7 +46,7 @@ class Record:
 
 @final
 class BulletBackend(Backend):
-    """Bullet, through pybullet: what it can honour of a ``Model``.
+    """Bullet, through pybullet: the part of a ``Model`` that it can honour.
 
     The engine cannot set a state exactly, because contact caches survive. So a state is set by
     bringing about a *canonical* world, which is a function of parameters and state alone. It is
@@ -193,7 +193,7 @@ class BulletBackend(Backend):
         return EngineSnapshot.of(self, self._at)
 
     def restore(self, snapshot: EngineSnapshot) -> None:
-        """Go back to a snapshot."""
+        """Restore a snapshot."""
         self._at = snapshot.opened(self)
         self.client()
 

@@ -3,7 +3,7 @@
 What can move is one multibody for each free body with what hangs on it, and one for all that hangs
 on the world. A body is one link for each of its joints, all but the last without mass. Its first
 shape is that of the last link; each further one is a link without mass that is fixed there, so that
-shapes of one body can differ in what they touch. A shape that cannot move is a body by itself.
+shapes of one body can differ in their contacts. A shape that cannot move is a body by itself.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class EngineBody:
 def renewed(
     engine: Any, before: list[EngineBody], mj: mujoco.MjModel, touching: list[int]
 ) -> list[EngineBody]:
-    """Make what is missing, remove what is not needed, and return all units.
+    """Make missing units, remove those not needed, and return all.
 
     Everything stays in one order: what comes after something new is new, too.
     """
@@ -348,7 +348,7 @@ def _corners(mj: mujoco.MjModel, geom: int, origin: Floats | None) -> bytes:
 
 @lru_cache(maxsize=1024)
 def _kept(vertices: bytes) -> list[list[float]]:
-    """Make a list, always the same one: the engine never lets go of what it is given."""
+    """Make a list, always the same one: the engine never releases its arguments."""
     found: list[list[float]] = np.frombuffer(vertices).reshape(-1, 3).tolist()
     return found
 
@@ -359,7 +359,7 @@ def custom(mj: mujoco.MjModel, name: str, index: int = 0) -> float:
     ``bullet_damping`` is what multibodies lose of their speed in a second, roughly: what hangs on
     the world, and free bodies. ``bullet_early_end`` is the residual at which the solver ends.
     ``bullet_explicit_servos`` says that actuators act with the speed before a step: one that brakes
-    with the speed after it, as if nothing were touched, presses too little on what it touches.
+    with the speed after it, as if nothing were touched, presses too little on touched bodies.
     """
     number = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_NUMERIC, name)
     return 0.0 if number < 0 else float(mj.numeric_data[mj.numeric_adr[number] + index])

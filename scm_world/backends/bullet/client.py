@@ -27,7 +27,7 @@ from scm_world.models.scene import ParameterKey, Parameters
 
 _OFF = mujoco.mjtDisableBit
 SMOOTH = int(_OFF.mjDSBL_CONSTRAINT) | int(_OFF.mjDSBL_AUTORESET)
-"""What is switched off while MuJoCo computes smooth forces."""
+"""Flags that are off while MuJoCo computes smooth forces."""
 
 SOLVER_ITERATIONS = 50  # with 20, towers spike at 40 mm/s
 
@@ -170,7 +170,7 @@ class Client:
     # --- bodies ----------------------------------------------------------------------------------
 
     def replay(self, world: Past) -> None:
-        """Bring about a world, independently of what was here before.
+        """Build a world, independently of the one before.
 
         Bodies stay where all their shapes stay; all else that depends on the past, the contact
         caches, is cleared by entering the collision objects again, always in one order.
@@ -190,7 +190,7 @@ class Client:
         self.holds = world
 
     def _construct(self, model: Model, parameters: Parameters) -> None:
-        """Make what differs from what is there, and what live bodies cannot take on."""
+        """Build the units that differ, and those with changes that live bodies cannot take on."""
         stays = self._model == model and alike(self._parameters, parameters, rebuilt(model))
         if self._model != model:
             self.twin = Realization(model, parameters)
@@ -241,7 +241,7 @@ class Client:
     # --- parameters ------------------------------------------------------------------------------
 
     def edit(self, parameters: Parameters) -> None:
-        """Change parameters that need no new bodies. What is in force already is left alone."""
+        """Change parameters that need no new bodies. Values already in force are left alone."""
         if parameters is self._parameters:
             return
         fresh = {k: v for k, v in parameters.items() if self._parameters.get(k) is not v}
@@ -421,14 +421,14 @@ class Client:
     # --- saved states ----------------------------------------------------------------------------
 
     def save(self) -> SavedState:
-        """Keep the engine's own state in this process as long as what is returned is held."""
+        """Keep the engine's own state in this process as long as the returned object is held."""
         self._free(number for number, saved in self._saved.items() if saved() is None)
         saved = SavedState(self.engine.saveState(), self.twin.data.act.copy())
         self._saved[saved.number] = weakref.ref(saved)
         return saved
 
     def load(self, saved: SavedState) -> bool:
-        """Go back to a state if it is kept here. Parameters are not part of it."""
+        """Restore a state if it is kept here. Parameters are not part of it."""
         if all(kept() is not saved for kept in self._saved.values()):
             return False
         self.twin.data.act[:] = saved.activations

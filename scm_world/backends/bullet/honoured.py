@@ -1,4 +1,4 @@
-"""What of a model the engine can honour, and what it cannot."""
+"""The parts of a model that the engine can honour, and those it cannot."""
 
 from __future__ import annotations
 
@@ -55,7 +55,11 @@ def unsupported(model: Model) -> tuple[str, ...]:
         ("actuator", working & adhesion, "the actuator {!r}, which acts by contact"),
         ("actuator", working & (mj.actuator_armature != 0.0), "armature of the actuator {!r}"),
         ("flex", np.ones(mj.nflex), "the flex {!r}"),
-        ("geom", touching & odd, "the geom {!r}, which is no box, ball, capsule, cylinder or mesh"),
+        (
+            "geom",
+            touching & odd,
+            "the geom {!r}, which is not a box, ball, capsule, cylinder or mesh",
+        ),
         ("geom", touching & surface, "adhesion or moving surface of the geom {!r}"),
         ("pair", own, "the pair {!r}, whose friction is not the product of those of its shapes"),
         ("body", mj.body_mocapid >= 0, "the mocap body {!r}"),
@@ -123,7 +127,7 @@ def _check(row: Parameter, honoured: bool, value: Floats) -> None:
     if not honoured and not np.array_equal(np.broadcast_to(row.default, row.shape), value):
         raise NotIntervenable(
             row.name,
-            f"is no parameter on Bullet: there it keeps its default {row.default}; use "
+            f"is not a parameter on Bullet: there it keeps its default {row.default}; use "
             "backend='mujoco'",
         )
 

@@ -103,7 +103,7 @@ class MujocoBackend(Backend):
         return EngineSnapshot.of(self, (*scene, now.numbers(), now.memory(), touches, replay))
 
     def restore(self, snapshot: EngineSnapshot) -> None:
-        """Go back to a snapshot."""
+        """Restore a snapshot."""
         structure, parameters, revision, numbers, memory, touches, replay = snapshot.opened(self)
         now: Realization | None = vars(self).get("realization")
         if now is None or now.revision is not revision:

@@ -55,7 +55,7 @@ class Simulations:
         self.taken[index] = 0
 
     def give_back(self, index: int, scene: Realization) -> None:
-        """Copy everything that the last step left, or what it takes to compute it again."""
+        """Copy everything that the last step left, or the numbers that give it again."""
         if scene.lean and self.taken[index]:
             mujoco.mj_setState(scene.model, scene.data, self.batch.state[index], STATE)
             scene.replay = self.before[index].copy(), int(self.taken[index])

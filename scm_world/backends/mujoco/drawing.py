@@ -94,7 +94,7 @@ class VisibleModel:
         mujoco.mj_kinematics(self.model, self.data)
 
     def shapes(self) -> Shapes:
-        """Copy what is shown: geoms, sites, tendons, height fields, flexes and skins."""
+        """Copy all visible parts: geoms, sites, tendons, height fields, flexes and skins."""
         model, data, rows, kinds = self.model, self.data, self._rows, self._kinds
         halves = model.geom_size[rows[:, None], self._columns]
         halves[kinds == CAPSULE, 2] += halves[kinds == CAPSULE, 0]
@@ -147,7 +147,7 @@ class VisibleModel:
 
     @cached_property
     def _abstract(self) -> tuple[mujoco.MjvScene, mujoco.MjvOption]:
-        """The abstract scene, and what it shows: no geoms."""
+        """The abstract scene, here without geoms."""
         option = mujoco.MjvOption()
         option.geomgroup[:] = 0
         return mujoco.MjvScene(self.model, MOST_SHAPES), option

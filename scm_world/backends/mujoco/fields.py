@@ -1,6 +1,6 @@
 """The parameters of a compiled model: for each kind of elements a table of rows.
 
-What may be changed, and what has to follow, is MuJoCo's own table (*Programming, Simulation,
+Which fields may be changed, and which follow, is MuJoCo's own table (*Programming, Simulation,
 mjModel changes*); every class was tried on foreign models by writing, undoing and comparing all
 arrays bit by bit. Since MuJoCo 3.16 ``mj_setConst`` derives the bounds of shapes from their sizes
 and places, so that nothing here needs another compilation.
@@ -116,7 +116,7 @@ class Element:
     Attributes:
         mj: The model, which is only read.
         data: The state in which episodes begin.
-        trees: Of the model.
+        trees: Kinematic trees of the model.
         kind: See ``ROWS``.
         i: Its number among those of its kind.
         name: Its name.
@@ -174,7 +174,7 @@ class Element:
         In a unit, {L} is that of the coordinate, {F} of a force and {I} of an inertia along it.
         ``where`` names the arrays of the value (see ``slots.at``) or finds it, ``index`` is its
         place in them (the number of the element if None), and ``form`` makes a slot of the views.
-        Constants of the model follow what is ``constant`` (``mj_setConst``). A default below
+        Constants of the model follow ``constant`` fields (``mj_setConst``). A default below
         ``low`` is the lower bound. The flags ``off`` of the model disable it; where it does not
         act, ``reason`` says why. ``effect`` has the trees it acts on; those of the element if None.
         """
@@ -436,7 +436,7 @@ def _actuator(e: Element) -> Rows:
     if e["trntype"] in (int(_TRN.mjTRN_JOINT), int(_TRN.mjTRN_JOINTINPARENT)):
         gears = {FREE: 6, BALL: 3}.get(int(e.mj.jnt_type[e["trnid"][0]]), 1)
     if gears:
-        yield e.row("gear", "1", "Factor from the force of the actuator to that on what it moves.",
+        yield e.row("gear", "1", "Factor from the force of the actuator to that on its target.",
             "actuator_gear", (int(e["outadr"]), _columns(gears)), constant=True, **acts)
     kind, about = servo(e.mj, e.i), "Force of the servo for each unit of"
     for which, attribute, unit, what, places in (
@@ -475,7 +475,7 @@ def _actuator(e: Element) -> Rows:
     yield e.row("forcerange", "{F}", "Range to which its force is clipped.",
         "actuator_forcerange", usual=False, acts=drives and e["forcelimited"], reason=unlimited)
     for what in ("damping", "armature"):
-        yield e.row(what, "1", f"The {what} that the actuator adds to what it moves.",
+        yield e.row(what, "1", f"The {what} that the actuator adds to its target.",
             f"actuator_{what}", constant=True, low=0.0, usual=e[what], **acts)
 
 
@@ -563,7 +563,7 @@ def element_names(mj: mujoco.MjModel) -> Mapping[str, tuple[str, ...]]:
 def _made(
     mj: mujoco.MjModel, kind: str, i: int, names: list[str], found: Mapping[str, tuple[str, ...]]
 ) -> str:
-    """Name an element that has no name: after its body, its shapes or what it acts on."""
+    """Name an element that has no name: after its body, its shapes or its target."""
     match kind:
         case "body":
             parent = int(mj.body_parentid[i])

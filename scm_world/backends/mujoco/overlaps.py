@@ -1,6 +1,6 @@
 """Which bodies are in one place: MuJoCo's collision detection, on a model of its own.
 
-A scene is looked at where it would be, before any engine realises it. What can touch is what is
+A scene is checked before any engine realises it. Shapes that can touch are those that are
 compared: pairs that the file excludes, parents and their children, and fixed bodies are not.
 """
 

@@ -80,11 +80,11 @@ def read_model(
     Args:
         source: A path to an MJCF or URDF file, XML text, a ``mujoco.MjSpec`` or a
             ``mujoco.MjModel``. It is not changed.
-        name: Of the model; the one in the file if None.
+        name: Name of the model; the one in the file if None.
         expose: Patterns of the parameters that can be set: ``"*.mass"``, ``"cube.*"``. A pattern
             that ends in ``*`` means the usual attributes; the others are exposed where they are
             named, as in ``["*", "*.solref"]``. All usual ones if None.
-        readouts: Names of what is computed from the states: ``"tip.position"``,
+        readouts: Names of quantities computed from the states: ``"tip.position"``,
             ``"tip.orientation"``, ``"tip.linear_velocity"``, ``"tip.angular_velocity"`` of sites,
             bodies and shapes, and ``"imu.value"`` of sensors.
         fixed_base: Whether the root link of a URDF is fixed to the world.
@@ -107,8 +107,8 @@ def read_model(
             ``{"fingertip": "lower_link"}``.
 
     Raises:
-        UnreadableFile: There is no such file, or it is no text.
-        ModelError: It is no model, or one that cannot be a causal model; or a pattern or readout
+        UnreadableFile: There is no such file, or it is not text.
+        ModelError: It is not a model, or one that cannot be a causal model; or a pattern or readout
             names nothing; or states are left out.
         UnknownOption: A setting or keyframe does not exist.
     """
@@ -183,7 +183,7 @@ def compiled(model: Model) -> mujoco.MjModel:
 
 
 def _check(mj: mujoco.MjModel, where: str) -> None:
-    """Refuse what has effects that no graph could declare."""
+    """Refuse elements whose effects no graph could declare."""
     problems = []
     if mj.nv == 0:
         hint = "add a joint, or a freejoint; for a URDF, fixed_base=False lets its root link move"
@@ -195,7 +195,7 @@ def _check(mj: mujoco.MjModel, where: str) -> None:
             what = "needs a callback of the user; give it one of MuJoCo's own types"
             problems.append(f"the actuator {name!r} {what}")
         if mj.actuator_historyadr[i] >= 0:
-            what = "acts with a delay, and what it remembers is no state; remove delay and nsample"
+            what = "acts with a delay, and its memory is not a state; remove delay and nsample"
             problems.append(f"the actuator {name!r} {what}")
     if getattr(mj, "nplastic", 0):  # since MuJoCo 4
         what = "plastic springs or flexes, whose rest shape is a hidden state"
@@ -269,7 +269,7 @@ def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator
         few = mj.opt.iterations
         yield (
             f"With {few} iteration{'s' * (few > 1)} the solver has to begin with the solution of "
-            "the last step; here every step begins anew, because that solution is no variable. "
+            "the last step; here every step begins anew, because that solution is not a variable. "
             f"After {steps * mj.opt.timestep:g} s without commands, "
             f"MuJoCo with the file as it is differs by up to {most:.2g} rad or m; "
             "<option iterations='100' ls_iterations='50'/> makes that small."
@@ -277,7 +277,7 @@ def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator
 
 
 def _notes(mj: mujoco.MjModel, keyframe: str | int | None, staged: bool) -> Iterator[str]:
-    """List what acts without having a variable, and what is not used."""
+    """List elements that act without having a variable, and elements that are not used."""
     if mj.nflex:
         yield f"{mj.nflex} flex(es) act through their vertices; their material has no variables."
     if staged:
@@ -371,7 +371,7 @@ def _moving(
     data: mujoco.MjData,
     frame: Literal["body", "world"],
 ) -> tuple[dict[str, StateRow], list[ModelRow]]:
-    """Describe what moves, in MuJoCo's order, what is reported, and the components of a command.
+    """Describe the states in MuJoCo's order, the reported values, and the components of a command.
 
     The data are those of the beginning.
     """

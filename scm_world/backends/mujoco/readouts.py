@@ -56,12 +56,12 @@ class Computed:
     """A function of states and parameters, in this order: a pose, a velocity, or a sensor.
 
     Attributes:
-        source: Of the model.
+        source: Source of the model.
         states: For each state, which numbers of ``"qpos"``, ``"qvel"`` or ``"act"`` it is, and in
             which frame it is given; see ``StateRow``.
         finders: Places of the parameters.
-        kind: Of the element: ``"site"``, ``"body"``, ``"geom"`` or ``"sensor"``.
-        index: Of the element.
+        kind: Kind of the element: ``"site"``, ``"body"``, ``"geom"`` or ``"sensor"``.
+        index: Index of the element.
         attribute: Attribute of the element that is computed.
     """
 
@@ -91,7 +91,7 @@ class Computed:
         if any(slot.constant for slot in slots):
             mujoco.mj_setConst(mj, scratch)
         if self.kind == "sensor":
-            # MuJoCo keeps what it computed for an earlier sensor until the velocity stage is over,
+            # MuJoCo keeps the results for an earlier sensor until the velocity stage is over,
             # which sensors of the position stage (e_kinetic is one) do not reach here.
             data.flg_energyvel = data.flg_subtreevel = False
             mujoco.mj_fwdPosition(mj, data)
@@ -136,7 +136,7 @@ _SENSORS = {
 frames that it compares, or all states and parameters."""
 _MEMORY = (
     "it measures forces or accelerations, the time, or what a callback, a plugin or a delay "
-    "decides, which is no function of the state alone"
+    "decides, which is not a function of the state alone"
 )
 
 
@@ -147,7 +147,7 @@ def find_readouts(
     parameters: Sequence[Parameter],
     wanted: Sequence[str],
 ) -> Iterator[Readout]:
-    """Describe what was asked for: ``"tip.position"``, ``"body:tip.position"``, ``"imu.value"``."""
+    """Describe readouts by name: ``"tip.position"``, ``"body:tip.position"``, ``"imu.value"``."""
     finder = _Finder(mj, source, states, [row for row in parameters if not row.visual])
     problems = []
     for name in wanted:
@@ -179,7 +179,7 @@ class _Finder:
             self.joints[row.name] = [int(joint) for joint in found]
 
     def find(self, name: str) -> Readout | str:
-        """Describe a readout, or return what is wrong with its name."""
+        """Describe a readout, or return why its name is refused."""
         prefix, _, plain = name.rpartition(":")
         element, _, attribute = plain.rpartition(".")
         sought = ("sensor",) if attribute == "value" else (*_OBJECTS,)

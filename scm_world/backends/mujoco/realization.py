@@ -50,7 +50,7 @@ class Realization:
     The parameters that it is made with are all that differ from it, and all that are compared.
 
     Attributes:
-        structure: What was compiled.
+        structure: The compiled structure.
         model: With the present parameters.
         data: With the present state.
         kept: The parameters in force; at first, none has been written.
@@ -103,7 +103,7 @@ class Realization:
             into[self._spins] = self._written[self._spins]
 
     def place(self, vector: Floats) -> None:
-        """Write a state; all else stays as it is. What is as the last step left it stays exact."""
+        """Write a state; all else stays as it is. Values that the last step left stay exact."""
         motion = vector[self._places]
         if self._names:
             names, known, exact = self._remembered()
@@ -140,7 +140,7 @@ class Realization:
         self._counts[:] = 1
 
     def forget(self) -> None:
-        """Forget what was before a step that is made now."""
+        """Forget the state before a step that is made now."""
         self.replay = self._last = self._written = None
 
     def step(self, command: Floats, substeps: int) -> str:
@@ -188,11 +188,11 @@ class Realization:
         return numbers
 
     def memory(self) -> Any:
-        """Return what has to be kept in addition to ``mjSTATE_INTEGRATION``; it can be pickled."""
+        """Return the state beside ``mjSTATE_INTEGRATION``; it can be pickled."""
         return None if self.lean else (self._forces.copy(), self._last, self._written)
 
     def recall(self, numbers: Floats, memory: Any) -> None:
-        """Restore what was kept."""
+        """Restore the state that was kept."""
         mujoco.mj_setState(self.model, self.data, numbers, STATE)
         self._counts[:] = 1
         self.replay = None
@@ -216,6 +216,13 @@ class Realization:
         """Which shapes touch with coefficients of their own, shape (ngeom, ngeom)."""
         return Couplings(self._compiled).dynamic
 
+    @cached_property
+    def _frictions(self) -> dict[str, int]:
+        """The numbers of the shapes whose own friction may not count, by the names of elements."""
+        names = fields.element_names(self._compiled)["geom"]
+        shapes = {name: n for n, name in enumerate(names) if self._dynamic[n].any()}
+        return shapes | {f"geom:{name}": n for name, n in shapes.items()}
+
     def remarks(self, before: Parameters) -> tuple[str, ...]:
         """List with which shapes a friction that was changed has no effect.
 
@@ -223,17 +230,16 @@ class Realization:
             MuJoCo, *Computation, Contact*: of two shapes the one with the higher priority decides,
             and with equal priorities the larger of each of their coefficients.
         """
-        mj, names = self.model, fields.element_names(self._compiled)["geom"]
-        found = []
+        mj, found = self.model, []
         for (element, attribute), old in before.items():
-            name = element.removeprefix("geom:")
-            if attribute not in fields.FRICTIONS or name not in names:
+            if attribute not in fields.FRICTIONS or element not in self._frictions:
                 continue
-            geom, column = names.index(name), fields.FRICTIONS.index(attribute)
+            geom, column = self._frictions[element], fields.FRICTIONS.index(attribute)
             rank, theirs = mj.geom_priority, mj.geom_friction[:, column]
             larger = (rank == rank[geom]) & (theirs >= max(float(old), theirs[geom]))
             others = np.flatnonzero(self._dynamic[geom] & ((rank > rank[geom]) | larger))
             if len(others):
+                names = fields.element_names(self._compiled)["geom"]
                 shown = [f"{names[i]} ({theirs[i]:g})" for i in others[:4].tolist()]
                 more = f" and {len(others) - 4} more" if len(others) > 4 else ""
                 found.append(

@@ -49,8 +49,8 @@ def place(
 ) -> Slot:
     """Return the slot of a value that stands in some views of arrays, alike in all of them.
 
-    ``to`` returns what MuJoCo keeps of a value, and ``back`` the value of what stands in the first
-    view.
+    ``to`` returns the numbers that MuJoCo keeps of a value, and ``back`` the value of those in the
+    first view.
     """
 
     def write(value: Floats) -> None:

@@ -35,7 +35,7 @@ class Source:
 
     Attributes:
         binary: What ``mj_saveModel`` writes (MJB).
-        version: Of the MuJoCo that wrote it; no other one reads it.
+        version: Version of the MuJoCo that wrote it; no other one reads it.
     """
 
     binary: bytes = field(repr=False)
@@ -111,7 +111,7 @@ def read_source(
         plugins = f" ({', '.join(sorted({plugin.plugin_name for plugin in spec.plugins}))})"
     if mj.nplugin:
         what = f"{where} uses {mj.nplugin} plugin(s){plugins}"
-        raise ModelError([f"{what}: what they act on is unknown; remove them"])
+        raise ModelError([f"{what}: their targets are unknown; remove them"])
     for option, value in options.items():
         _set_option(mj.opt, option, value)
     binary = np.empty(mujoco.mj_sizeModel(mj), np.uint8)
@@ -147,7 +147,7 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
         included = _included(text, path.parent)
     else:
         kinds = "an .xml, .mjcf or .urdf file, XML text, a mujoco.MjSpec or a mujoco.MjModel"
-        raise ModelError([f"{source!r} is no model: give the path of {kinds}"])
+        raise ModelError([f"{source!r} is not a model: give the path of {kinds}"])
     plain = re.sub(r"<!--.*?-->|<\?.*?\?>|<!DOCTYPE[^>]*>", "", text, flags=re.DOTALL)
     found = re.search(r"<\s*([\w:.-]+)", plain)
     tag = found[1] if found else ""
@@ -171,7 +171,7 @@ def _contents(path: Path) -> str:
     except OSError as error:
         raise UnreadableFile(str(path), (error.strerror or str(error)).lower(), advice) from error
     if "\0" in text:
-        raise UnreadableFile(str(path), "it is no text", advice)
+        raise UnreadableFile(str(path), "it is not text", advice)
     return text.replace("\r\n", "\n")
 
 
@@ -239,7 +239,7 @@ def _check_names(text: str, where: str) -> None:
     """Refuse links and moving joints of a URDF that share a name, which MuJoCo would leave out."""
     try:
         root = ElementTree.fromstring(text)  # noqa: S314 # expat bounds what entities become
-    except ElementTree.ParseError:  # MuJoCo minds less, or says what is wrong
+    except ElementTree.ParseError:  # MuJoCo accepts more, or says which line is wrong
         return
     parts = [(part.tag, part.get("name")) for part in root if part.get("type") != "fixed"]
     problems = [

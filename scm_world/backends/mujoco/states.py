@@ -53,7 +53,7 @@ def read_rows(
     """Write some rows of motions as states; return the last that is not finite, or -1.
 
     ``places`` has where in a state each number of a motion is, ``reported`` the places in
-    ``qfrc_actuator`` and in a state of what is reported (2, m), and ``turned`` those of quaternion
+    ``qfrc_actuator`` and in a state of reported values (2, m), and ``turned`` those of quaternion
     and angular velocity of each turned body in a state (n, 7).
     """
     wrong = -1

@@ -139,7 +139,7 @@ class Couplings:
         return self.always(trees, [geom])
 
     def site(self, site: int) -> Effect:
-        """Return the effect of the place of a site: on what is attached to it."""
+        """Return the effect of the place of a site: on the elements attached to it."""
         return self.always(
             NONE.union(*(link.trees for link in self._all_links() if site in link.sites))
         )
@@ -150,11 +150,11 @@ class Couplings:
         return self.touching(self._moving(self._mj.geom_bodyid[geoms])) if self._touch else NOTHING
 
     def tendon(self, tendon: int) -> Effect:
-        """Return the effect of a tendon: on what it reaches."""
+        """Return the effect of a tendon: on the bodies it reaches."""
         return self.always(self.links["tendon"][tendon].trees)
 
     def equality(self, equality: int) -> Effect:
-        """Return the effect of an equality constraint: on what it joins."""
+        """Return the effect of an equality constraint: on the bodies it joins."""
         off = disabled(self._mj, _OFF.mjDSBL_EQUALITY)
         return NOTHING if off else self.always(self.links["equality"][equality].trees)
 
@@ -320,7 +320,7 @@ class Couplings:
 
 
 def _groups(n: int, links: Iterable[Iterable[int]]) -> list[Trees]:
-    """Merge what is linked, directly or through others; return the group of each."""
+    """Merge linked trees, directly or through others; return the group of each."""
     group = [frozenset([i]) for i in range(n)]
     for link in links:
         joined = NONE.union(*(group[i] for i in link))

@@ -17,7 +17,7 @@ from scm_world.models.shapes import GOAL_OPACITY
 
 @final
 class Viewer:
-    """A window that shows what it is given; it simulates nothing."""
+    """A window that shows scenes; it simulates nothing."""
 
     def __init__(self) -> None:
         self._backend = MujocoBackend()

@@ -58,7 +58,7 @@ def shapes_of(scene: Scene, *, goals: bool = True) -> Shapes:
 def background_of(scene: Scene, *, obstacles: bool = True) -> Shapes:
     """Collect what pictures of the goals of a scene show: nothing that moves.
 
-    In scenes whose structure has ``Views``, these say what is shown besides the goals.
+    In scenes whose structure has ``Views``, these list the bodies shown besides the goals.
     """
     views = views_of(scene.structure)
     shown, hidden = (scene, None) if views is None else views.background(scene, obstacles)
@@ -72,7 +72,7 @@ def background_of(scene: Scene, *, obstacles: bool = True) -> Shapes:
 
 USUAL_SIZE = 480, 640  # [pixels] height and width of a picture for people
 THREE_QUARTER = np.array([0.5, -1.0, 0.5]) / np.sqrt(1.5)
-"""From what is seen towards an automatic camera."""
+"""From the scene towards an automatic camera."""
 
 AUTOMATIC = "automatic"
 FIELD_OF_VIEW = 40.0  # [deg] of an automatic camera
@@ -83,7 +83,7 @@ STILL = 0.05  # of the distance: how far from the middle of a picture is near it
 @final
 @dataclass(frozen=True)
 class RenderedImage:
-    """A picture, and what is in it.
+    """A picture, and the bodies in it.
 
     Attributes:
         rgb: Shape (h, w, 3), 0 to 255; of shape (0, 0, 3) without colors.
@@ -91,7 +91,7 @@ class RenderedImage:
         segmentation: Which body a pixel shows, shape (h, w): an index into ``names``, or -1 where
             there is nothing. Goals are no bodies: they color pixels, but have neither depth nor
             number.
-        names: Of the bodies.
+        names: Names of the bodies.
     """
 
     rgb: NDArray[np.uint8]
@@ -100,7 +100,7 @@ class RenderedImage:
     names: tuple[str, ...]
 
     def shows(self, name: str) -> NDArray[np.bool_]:
-        """Tell which pixels show a body, shape (h, w)."""
+        """Return which pixels show a body, shape (h, w)."""
         if name not in self.names:
             raise UnknownOption("body", name, self.names)
         mask: NDArray[np.bool_] = self.segmentation == self.names.index(name)
@@ -189,7 +189,7 @@ def scene_camera(
     """Find a camera for a picture of a scene.
 
     Args:
-        scene: What is to be seen.
+        scene: The scene to draw.
         camera: Any camera, or the name of one: of the robot's tasks ``"overview"``, ``"60"``,
             ``"120"`` or ``"300"``; of a model one that its file names, where it stands now, or
             ``"automatic"``: see ``automatic_camera``. If not given, ``"overview"`` or
@@ -234,7 +234,7 @@ def automatic_camera(shapes: Shapes, size: tuple[int, int] = USUAL_SIZE) -> Came
 
 
 def _looking(at: Floats, offset: Floats, size: tuple[int, int]) -> Camera:
-    """Place a camera at an offset from what it looks at."""
+    """Place a camera at an offset from its target."""
     distance = float(np.linalg.norm(offset))
     return Camera(
         AUTOMATIC,
@@ -265,7 +265,7 @@ def following_camera(camera: Camera, shapes: Shapes) -> Camera:
 
 
 def png(rgb: NDArray[np.uint8]) -> bytes:
-    """Encode a picture of shape (h, w, 3) as PNG, without filters: what is drawn is flat.
+    """Encode a picture of shape (h, w, 3) as PNG, without filters: the drawing is flat.
 
     Source:
         W3C, *Portable Network Graphics (PNG) Specification*, second edition, 2003.
@@ -296,7 +296,7 @@ def camera_pixels(
     goals: bool = False,
     published: bool = False,
 ) -> None:
-    """Draw what cameras see now, without goals and shadows, or what they should see.
+    """Draw the present view of cameras, without goals and shadows, or the view of the goals.
 
     Colors are those of ``render`` wherever no shadow falls. Pictures of the goals show them as
     silhouettes, and nothing that moves, so they can be kept until an intervention; in the tasks of

@@ -51,7 +51,7 @@ class View(NamedTuple):
 
 
 class Canvas(NamedTuple):
-    """What has been seen so far.
+    """The image so far.
 
     Attributes:
         depth: Shape (h, w).
@@ -102,7 +102,8 @@ def _projected(vertices: Floats, position: Floats, rotation: Floats, view: View)
 def _bounds(corners: Floats, near: float, shape: tuple[int, int]) -> tuple[int, int, int, int]:
     """Bound the pixels between corners, homogeneous pixels of shape (k, 3).
 
-    First and last column plus one, the same for rows; what is partly too near can cover any pixel.
+    First and last column plus one, the same for rows; a shape that is partly too near can
+    cover any pixel.
     """
     height, width = shape
     left, right, top, bottom, ahead = math.inf, -math.inf, math.inf, -math.inf, 0
@@ -221,7 +222,7 @@ def _shadow_at(shadow: Shadow, hit: Hit) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _scale(shapes: ShapeTable, n: int) -> tuple[Floats, float]:
-    """Compute the unit of length in the frame of a shape, and half the length of what is round."""
+    """Compute the unit of length in the frame of a shape, and half the length of round shapes."""
     if shapes.kinds[n] == PLANE:
         return np.ones(3), 0.0
     scale = shapes.halves[n].copy()
@@ -335,7 +336,7 @@ def _hit_plane(o: Triple, d: Triple, halves: Floats, near: float) -> Hit:
 
 @njit(cache=True, error_model="numpy")
 def _hit(shapes: ShapeTable, n: int, o: Triple, d: Triple, measures: tuple[float, float]) -> Hit:
-    """Meet a solid or a plane, given the least depth and half the length of what is round."""
+    """Meet a solid or a plane, given the least depth and half the length of round shapes."""
     kind, (near, half) = shapes.kinds[n], measures
     if kind == BOX:
         return _hit_flat(o, d, 0, 1.0, near)
@@ -387,7 +388,7 @@ def draw(
     alpha: float,
     canvas: Canvas,
 ) -> None:
-    """Draw solids and planes, ``which`` of the shapes, over what is there where they are nearer.
+    """Draw solids and planes, ``which`` of the shapes, over the image where they are nearer.
 
     ``light`` is the unit vector towards the light, and the ambient brightness, shape (4,). With an
     opacity ``alpha`` below 1 colors are blended, and depth and owners stay as they are.
@@ -452,11 +453,11 @@ def _edges(corners: Floats, edges: Floats) -> float:
 def draw_mesh(
     mesh: Mesh, shapes: ShapeTable, n: int, view: View, light: Floats, alpha: float, canvas: Canvas
 ) -> None:
-    """Draw triangles over what is there, where they are nearer. Both of their sides are seen.
+    """Draw triangles over the image, where they are nearer. Both of their sides are seen.
 
     The triangle with the homogeneous pixels a, b, c covers the pixel q where the products of q
     with b × c, c × a and a × b have the sign of a · (b × c); it is seen from outside if that is
-    negative. With an opacity below 1, ``canvas.depth`` has to hold the depth of what is nearest,
+    negative. With an opacity below 1, ``canvas.depth`` has to hold the depth of the nearest shape,
     this mesh included; only where the mesh is nearest are colors blended, and the depth there is
     minus infinity afterwards. Owners stay as they are.
 

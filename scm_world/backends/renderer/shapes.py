@@ -29,7 +29,7 @@ from scm_world.models.scene import GoalRegion, Light
 from scm_world.models.shapes import BOX, ELLIPSOID, GOAL_OPACITY, MESH, PLANE, Shapes, mesh_of
 
 NOTHING = -1
-"""What a pixel shows where there is no body."""
+"""Color of a pixel without a body."""
 
 SKY = (178, 199, 222)  # red, green, blue
 SHADOW_TEXELS = 64, 256  # least and most along an edge; between them as many as a picture has rows
@@ -135,7 +135,7 @@ def _draw(
 
 
 def _blend(shapes: Shapes, row: int, view: View, towards: Floats, canvas: Canvas) -> None:
-    """Draw one clear shape over what is there."""
+    """Draw one transparent shape over the image."""
     table, alpha = shapes.table, float(shapes.table.colors[row, 3])
     if table.kinds[row] == MESH:
         mesh, nearest = shapes.meshes[row], canvas.depth - np.float32(TIE)
@@ -168,7 +168,7 @@ def lamp(light: Light) -> Floats:
 
 
 def _shadow(parts: Parts, plane: int, light: Floats, rows: int) -> Shadow:
-    """Look from a plane towards the light, and soften what stands in the way.
+    """Compute the shadow of shapes on a plane, with soft edges.
 
     There is no shadow where the light comes from the side or from below. ``rows`` is the height of
     the picture.

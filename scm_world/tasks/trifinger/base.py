@@ -328,7 +328,7 @@ class TriFingerTask(Task):
         return scenarios(world)
 
     def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
-        """Leave out what is absent, and what is computed from something that is not there.
+        """Leave out absent entities, and variables computed from them.
 
         An entity of which something cannot be computed any more goes as well, such as the places
         of a pile of which a block is missing. The reward sums up the terms that are left.

@@ -29,7 +29,7 @@ OURS = (
     "spinning_friction",
     "torque_limit",
 )
-"""What it does not have."""
+"""Options that it does not have."""
 
 POSE = ("cylindrical_position", "euler_orientation")
 """The coordinates in which the spaces of poses are declared."""

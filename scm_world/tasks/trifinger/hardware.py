@@ -63,7 +63,7 @@ class Inertial(NamedTuple):
 
     Attributes:
         center: Center of mass in the frame of the link, shape (3,) [m].
-        orientation: Of the principal axes in that frame, (x, y, z, w).
+        orientation: Orientation of the principal axes in that frame, (x, y, z, w).
         per_mass: Principal moments divided by the mass, shape (3,) [m²].
     """
 
@@ -144,7 +144,7 @@ class JointGroup:
         fingers: Those that they belong to.
         names: Of ``QUANTITIES``.
         action: Name of their action.
-        of: What they are joints of, for sentences.
+        of: Body of the joints, for sentences.
     """
 
     where: slice

@@ -79,7 +79,7 @@ def point_kernel(
     Args:
         finger: Its number.
         angles: Of its three joints, shape (3,) [rad].
-        height: Of the robot [m].
+        height: Height of the robot [m].
         aside: How far the point lies along the axis of the second joint [m].
         middle: How far along the middle link, as a share of its length.
         lower: How far along the lower link, as a share of its length.
@@ -170,7 +170,7 @@ def forward(joint_positions: ArrayLike, height: float) -> Floats:
 
     Args:
         joint_positions: Shape (9,) [rad].
-        height: Of the robot, measured from the plane below the table top [m].
+        height: Height of the robot, measured from the plane below the table top [m].
 
     Returns:
         The origins of the three tip frames, shape (9,) [m], z from the table top.
@@ -197,8 +197,8 @@ def inverse(targets: ArrayLike, height: float, near: ArrayLike) -> InverseSoluti
     the finger at ``near``.
 
     Args:
-        targets: Of the three tips, shape (9,) [m], z from the table top.
-        height: Of the robot, measured from the plane below the table top [m].
+        targets: Places of the three tips, shape (9,) [m], z from the table top.
+        height: Height of the robot, measured from the plane below the table top [m].
         near: The joint positions to stay close to, shape (9,) [rad].
 
     Returns:

@@ -72,7 +72,7 @@ class TriFingerPlatform(InMemory):
         """Keep the scene; the platform is started with the first step.
 
         Raises:
-            UnknownOption: It is no scene with one cube, or a value is not the platform's.
+            UnknownOption: It is not a scene with one cube, or a value is not the platform's.
         """
         has = scene.structure
         is_one = isinstance(has, TriFinger) and len(has.blocks) == 1
@@ -96,7 +96,7 @@ class TriFingerPlatform(InMemory):
             self._begin()
 
     def step(self, command: Floats, substeps: int) -> None:
-        """Let the fingertips go where a command would bring those of this package's robot.
+        """Move the fingertips to where a command would bring those of this package's robot.
 
         Raises:
             EngineFailure: Torques are commanded, or a number is not finite.
@@ -118,7 +118,7 @@ class TriFingerPlatform(InMemory):
         return EngineSnapshot.of(self, (super().snapshot(), self._first, self._played))
 
     def restore(self, snapshot: EngineSnapshot) -> None:
-        """Go back to a snapshot; the commands before it are repeated with the next step."""
+        """Restore a snapshot; the commands before it are repeated with the next step."""
         scene, first, played = snapshot.opened(self)
         super().restore(scene)
         self._platform, self._first, self._played = None, first, played

@@ -59,7 +59,7 @@ def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
             ``indices``. An episode that is cut off is kept; its steps count from its first row.
 
     Returns:
-        Rows with ``episode``, ``step``, what was observed (vectors are ``NAME[0]``, ``NAME[1]``,
+        Rows with ``episode``, ``step``, observed variables (vectors are ``NAME[0]``, ``NAME[1]``,
         …), ``action``, ``reward`` and ``intervention_targets``.
 
     Raises:
@@ -110,7 +110,7 @@ def _array(data: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Floats
     try:
         found = np.asarray(data[name], dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise UnknownOption(name, f"what is no array of numbers ({error})", allowed) from None
+        raise UnknownOption(name, f"not an array of numbers ({error})", allowed) from None
     if found.shape != shape or not np.isfinite(found).all():
         given = f"of shape {found.shape}" if found.shape != shape else "not finite"
         raise UnknownOption(name, given, allowed)

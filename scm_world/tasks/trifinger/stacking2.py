@@ -82,8 +82,8 @@ class Stacking2(TriFingerTask):
         tool_block_1_position: Where the center of the first block begins: x and y if it stands on
             the floor, or x, y and z [m].
         tool_block_1_orientation: How it begins: quaternion (x, y, z, w).
-        tool_block_2_position: Of the second block; it begins farther away from the first one if
-            they are too large for that.
+        tool_block_2_position: Start of the second block; it begins farther away from the first
+            one if they are too large for that.
         tool_block_2_orientation: Likewise.
         goal_position: Default x and y of the tower, whose lower block is on the floor [m].
         goal_orientation: Default orientation of the tower.

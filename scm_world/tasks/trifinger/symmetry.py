@@ -1,4 +1,4 @@
-"""The robot looks the same after a third of a turn, and so does what it does to a scene."""
+"""The robot looks the same after a third of a turn, and so do its effects on a scene."""
 
 from __future__ import annotations
 

@@ -157,7 +157,7 @@ class TriFinger(Model, Assembly):
         return PhysicalState(self.layout)
 
     def move(self, state: PhysicalState, command: Floats, seconds: float) -> None:
-        """Let blocks drift, without physics; let joints jump, or stay where torques are commanded.
+        """Move blocks and joints without physics: joints jump, or stay under torques.
 
         See ``backends.fake``, as for the two below.
         """

@@ -1,7 +1,7 @@
 """Blocks as a hand and as a planner see them.
 
 The view of a hand is in a frame that is the same however the block's own axes are named. A box
-looks the same after half a turn, and after a quarter with two edges exchanged. What is observed of
+looks the same after half a turn, and after a quarter with two edges exchanged. The observation of
 its pose is not: a learner has to find out that four quaternions are one place. With the task option
 ``views=True`` each block that has a goal has a readout ``BLOCK.view`` without that ambiguity. Its
 axes are those of the block's vertical sides, the first one within 45 degrees of x.
@@ -60,7 +60,7 @@ def view(
         size: Edges of the block, shape (3,) [m].
         position: Of its center, shape (3,) [m].
         orientation: Quaternion (x, y, z, w), shape (4,).
-        goal_position: Of the goal; so too what follows.
+        goal_position: Position of the goal; the same holds for the next arguments.
         goal_orientation: Shape (4,).
 
     Returns:

@@ -34,7 +34,7 @@ NOISE = "wall_noise"
 LAYOUT = "wall.layout"
 RANDOM = 1  # the category of ``wall_pattern``
 
-LOW = 0.25  # [m] what is lower fits under the raised fingers
+LOW = 0.25  # [m] a lower block fits under the raised fingers
 MAX_LEVELS = 10
 MAX_PER_LEVEL = 15
 SHAPE = (MAX_LEVELS, MAX_PER_LEVEL, 3)

@@ -124,7 +124,7 @@ def _clear(joints: Floats, heights: Floats, limit: float) -> NDArray[np.bool_]:
 
 @final
 class BlockWorld(Composition):
-    """The robot, blocks, obstacles, goals and what they stand in.
+    """The robot, blocks, obstacles, goals and the stage.
 
     Args:
         entities: In the order of the observation.

@@ -63,7 +63,7 @@ def keep_lowest_point(position: Floats, *parents: Floats, form: float = 2.0) -> 
     A block that grows does not sink into the floor, and one that shrinks does not hang above it.
 
     Args:
-        position: Of the center, shape (3,) [m].
+        position: Place of the center, shape (3,) [m].
         parents: What ``lowest_point`` takes and what else moves it, before; then the same after.
         form: How many of them ``lowest_point`` takes.
     """

@@ -128,7 +128,7 @@ class Sight:
         if self._version != world.version:  # all else moves only when someone intervenes
             self._intervened(world, values)
         self.tips = self.tips_at(self.joints)
-        self.before = self.joints  # what was commanded last, if anything
+        self.before = self.joints  # the last command, if any
         if world.index > 0:
             last = np.array(world.evaluate(("action",))["action"])
             self.before = self.solve(last) if "effector" in world.options.action_mode else last
@@ -144,7 +144,7 @@ class Sight:
             masses = np.array([*links, hardware.TIP_MASS], dtype=np.float64)
             self.weights[finger, :, 2] = -float(values["gravity"][2]) * masses
         self.aside = self.tips_at(np.array(hardware.ASIDE))  # where unused fingertips are
-        self.walls = world.composition.obstacles  # names of what is in the way and is not moved
+        self.walls = world.composition.obstacles  # names of obstacles that are not moved
         self.solid = (*world.composition.blocks, *self.walls)  # of all that fingers could run into
         self.pairs = [  # blocks, each with its goal
             (tool, goal)

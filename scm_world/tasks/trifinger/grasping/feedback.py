@@ -1,4 +1,4 @@
-"""A grasp by feedback: what it does next follows from where things are, not from the time."""
+"""A grasp by feedback: the next command follows from the poses of bodies, not from the time."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ BESIDE, ASIDE = 0.012, 0.015  # [m] likewise, beyond the opening, of those that 
 STRAIGHT, OBLIQUE = 0.008, 0.02  # [m] along a face, of fingers that close fully, or not at all
 INTO = 0.012  # [m] behind a face, of the place that fingers close towards: they touch at full speed
 NEAR, FAR = 0.008, 0.025  # [m] from above a grip: fingertips come down; they go up first
-FUNNEL = 2.5  # how much higher fingertips are for what they are too far aside
+FUNNEL = 2.5  # how much higher fingertips are, for each metre they are too far aside
 UNEVEN = 0.012  # [m] by which the fingers of two faces may be aside of one another
 PRESS, LIGHT = 2.0, 1.5  # [N] with which a block is pressed, if fingers can, that wants less
-FIRMLY = 1.5  # with which a heavier one is pressed, as a multiple of what it wants
+FIRMLY = 1.5  # with which a heavier one is pressed, as a multiple of the needed force
 LANDING, TILTED, SOFT = 0.012, 0.1, 0.6  # [m], sine, share: a block that swings is laid flat
 LAG, TWIST = 0.015, 0.2  # [m], [rad] that a held block may be behind its command
 OFF = 0.001, 0.007  # [m] above the floor, between which a block begins to follow fingertips
@@ -64,7 +64,7 @@ class Feedback:
     pushing, picking, pick and place, and stacking two; where there are dozens of blocks it begins,
     and mostly does not finish.
 
-    What it does follows from where things are and from its last command, not from the time. So a
+    Its commands follow from the poses of bodies and from its last command, not from the time. So a
     network can imitate it, and it goes on from wherever somebody else has led. It remembers which
     block it takes, by which grip, and where to; all else is read in each step: fingertips go above
     the grip, down, towards the faces, and press; then the block goes towards its goal, higher than
@@ -84,7 +84,7 @@ class Feedback:
         self._programs: WeakKeyDictionary[Any, tuple[Any, Program]] = WeakKeyDictionary()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copy and pickle without what is going on."""
+        """Copy and pickle without the present episode."""
         return Feedback, ()
 
     def __call__(self, world: Any) -> Floats:
@@ -106,7 +106,7 @@ class Feedback:
         return program.sight.tips_at(command).ravel() if tips else command
 
     def memory(self, world: Any) -> Floats:
-        """Return what it remembers after the action of the present step: -1 for no, 1 for yes.
+        """Return its memory after the action of the present step: -1 for no, 1 for yes.
 
         Where a finger touches, and where the block is taken to, is not among it.
 
@@ -299,7 +299,7 @@ class Program:
 
 
 def held(body: Cuboid, own: Floats) -> Grip | None:
-    """See how fingertips hold a block, from where they are in its frame, shape (3, 3) [m]."""
+    """Return how fingertips hold a block, from where they are in its frame, shape (3, 3) [m]."""
     each = np.arange(3)
     for axis in (0, 1):
         along, out = own[:, 1 - axis], body.half[axis] + TIP_RADIUS

@@ -1,4 +1,4 @@
-"""Three fingers: the torques with which they press, and what they would run into."""
+"""Three fingers: the torques with which they press, and their obstacles."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def deepest_kernel(joints: Floats, height: float, boxes: Floats) -> float:
 
     Args:
         joints: Shape (9,) [rad].
-        height: Of the robot [m].
+        height: Height of the robot [m].
         boxes: Half edges [m], center [m] and the three axes of each as columns, shape (n, 3, 5).
     """
     legs, deepest = np.empty((2 * N_FINGERS, BALLS, 3)), -math.inf

@@ -1,0 +1,153 @@
+"""Jobs as tasks of Ray: on a cluster, or in processes that Ray starts on this machine."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import logging
+import os
+import socket
+import sys
+import warnings
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from importlib import import_module
+from pathlib import Path
+from typing import Any, final
+
+from scm_world._fingerprint import differing
+from scm_world.errors import EngineFailure, MissingExtra, UnknownOption
+from scm_world.runs.processes import TRIES, Outcome, answered, pickled, single_threaded
+
+RAY = "ray"
+SAME = ("scm-world", "numpy", "numba", "mujoco", "pybullet")
+"""Packages whose versions decide what comes out of a job."""
+QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0",  # nothing is reported to anybody
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # or it warns of a change of its own
+}
+PATIENCE = 10.0  # [s] for the head of a cluster to answer; Ray itself would wait for minutes
+
+
+@final
+class Cluster:
+    """A connection to Ray; one that this process has already is used, and left open.
+
+    Args:
+        address: ``"auto"`` or ``host:port`` of the head; None is ``RAY_ADDRESS`` if it is set, and
+            else processes that are started on this machine.
+        workers: How many jobs are done at the same time; as many as there are cores if None.
+
+    Raises:
+        MissingExtra: Ray is not installed.
+        EngineFailure: There is no cluster at the address.
+        UnknownOption: This process is connected to another one.
+    """
+
+    def __init__(self, address: str | None, workers: int | None) -> None:
+        for name, value in QUIET.items():
+            os.environ.setdefault(name, value)
+        try:
+            self._ray: Any = import_module("ray")
+        except ImportError as error:
+            raise MissingExtra("ray", "cloud") from error
+        address = address or os.environ.get("RAY_ADDRESS")
+        self._is_mine = not self._ray.is_initialized()
+        if self._is_mine:
+            self._connect(address, workers)
+        self.address = self._ray.get_runtime_context().gcs_address
+        if address not in (None, "auto", self.address) and not self._is_mine:
+            raise UnknownOption("engine", address, (f"{self.address}: it is connected there",))
+        self.workers = workers or max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
+    def _connect(self, address: str | None, workers: int | None) -> None:
+        how: dict[str, Any] = {"address": address}
+        if address is None:
+            how = {"address": "local", "num_cpus": workers, "include_dashboard": False}
+        host, _, port = (address or "").rpartition(":")
+        try:
+            if port.isdecimal():
+                socket.create_connection((host, int(port)), timeout=PATIENCE).close()
+            self._ray.init(**how, log_to_driver=False, logging_level=logging.ERROR)
+        except (OSError, OverflowError, RuntimeError, ValueError) as error:
+            hint = "if the cluster asks for a token, set RAY_AUTH_MODE=token"
+            said = f"there is no Ray at {address or 'this machine'}: {error}; {hint}"
+            raise EngineFailure(said, RAY) from None
+
+    @property
+    def where(self) -> str:
+        """Where the work is done, in words."""
+        nodes = sum(node["Alive"] for node in self._ray.nodes())
+        workers = f"{self.workers} worker{'s' * (self.workers > 1)}"
+        return f"on Ray at {self.address}, {workers} on {nodes} node{'s' * (nodes > 1)}"
+
+    def pickled(self, what: str, thing: object) -> bytes:
+        """Write something for a worker; what the main module defines can be written, too."""
+        return pickled(what, thing, self._ray.cloudpickle.dumps)
+
+    def outcomes(self, work: bytes, jobs: Sequence[bytes]) -> Iterator[Outcome]:
+        """Do jobs, one core each; Ray repeats those whose worker or node is lost."""
+        ray, waiting = self._ray, deque(range(len(jobs)))
+        task = ray.remote(num_cpus=1, max_retries=TRIES - 1)(_answered)
+        # `put` sends the work once to each node.
+        luggage = ray.put((work, tuple(sys.path), os.getcwd(), _versions()))
+        flying: dict[Any, int] = {}
+        try:
+            while waiting or flying:
+                while waiting and len(flying) < self.workers:
+                    place = waiting.popleft()
+                    flying[task.remote(luggage, jobs[place])] = place
+                (ref,), _ = ray.wait(list(flying), num_returns=1)
+                place, result, failed = flying.pop(ref), None, None
+                try:
+                    result, failed = ray.get(ref)
+                except (ray.exceptions.RayTaskError, ray.exceptions.RuntimeEnvSetupError) as error:
+                    raise EngineFailure(f"a worker of Ray cannot work: {error}", RAY) from None
+                except ray.exceptions.RayError as error:
+                    said = f"it was tried {TRIES} times, and each time its worker ended: {error}"
+                    failed = EngineFailure(said, RAY)
+                if waiting:  # the worker has the next one while the result is looked at
+                    following = waiting.popleft()
+                    flying[task.remote(luggage, jobs[following])] = following
+                yield place, result, failed
+        finally:
+            for ref in flying:
+                ray.cancel(ref, force=True)
+
+    def close(self) -> None:
+        """End Ray, or the connection to the cluster, if it was begun here."""
+        if self._is_mine and self._ray.is_initialized():
+            with warnings.catch_warnings():
+                # It leaves processes to the system that it has told to end.
+                warnings.simplefilter("ignore", ResourceWarning)
+                self._ray.shutdown()
+
+
+# --- in a worker ----------------------------------------------------------------------------------
+
+
+def _versions() -> dict[str, str]:
+    known = importlib.metadata.distributions()
+    return {f"version of {one.name}": one.version for one in known if one.name in SAME}
+
+
+_KEPT: dict[bytes, list[Any]] = {}
+_HELD = ExitStack()  # one thread for each library, until the worker ends
+
+
+def _answered(luggage: tuple[Any, ...], job: bytes) -> tuple[Any, Exception | None]:
+    """Do a job; the work is kept for the next one."""
+    work, paths, folder, theirs = luggage
+    if work not in _KEPT:
+        if others := differing(theirs, _versions()):
+            said = f"a node would give other results; here and there differ: {', '.join(others)}"
+            raise EngineFailure(said, RAY)
+        if not _KEPT:
+            _HELD.enter_context(single_threaded())
+        # Modules and files are looked for where the process that asks does, if that is here.
+        sys.path += [path for path in paths if path not in sys.path and Path(path).exists()]
+        if Path(folder).is_dir():
+            os.chdir(folder)
+        _KEPT.clear()
+        _KEPT[work] = [work]
+    return answered(_KEPT[work], job)

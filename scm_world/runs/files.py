@@ -1,0 +1,180 @@
+"""Files on this machine or behind URLs of fsspec: written whole, and read without running code."""
+
+from __future__ import annotations
+
+import fcntl
+import io
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+from urllib.parse import unquote
+from uuid import uuid4
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world.errors import (
+    MissingExtra,
+    UnknownOption,
+    UnreadableFile,
+    UnwritableFolder,
+    in_one_line,
+)
+
+if TYPE_CHECKING:
+    from upath import UPath
+
+Location: TypeAlias = "Path | UPath"
+"""A file or folder: a ``Path`` on this machine, elsewhere a ``UPath`` of universal_pathlib."""
+
+DRAFT = ".part"
+"""How the names of files end that are not whole yet; they begin with a dot."""
+STORES = ("abfs", "az", "gs", "memory", "s3", "sftp", "file", "any other that fsspec knows")
+_PASSWORD = re.compile(r"://[^/@]*:[^/]*@")
+
+
+def located(given: Location | str) -> Location:
+    """Return the file or folder that a path, or a URL as a text, names.
+
+    Raises:
+        MissingExtra: It is a URL of another place, and universal_pathlib or the package of the
+            protocol is not installed.
+        UnknownOption: It is no path, there is no such protocol, a password stands in the URL
+            (messages and results would show it), or a URL was made a ``Path``.
+
+    Example:
+        >>> located("runs/one").name, located("file:///runs/one%202").name
+        ('one', 'one 2')
+    """
+    if not isinstance(given, str):
+        if not hasattr(given, "iterdir"):
+            raise UnknownOption("path", given, ("a path, or a URL as a text",))
+        if isinstance(given, Path) and re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(given)):
+            raise UnknownOption("folder", str(given), ("a URL as a text: a Path spoils it",))
+        return given
+    protocol, slashes, rest = given.partition("://")
+    if not slashes:
+        return Path(given)
+    if protocol == "file" and rest.startswith("/"):
+        return Path(unquote(rest))
+    if protocol in ("", "file"):
+        raise UnknownOption("URL", given, ("s3://bucket/run", "file:///… with three slashes"))
+    if _PASSWORD.search(given):
+        safe = ["one without a password: fsspec reads it from its own configuration"]
+        raise UnknownOption("URL", _PASSWORD.sub("://…@", given), safe)
+    try:
+        upath: Any = import_module("upath")
+    except ImportError:
+        raise MissingExtra("universal_pathlib", "cloud") from None
+    try:
+        found: UPath = upath.UPath(given)
+        found.fs.invalidate_cache()  # others write there, too
+    except ValueError:
+        raise UnknownOption("protocol of a URL", protocol, STORES) from None
+    except ImportError as error:
+        named = re.search(r"nstall ['\"`]?([\w.-]+)", str(error))
+        raise MissingExtra(named[1] if named else protocol) from None
+    return found
+
+
+def read_bytes(path: Location | str) -> bytes:
+    """Read a file; an ``OSError`` where it is a folder, or a device or pipe without an end."""
+    where = located(path)
+    if where.exists() and not where.is_file():
+        raise OSError("it is no regular file, but a folder, a device or a pipe")
+    return where.read_bytes()
+
+
+def read_text(path: Location | str, encoding: str = "utf-8") -> str:
+    """Read a text; errors as in ``read_bytes``, and a ``ValueError`` where it is none."""
+    return read_bytes(path).decode(encoding).replace("\r\n", "\n")
+
+
+def read_arrays(source: Location | str | bytes) -> dict[str, NDArray[Any]]:
+    """Read the arrays of an archive of NumPy (.npz), by name; pickled objects are refused."""
+    data = source if isinstance(source, bytes) else read_bytes(source)
+    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
+
+
+def write_whole(path: Location | str, data: bytes | str) -> None:
+    """Write a file whole or not at all, and its folder if there is none; a text as UTF-8.
+
+    Of several simultaneous writers the last one decides; a reader always finds a whole file.
+    Behind a URL all of this is as fsspec and the store have it.
+
+    Raises:
+        UnwritableFolder: There is no room, or no permission; what was there is still there.
+    """
+    target = located(path)
+    content = data if isinstance(data, bytes) else data.encode("utf-8", "backslashreplace")
+    made(target.parent)
+    draft: Path | None = None
+    try:
+        if not isinstance(target, Path):
+            target.write_bytes(content)
+            return
+        draft = target.with_name(f".{target.name}.{uuid4().hex[:16]}{DRAFT}")
+        with draft.open("xb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        draft.replace(target)
+    except OSError as error:
+        raise UnwritableFolder(str(target.parent), f"{target.name}: {_said(error)}") from None
+    finally:
+        with suppress(OSError):
+            if draft is not None:
+                draft.unlink(missing_ok=True)
+
+
+def _said(error: OSError) -> str:
+    return error.strerror or in_one_line(error)
+
+
+def removed(path: Location) -> None:
+    """Remove a file, if it is there; ``UnwritableFolder`` without permission."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise UnwritableFolder(str(path.parent), f"{path.name}: {_said(error)}") from None
+
+
+def made(folder: Location | str) -> Location:
+    """Make a folder, if there is none; ``UnwritableFolder`` where there can be none."""
+    path = located(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UnwritableFolder(str(path), _said(error)) from None
+    return path
+
+
+@contextmanager
+def locked(folder: Location | str) -> Iterator[None]:
+    """Be the only one who writes to a folder, until the block or the process ends.
+
+    Behind a URL nobody is refused: what two writers of one study write there is the same.
+
+    Raises:
+        UnreadableFile: Another one is writing to it, in this process or in another.
+        UnwritableFolder: There is no permission, or a file in its place.
+    """
+    path = made(folder)
+    if not isinstance(path, Path):
+        yield
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            reason = "another process is writing to it"
+            raise UnreadableFile(str(path), reason, "wait, or give another folder") from None
+        yield
+    finally:
+        os.close(handle)

@@ -1,0 +1,197 @@
+"""Independent jobs: in this process, in processes of this machine, or on a Ray cluster.
+
+- Every result comes once, in the order in which they are ready, with the place of its job.
+- The results do not depend on the engine, or on the number of workers.
+- A worker that is killed costs the job it was doing, which is done again. A job that fails, or
+  takes three workers with it, is put aside; its error is raised when all other jobs are done.
+"""
+
+from __future__ import annotations
+
+import re
+import reprlib
+import weakref
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Any, Self, TypeVar, final
+
+from scm_world.errors import UnknownOption
+from scm_world.runs.cluster import RAY, Cluster
+from scm_world.runs.processes import PROCESS, Outcome, cores, outcomes, pickled, single_threaded
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+SERIAL = "serial"
+ENGINES = (SERIAL, PROCESS, RAY, "host:port or 'auto' of a Ray cluster")
+SHOWN = 5  # failed jobs that an error lists
+
+
+@final
+class Pool:
+    """What does independent jobs.
+
+    Args:
+        engine: ``"serial"``: this process; ``"process"``: others of this machine; ``"ray"``, or
+            the address of a Ray cluster: ``"auto"`` or ``host:port``. ``"ray"`` means the cluster
+            of ``RAY_ADDRESS`` if that is set, and else processes that Ray starts on this machine.
+            None is ``"process"`` if several workers are asked for, and else ``"serial"``.
+        workers: How many jobs are done at the same time; None is as many as there are cores, on
+            this machine or in the cluster.
+
+    Attributes:
+        engine: ``"serial"``, ``"process"`` or ``"ray"``.
+        workers: How many jobs are done at the same time.
+
+    Raises:
+        UnknownOption: There is no such engine, or it cannot have so many workers.
+        MissingExtra: Ray is not installed.
+        EngineFailure: There is no cluster at the address.
+
+    Example:
+        >>> with Pool("process", workers=2) as pool:
+        ...     sorted(pool.run(abs, [-3, 10]))
+        [(0, 3), (1, 10)]
+    """
+
+    def __init__(self, engine: str | None = None, workers: int | None = None) -> None:
+        whole = workers is None or (isinstance(workers, int) and not isinstance(workers, bool))
+        if not whole or (workers is not None and workers < 1):
+            raise UnknownOption("workers", workers, ("any whole number from 1 on",))
+        if engine is None:
+            engine = PROCESS if workers is not None and workers > 1 else SERIAL
+        if engine == SERIAL and workers not in (None, 1):
+            raise UnknownOption("workers of the engine 'serial'", workers, ("1", "None"))
+        self._cluster: Cluster | None = None
+        self._running: Callable[[], Any] = lambda: None
+        if engine in (SERIAL, PROCESS):
+            self.engine = engine
+            self.workers = (workers or cores()) if engine == PROCESS else 1
+            return
+        if engine not in (RAY, "auto") and not re.fullmatch(r"[^/:]+:\d+", str(engine)):
+            raise UnknownOption("engine of work", engine, ENGINES)
+        self._cluster = Cluster(None if engine == RAY else engine, workers)
+        self.engine, self.workers = RAY, self._cluster.workers
+
+    @property
+    def where(self) -> str:
+        """Where the work is done, in words."""
+        if self._cluster is not None:
+            return self._cluster.where
+        if self.engine == SERIAL:
+            return "in this process"
+        return f"in {self.workers} process{'es' * (self.workers > 1)} of this machine"
+
+    def check(self, what: str, thing: object) -> bytes:
+        """Return something as it is sent to workers; empty if nothing is sent.
+
+        Args:
+            what: Said in the error.
+            thing: The work, a job, or a part of them.
+
+        Raises:
+            UnknownOption: It cannot be sent.
+        """
+        if self.engine == SERIAL:
+            return b""
+        return pickled(what, thing) if self._cluster is None else self._cluster.pickled(what, thing)
+
+    def run(
+        self, work: Callable[[Job], Result], jobs: Sequence[Job]
+    ) -> Generator[tuple[int, Result]]:
+        """Do jobs.
+
+        Args:
+            work: Called with each job. Each worker keeps its own copy for all of them.
+            jobs: What it is called with.
+
+        Returns:
+            The place of a job among the jobs, and its result: each once, in the order in which
+            they are ready. Whoever stops reading ends the work.
+
+        Raises:
+            UnknownOption: The work or a job cannot be sent; none was begun.
+            EngineFailure: While reading: no worker can begin. At the end: three ended over one job.
+            Exception: At the end, when all other jobs are done: what a job raised, with a note
+                that names it.
+        """
+        sent = self.check("work", work)
+        given = [self.check(f"job {place}", (job,)) for place, job in enumerate(jobs)]
+        if self._cluster is not None:
+            found = self._cluster.outcomes(sent, given)
+        elif self.engine == PROCESS:
+            found = outcomes(self.workers, sent, given)
+        else:
+            found = _here(work, jobs)
+        running = _results(found, jobs)
+        self._running = weakref.ref(running)
+        return running
+
+    def close(self) -> None:
+        """End the work that goes on, and what was opened for it."""
+        running = self._running()
+        if running is not None:
+            running.close()
+        if self._cluster is not None:
+            self._cluster.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def _here(work: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterator[Outcome]:
+    for place, job in enumerate(jobs):
+        result, failed = None, None
+        try:
+            with single_threaded():
+                result = work(job)
+        except Exception as error:
+            failed = error
+        yield place, result, failed
+
+
+def _results(found: Iterator[Outcome], jobs: Sequence[Any]) -> Generator[tuple[int, Any]]:
+    aside: dict[int, Exception] = {}
+    for place, result, error in found:
+        if error is None:
+            yield place, result
+        else:
+            aside[place] = error
+    if not aside:
+        return
+    first, *others = [
+        (f"job {place}, {reprlib.repr(jobs[place])}", aside[place]) for place in sorted(aside)
+    ]
+    name, error = first
+    error.add_note(f"in {name}")
+    for name, other in others[:SHOWN]:
+        error.add_note(f"so did {name}: {type(other).__name__}: {other}")
+    if len(others) > SHOWN:
+        error.add_note(f"and {len(others) - SHOWN} more")
+    error.add_note(f"{len(jobs) - len(aside)} of {len(jobs)} jobs are done")
+    raise error
+
+
+@contextmanager
+def pool_of(engine: Pool | str | None, workers: int | None = None) -> Iterator[Pool]:
+    """Return a pool that is given, which has its workers, or open one for the block; see ``Pool``.
+
+    Raises:
+        UnknownOption: ``workers`` are given beside a pool.
+    """
+    if isinstance(engine, Pool):
+        if workers is not None:
+            raise UnknownOption("workers", workers, ("None with a pool, which has its own",))
+        yield engine
+        return
+    with Pool(engine, workers) as made:
+        yield made
