@@ -145,7 +145,7 @@ def discover(
                 probes=probes,
                 seed=seed,
                 progress=tell,
-                checkpoint=folder / "progress.json",
+                checkpoint=folder / "probes",
             )
         names = tuple(system.graph)
     report = report.model_copy(update={"arguments": tuple(option or ())})
