@@ -243,7 +243,7 @@ def list_(zoo: bool = False) -> None:
             name: ": ".join(filter(None, (one.task, policies.best_known(one))))
             for name, one in trained.items()
         },
-        "families": {f"{name}:N": first_line(draw.__doc__) for name, draw in FAMILIES.items()}
+        "families": {f"{name}:N": family.doc for name, family in FAMILIES.items()}
         | {f"{name}:N": doc for name, doc in PHYSICS.items()},
         "environments": {name: f"gymnasium.make({name!r})" for name in IDS},
     }
