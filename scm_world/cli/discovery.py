@@ -27,12 +27,10 @@ from scm_world.errors import UnknownOption
 from scm_world.output.remote import Location
 
 if TYPE_CHECKING:
-    from scm_world.discovery import DiscoveryReport
     from scm_world.discovery.problems import TaskView
     from scm_world.queries.comparison import Comparison
     from scm_world.queries.verification import Verification
 
-LONG = 80  # [characters] what is longer is not repeated
 LISTED = 10  # edges
 BRIEF = (
     *("shd", "shd_standardised", "f1", "precision", "recall", "auprc", "sid"),
@@ -149,12 +147,15 @@ def discover(
             )
         names = tuple(system.graph)
     report = report.model_copy(update={"arguments": tuple(option or ())})
-    _edge_table(report, names)
-    used = {name for edge in (*report.found, *report.declared) for name in edge[:2]}
-    if lonely := [name for name in names if name not in used]:
-        from scm_world.discovery.names import by_entity
-
-        console.say(f"no edge at all: {', '.join(by_entity(lonely))}", "")
+    found, declared = set(report.found), set(report.declared)
+    styles = {edge: "" if edge in declared else "bold dark_orange" for edge in found}
+    console.edge_table(
+        names,
+        styles | dict.fromkeys(declared - found, "bold red"),
+        signs={"bold dark_orange": "[+]", "bold red": "[-]"},
+        title=f"Recovered graph of {report.task} ({len(found)} edges)",
+        caption="[+] found but not declared   [-] declared but not found",
+    )
     console.facts(report.rows())
     with console.staged(folder) as draft:
         report.save(draft / "report.json")
@@ -162,43 +163,6 @@ def discover(
     if report.probes < report.planned:
         raise typer.Exit(console.INTERRUPTED)
     raise typer.Exit(int(failed([report.outcome], strict=strict)))
-
-
-def _edge_table(report: DiscoveryReport, names: Sequence[str]) -> None:
-    """Print one row per effect; a long list of causes is written out once."""
-    from scm_world.discovery.names import by_entity
-
-    found, declared = set(report.found), set(report.declared)
-    first: dict[str, str] = {}
-    rows = []
-    for effect in names:
-        cells = []
-        for lag in (0, 1):
-            edges = [(cause, effect, lag) for cause in names]
-            kinds = (
-                ("", "", [e for e in edges if e in found and e in declared]),
-                ("[+]", "bold dark_orange", [e for e in edges if e in found - declared]),
-                ("[-]", "bold red", [e for e in edges if e in declared - found]),
-            )
-            parts = [
-                Text(symbol + short, style=style)
-                for symbol, style, kind in kinds
-                for short in by_entity(edge[0] for edge in kind)
-            ]
-            cell = Text(", ").join(parts)
-            like = first.setdefault(cell.plain, effect)
-            alike = like != effect and len(cell) > LONG
-            cells.append(Text(f"same as {like}", style="italic") if alike else cell)
-        if any(cells):
-            count = sum(edge[1] == effect for edge in report.found)
-            rows.append((Text(effect, style="bold"), *cells, count))
-    console.table(
-        ("effect", "causes at once", "causes one step earlier", "edges"),
-        rows,
-        title=f"Recovered graph of {report.task} ({len(report.found)} edges)",
-        caption="[+] found but not declared   [-] declared but not found",
-        whole=(0,),
-    )
 
 
 def _benchmark(

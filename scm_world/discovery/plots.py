@@ -122,9 +122,10 @@ def draw_verification(found: Verification, path: Location | str) -> None:
     figure.text(0.02, 0.945, f"Verification of {found.task}", **TITLE)
     outcome = {**TITLE, "color": OUTCOMES[found.outcome]}
     figure.text(0.98, 0.945, found.outcome, ha="right", **outcome)
+    backend = f"{found.backend} {found.versions.get(found.backend, '')}".strip()
     words = (
-        f"{found.backend} {found.versions.get(found.backend, '')}: {len(found.undeclared)} "
-        f"undeclared, {len(found.never_fired)} never seen, {found.rollouts:,} rollouts"
+        f"{backend}: {len(found.undeclared)} undeclared, {len(found.never_fired)} never seen, "
+        f"{found.rollouts:,} rollouts"
     )
     figure.text(0.02, 0.9, words, fontsize=11, color=INK)
     declared = len(found.declared)
@@ -133,6 +134,7 @@ def draw_verification(found: Verification, path: Location | str) -> None:
     label = f"{found.backend}: {len(found.fired)} of {declared}"
     ax.step(range(1, len(share) + 1), share, where="mid", color=MATCHED, lw=2.2, label=label)
     ax.axhline(100.0, color=FAINT, lw=1.0, zorder=0)
+    ax.set_ylim(0.0, 105.0)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_title("declared edges seen [%]", **LEFT)
     ax.set_xlabel("probe states", fontsize=11, color=INK)

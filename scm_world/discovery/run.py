@@ -27,8 +27,6 @@ from scm_world.queries.verification import (
     Outcome,
     Row,
     arrow,
-    counted,
-    edge_reports,
     listed,
     outcome,
 )
@@ -84,7 +82,7 @@ class DiscoveryReport(GraphReport):
         good = {"confirmed": True, "refuted": False}
         return (
             ("outcome", self.outcome, good.get(self.outcome)),
-            *counted(self.provenance),
+            *self.counted(),
             ("backend", f"{self.backend} {version}, preset {self.preset}", None),
             *((("options", ", ".join(self.arguments), None),) if self.arguments else ()),
             ("probe states", states, None if complete else False),
@@ -183,7 +181,6 @@ def discover(
         return DiscoveryReport.of(
             there,
             effects,
-            edge_reports(paired.model, effects),
             seed=seed,
             probes=done,
             planned=probes,

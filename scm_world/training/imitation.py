@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
@@ -20,7 +21,7 @@ from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation.episodes import EpisodeRunner
+from scm_world.evaluation.episodes import EpisodeRunner, Hook, play
 from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.evaluation.recording import Recording, action_noise
 from scm_world.output.durable import locked, made, write_durably
@@ -329,8 +330,7 @@ def demonstrated(
             episodes end.
     """
     env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
-    runner = EpisodeRunner(env)
-    try:
+    with closing(EpisodeRunner(env)) as runner:
         metrics = [name for name in (FRACTION, SUCCESS) if name in env.world.model]
         if not metrics:
             allowed = (
@@ -341,14 +341,13 @@ def demonstrated(
         taught = [one for name in lesson.protocols for one in chosen([name], known)]
         shown, scores = list[list[NDArray[np.float32]]](), list[float]()
         for number in numbers:
-            protocol = taught[number % len(taught)]
+            acting = runner.under(taught[number % len(taught)])
             random = np.random.default_rng([seed, round_, number])
-            _, observation = runner.begin(protocol, seed=SEED + seed, episode=number)
-            pairs, info = _episode(lesson, env, observation, random, learner, metrics[0])
-            shown.append([np.array(one, np.float32) for one in zip(*pairs, strict=True)])
+            teaching = Teaching(lesson, random, learner, metrics[0])
+            info = play(acting, teaching, hooks=[teaching], seed=SEED + seed, episode=number)
+            pairs = zip(*teaching.pairs, strict=True)
+            shown.append([np.array(one, np.float32) for one in pairs])
             scores.append(float(info[metrics[0]]))
-    finally:
-        runner.close()
     kept = np.array(scores) >= lesson.keep
     good = [one for one, is_good in zip(shown, kept, strict=True) if is_good]
     none = [array[:0] for array in shown[0]]
@@ -357,25 +356,48 @@ def demonstrated(
     return Demonstrations(**named, scores=np.array(scores), kept=kept)
 
 
-def _episode(
-    lesson: Lesson,
-    env: ScmWorldEnv,
-    observation: Any,
-    random: np.random.Generator,
-    learner: MlpPolicy | None,
-    metric: str,
-) -> tuple[list[tuple[Any, ...]], dict[str, Any]]:
-    """Run an episode; return the rows of ``PAIRS``, and the infos of its end."""
-    teacher: Any = NAMED[lesson.teacher]()
-    size = env.world.compiled.n_actions
-    scale, share = lesson.noise * random.uniform(), lesson.share * random.uniform(0.0, 2.0)
-    noises, learns, over, info = action_noise(random, size), False, False, dict[str, Any]()
-    pairs, row, said = list[tuple[Any, ...]](), 0, np.empty(0)
-    while not over:
+@final
+class Teaching(Hook):
+    """Acts in an episode as the teacher does, or now and then as the learner does.
+
+    Args:
+        lesson: How demonstrations are made.
+        random: Generator of all that is drawn.
+        learner: Acts now and then; never if None.
+        metric: How good the present is, by the name of its info.
+
+    Attributes:
+        pairs: The rows of ``PAIRS``.
+    """
+
+    def __init__(
+        self,
+        lesson: Lesson,
+        random: np.random.Generator,
+        learner: MlpPolicy | None,
+        metric: str,
+    ) -> None:
+        self._lesson, self._random, self._learner = lesson, random, learner
+        self._metric, self._learns, self._row = metric, False, 0
+        self._memory: Any = np.empty(0)
+        self.pairs: list[tuple[Any, ...]] = []
+
+    def start(self, env: ScmWorldEnv) -> None:
+        """Begin an episode."""
+        self._env = env
+        self._teacher: Any = NAMED[self._lesson.teacher]()
+        self._scale = self._lesson.noise * self._random.uniform()
+        self._share = self._lesson.share * self._random.uniform(0.0, 2.0)
+        self._noises = action_noise(self._random, env.world.compiled.n_actions)
+
+    def act(self, observation: Any) -> Any:
+        """Keep the action of the teacher; return the one that is played."""
+        env, lesson, teacher = self._env, self._lesson, self._teacher
         right = np.clip(env.as_action(teacher(env.world)), -1.0, 1.0)
-        now = teacher.memory(env.world) if lesson.memory else said
-        before, said = said if pairs else np.zeros_like(now), now
-        pairs.append((observation, right, before, said))
+        now = teacher.memory(env.world) if lesson.memory else self._memory
+        before = self._memory if self.pairs else np.zeros_like(now)
+        self._memory = now
+        self.pairs.append((observation, right, before, now))
         if lesson.symmetric:
             names = env.observed or ()
             symmetries = env.world.task.observation.symmetries
@@ -383,17 +405,20 @@ def _episode(
                 allowed = (f"False: {lesson.task} has no symmetries",)
                 raise UnknownOption("symmetric of a lesson", True, allowed)
             for scene, order in symmetries(env.world.evaluate(names), names):
-                pairs.append((env.observe_values(scene), right[list(order)], before, said))
-        if learner is not None and random.uniform() < 1.0 / lesson.stretch:
-            learns = random.uniform() < share
+                self.pairs.append((env.observe_values(scene), right[list(order)], before, now))
         action: Any = right
-        if learner is not None and learns:
-            action, _ = learner.predict(observation, before if lesson.memory else None)
-        given: Any = np.clip(action + scale * next(noises), -1.0, 1.0)
-        observation, _, terminated, truncated, info = env.step(given)
-        row = row + 1 if float(info[metric]) >= lesson.keep else 0
-        over = terminated or truncated or row == lesson.settled
-    return pairs, info
+        if self._learner is not None:
+            if self._random.uniform() < 1.0 / lesson.stretch:
+                self._learns = self._random.uniform() < self._share
+            if self._learns:
+                memory = before if lesson.memory else None
+                action, _ = self._learner.predict(observation, memory)
+        return np.clip(action + self._scale * next(self._noises), -1.0, 1.0)
+
+    def after(self, observation: Any, reward: float, info: Mapping[str, Any]) -> bool:
+        """End the episode where it has been good for long enough."""
+        self._row = self._row + 1 if float(info[self._metric]) >= self._lesson.keep else 0
+        return self._row == self._lesson.settled
 
 
 def given_demonstrations(

@@ -21,13 +21,13 @@ from scm_world.curricula import Curriculum
 from scm_world.discovery.data import load as dataset_of
 from scm_world.errors import ModelError, ScmWorldError, UnreadableFile
 from scm_world.evaluation import Evaluation, evaluate
-from scm_world.evaluation.again import shard_runner_of
-from scm_world.evaluation.players import as_player
+from scm_world.evaluation.preparation import again
 from scm_world.evaluation.recording import Recording
 from scm_world.geometry.hulls import load_hull
 from scm_world.graph.files import from_dict, from_json
 from scm_world.output import reading
 from scm_world.policies import load_sb2
+from scm_world.policies.agents import as_agent
 from scm_world.queries import Plan, World, load_episode, save_episode
 from scm_world.training.recipe import Recipe
 from scm_world.variables import Derived, Exogenous
@@ -60,8 +60,8 @@ def _named_by(text: str, path: Path) -> Any:
 
 
 READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
-    "policy": (".safetensors", as_player),
-    "network": (".safetensors", as_player),
+    "policy": (".safetensors", as_agent),
+    "network": (".safetensors", as_agent),
     "archive": (".zip", load_sb2),
     "episode": (".npz", load_episode),
     "recording": (".parquet", Recording.load),
@@ -181,7 +181,7 @@ def test_results_that_say_something_else_are_not_played_again(changed: dict[str,
     short = {"max_episode_length": 1}
     found = evaluate("still", "P0", task="reaching", n=1, backend="fake", env=short)
     with pytest.raises(ScmWorldError):
-        shard_runner_of(Evaluation({**found.about, **changed}, found.columns))
+        again(Evaluation({**found.about, **changed}, found.columns))
 
 
 def test_damaged_episodes_are_told(episode_file: Path, tmp_path: Path) -> None:
