@@ -17,12 +17,11 @@ from scm_world.discovery.data.dataset import (
     TARGETS,
     Column,
     Dataset,
-    Regime,
     check_names,
+    regimes_as_dict,
+    regimes_from_dict,
 )
 from scm_world.errors import DAMAGED, ModelError, UnreadableFile, in_one_line
-from scm_world.queries.plans import FORMAT as PLAN
-from scm_world.queries.plans import Plan
 from scm_world.runs.files import Location, located, read_bytes, read_text, write_whole
 from scm_world.runs.study import Study, settings_in
 
@@ -83,12 +82,7 @@ def encoded(table: Dataset) -> bytes:
     from pyarrow import parquet
 
     used, number = np.unique(table.regime, return_inverse=True)
-    acts: dict[str, int] = {}  # many regimes share them: each is written once
-    regimes = []
-    for regime in (table.regimes[kind] for kind in used):
-        done = (json.dumps(act) for act in regime.plan.as_dict()["do"].items())
-        regimes.append([[acts.setdefault(act, len(acts)) for act in done], list(regime.targets)])
-    header = {"about": table.about, "acts": [json.loads(act) for act in acts], "regimes": regimes}
+    header = {"about": table.about, **regimes_as_dict(table.regimes[kind] for kind in used)}
     numbers = {"episode": table.episode, "step": table.step, "regime": number.reshape(-1)}
     texts = [";".join(names) for names in table.target_names]
     columns = {
@@ -123,19 +117,11 @@ def decoded(data: bytes, columns: Sequence[Column], trusted: Sequence[str]) -> D
     if file.column_names != [*RESERVED, *names]:
         raise ValueError("it has other columns")
     header = json.loads(file.schema.metadata[KEY])
-    acts = [
-        (name, Plan.from_dict({"format": PLAN, "do": {name: parts}}, trusted=trusted)[name])
-        for name, parts in header["acts"]
-    ]
-    regimes = (
-        Regime(Plan(dict(acts[number] for number in numbers)), tuple(targets))
-        for numbers, targets in header["regimes"]
-    )
     values = [file[name].to_numpy() for name in names]
     return Dataset(
         values=np.stack(values, axis=1) if values else np.empty((file.num_rows, 0)),
         columns=tuple(columns),
-        regimes=tuple(regimes),
+        regimes=regimes_from_dict(header, trusted),
         about=header["about"],
         **{name: file[name].to_numpy().astype(np.int64) for name in NUMBERS},
     )

@@ -16,7 +16,7 @@ from scm_world._types import Floats
 from scm_world.discovery.data.collect import collected
 from scm_world.discovery.data.dataset import Column, Dataset, Ints
 from scm_world.discovery.data.designs import Grid
-from scm_world.discovery.data.worlds import WorldRows
+from scm_world.discovery.data.worlds import EpisodeRows
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.estimates import difference
@@ -267,7 +267,7 @@ def sweep(
     count, (_, world) = whole_number("n", n, least=1), asked(system)
     points = points_of(over, world.model)
     given, measured = Setting.of(world, setting), None if outcomes is None else tuple(outcomes)
-    rows = WorldRows(system, Grid(points), given, causes=points[0], outcomes=measured)
+    rows = EpisodeRows(system, Grid(points), given, causes=points[0], outcomes=measured)
     data = collected(
         rows,
         count * len(points),
