@@ -14,7 +14,7 @@ from typing import Any, final
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
 from scm_world.evaluation.episodes import METRICS, EpisodeRow, EpisodeRunner, Hook
 from scm_world.evaluation.preparation import prepare
-from scm_world.evaluation.results import Evaluation, columns_of
+from scm_world.evaluation.results import Evaluation, frame_of
 from scm_world.evaluation.setups import Setup, Shard, form_of
 from scm_world.output.durable import locked, made, write_whole
 from scm_world.output.reading import read_text
@@ -146,7 +146,7 @@ def evaluate(
     ):
         rows = played(setup, executor, folder=folder, progress=progress, tell=tell)
     policies = {who: agent.policy for who, agent in setup.agents.items()}
-    return Evaluation(setup.about(), columns_of(rows), policies)
+    return Evaluation(setup.about(), frame_of(rows), policies)
 
 
 def played(

@@ -16,9 +16,9 @@ from scm_world._types import Floats
 from scm_world.curricula import make_vec
 from scm_world.env import IDS
 from scm_world.errors import Diverged, UnknownOption
-from scm_world.output.durable import made, write_whole
 from scm_world.policies import save_policy
 from scm_world.queries.progress import Progress, Tell, clock
+from scm_world.runs.files import made, write_whole
 from scm_world.training.export import exported, mean, scored, words
 from scm_world.training.recipe import Recipe, curriculum_of
 from scm_world.training.sb3 import Sb3VecEnv
@@ -421,7 +421,7 @@ class Watch(BaseCallback):
         score = mean(scores)
         found = {"steps": steps, "metric": metric, "mean": score, "scores": scores}
         path = made(self._folder / "evaluations") / f"{steps}.json"
-        write_whole(json.dumps(found, indent=2), path)
+        write_whole(path, json.dumps(found, indent=2))
         self._tell(f"{steps:,} steps: {words(scores)}")
         for name, value in scores.items():
             self.logger.record(f"evaluation/{name}", value)

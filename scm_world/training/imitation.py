@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 from collections.abc import Iterable, Mapping
@@ -20,23 +21,23 @@ from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.episodes import EpisodeRunner, Hook, play
 from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.evaluation.recording import Recording, action_noise
-from scm_world.output.durable import locked, made, write_durably
-from scm_world.output.reading import read_arrays
 from scm_world.policies import MlpPolicy, load_policy, save_policy
 from scm_world.policies.cards import OPTIONS
 from scm_world.policies.scripted import NAMED
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress, Tell
+from scm_world.runs.files import made, read_arrays
+from scm_world.runs.pool import Pool
+from scm_world.runs.study import Study
 from scm_world.tasks import TASKS, make_task
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.training.export import mean, scored, words
-from scm_world.training.loop import open_folder, torch_threads
+from scm_world.training.loop import torch_threads
 from scm_world.training.settings import (
-    LESSONS,
     Count,
     Network,
     NotNegative,
@@ -49,10 +50,10 @@ from scm_world.training.settings import (
     merged,
     nested,
     observed,
+    presets,
     refused,
 )
 from scm_world.variables.spaces import Frozen
-from scm_world.work.executors import Executor, opened
 
 SHARD = 25
 """Episodes in a file."""
@@ -202,7 +203,7 @@ def lesson(task: str, **changes: Any) -> Lesson:
         40
     """
     fields: dict[str, Any] = Lesson.model_construct(task=task).model_dump(mode="json")
-    fields |= LESSONS.get(task, {})
+    fields |= copy.deepcopy(presets()["lessons"].get(task, {}))
     made = make_task(known_task(task))
     fields["env"] = {**made.training.get("env", {}), **fields["env"]}
     known = protocols_of(made)
@@ -257,26 +258,17 @@ PAIRS = ("observations", "actions", "before", "after")
 """Arrays of ``Demonstrations`` with a row for each control step."""
 
 
-def _load(path: Path) -> Demonstrations:
-    """Read a file of demonstrations.
+def _read(data: bytes) -> Demonstrations:
+    """Read a file of demonstrations."""
+    file = read_arrays(data)
+    return Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
 
-    Raises:
-        UnreadableFile: It is something else, or damaged.
-    """
-    try:
-        file = read_arrays(path)
-        found = Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
-        shapes = [array.shape for array in vars(found).values()]
-        *pairs, scores, kept = shapes
-        same = len({shape[0] for shape in pairs}) == 1 and pairs[2] == pairs[3]
-        if any(len(shape) != 2 for shape in pairs) or not same or scores != kept:
-            raise ValueError(f"its arrays have the shapes {shapes}")
-        if not all(np.isfinite(getattr(found, name)).all() for name in PAIRS):
-            raise ValueError("a number is not finite")
-    except DAMAGED as error:
-        advice = "remove it: the same call makes it again"
-        raise UnreadableFile(str(path), f"it is damaged ({error})", advice) from None
-    return found
+
+def _write(shown: Demonstrations) -> bytes:
+    """Return the content of a file of demonstrations."""
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **vars(shown))
+    return stream.getvalue()
 
 
 def joined(parts: Iterable[Demonstrations]) -> Demonstrations:
@@ -660,23 +652,26 @@ def clone(
         digest = sha256(given.observations.tobytes() + given.actions.tobytes()).hexdigest()
     else:
         engines = [_checked(lesson, name, number) for name in backend.split(",")]
-    identity = {
+    settings = {
+        **lesson.about(),
         "fingerprint": fingerprint(make_task(lesson.task), libraries=False),
-        "lesson": lesson.about(),
         "seed": number,
         "backend": backend,
         "recording": digest,
     }
     policies: list[MlpPolicy] = []
-    with locked(folder), torch_threads(1), opened(None, workers) as executor:
-        open_folder(folder / "clone.json", "scm_world/clone/1", identity, identity, say)
+    with (
+        torch_threads(1),
+        Pool(workers=workers) as pool,
+        Study(folder, "clone", settings) as study,
+    ):
         who = lesson.teacher if source is None else source
         say(f"Learning {lesson}; from {who} on {backend}, seed {number}, in {folder}")
         for round_ in range(lesson.rounds + 1):
             how: dict[str, Any] = {"backend": backend, "seed": number, "round_": round_}
             if source is None:
                 learner = policies[-1] if policies else None
-                shown += _collected(folder, lesson, executor, progress, learner=learner, **how)
+                shown += _collected(study, lesson, pool, progress, learner=learner, **how)
             path = made(folder / "rounds") / f"{round_:02}.safetensors"
             if not path.exists():
                 pairs = joined(shown)
@@ -714,15 +709,15 @@ def clone(
                     say(f"round {round_}: {words(scores)}")
                 save_policy(path, policy, policy.about.with_card(trials=scores))
             policies.append(load_policy(str(path)))
-        trials: list[Any] = [policy.about.card.get("trials") or {} for policy in policies]
-        means = [mean(scores) for scores in trials]
-        last, best = folder / "policy.safetensors", folder / "best.safetensors"
-        save_policy(last, policies[-1])
-        if None in means:
-            return Cloned(folder, lesson, number, last, last, None)
-        ranked = max(range(len(means)), key=lambda i: (means[i], i))
-        save_policy(best, policies[ranked])
-        return Cloned(folder, lesson, number, last, best, means[ranked])
+    trials: list[Any] = [policy.about.card.get("trials") or {} for policy in policies]
+    means = [mean(scores) for scores in trials]
+    last, best = folder / "policy.safetensors", folder / "best.safetensors"
+    save_policy(last, policies[-1])
+    if None in means:
+        return Cloned(folder, lesson, number, last, last, None)
+    ranked = max(range(len(means)), key=lambda i: (means[i], i))
+    save_policy(best, policies[ranked])
+    return Cloned(folder, lesson, number, last, best, means[ranked])
 
 
 def _checked(lesson: Lesson, backend: str, seed: int) -> str:
@@ -741,9 +736,9 @@ def _checked(lesson: Lesson, backend: str, seed: int) -> str:
 
 
 def _collected(
-    folder: Path,
+    study: Study,
     lesson: Lesson,
-    executor: Executor,
+    pool: Pool,
     progress: Progress | None,
     *,
     backend: str,
@@ -754,27 +749,21 @@ def _collected(
     backends = backend.split(",")
     first = 0 if round_ == 0 else lesson.episodes + (round_ - 1) * lesson.more
     stop = first + (lesson.episodes if round_ == 0 else lesson.more)
-    begins = range(first, stop, SHARD)
-    made(folder / "demonstrations")
-    paths = [folder / "demonstrations" / f"{round_:02}-{begin:06}.npz" for begin in begins]
-    jobs = [
-        (range(begin, min(begin + SHARD, stop)), backends[begin // SHARD % len(backends)])
-        for begin in begins
-    ]
-    found = {place: _load(path) for place, path in enumerate(paths) if path.exists()}
-    missing = [place for place in range(len(jobs)) if place not in found]
-    done = first + sum(len(jobs[place][0]) for place in found)
-    show = partial(partial, _shown, lesson=lesson, round_=round_, **how)
-    total, tell = lesson.episodes + lesson.rounds * lesson.more, progress or (lambda *_: None)
-    tell(done, total)
-    for number, shown in executor.run(show, [jobs[place] for place in missing]):
-        stream, place = io.BytesIO(), missing[number]
-        np.savez(stream, allow_pickle=False, **vars(shown))
-        write_durably(paths[place], stream.getvalue())
-        found[place] = shown
-        done += len(jobs[place][0])
-        tell(done, total)
-    return [found[place] for place in range(len(jobs))]
+    cells = {
+        f"demonstrations/{round_:02}-{begin:06}.npz": (
+            range(begin, min(begin + SHARD, stop)),
+            backends[begin // SHARD % len(backends)],
+        )
+        for begin in range(first, stop, SHARD)
+    }
+    total, done, found = lesson.episodes + lesson.rounds * lesson.more, first, {}
+    show = partial(_shown, lesson=lesson, round_=round_, **how)
+    for name, shown in study.map(cells, show, read=_read, write=_write, pool=pool):
+        found[name] = shown
+        done += len(cells[name][0])
+        if progress is not None:
+            progress(done, total)
+    return [found[name] for name in cells]
 
 
 def _shown(job: tuple[range, str], *, lesson: Lesson, **how: Any) -> Demonstrations:
