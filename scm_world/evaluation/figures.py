@@ -161,11 +161,11 @@ def _sheet(
     """Begin a figure with a title above, and legend and note below what will be drawn.
 
     Args:
-        width: Of the figure [inches].
-        height: Of what will be drawn [inches].
-        title: Of the figure.
+        width: Width of the figure [inches].
+        height: Height of the drawing [inches].
+        title: Title above it.
         note: What the figure shows, in sentences.
-        handles: Of the legend.
+        handles: Entries of the legend.
     """
     head, notes = textwrap.wrap(title, int(8 * width)), textwrap.wrap(note, int(13 * width))
     longest = max((len(row) for h in handles for row in str(h.get_label()).split("\n")), default=1)
@@ -378,7 +378,7 @@ def write_figures(
     """Draw every figure that an evaluation has numbers for.
 
     Args:
-        evaluation: What is drawn.
+        evaluation: The evaluation.
         folder: Where to; it is there. It may be a URL. Figures of an earlier evaluation go.
         metric: One of ``METRICS``; the first that the evaluation has if None.
 

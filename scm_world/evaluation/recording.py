@@ -76,7 +76,7 @@ class Recording:
     Attributes:
         environment: Arguments of the environment.
         episodes: The recorded episodes.
-        versions: Of Python, the packages and the backend.
+        versions: Versions of Python, the packages and the backend.
         policy: Description of the policy, if known.
         fingerprint: Hashes of the parts of the system; a replay compares them, if there are any.
         trusted: Packages whose functions may be called to make the environment again; any if the
@@ -181,7 +181,7 @@ class Recording:
         """Write a Parquet file, whole or not at all: one row for each instant.
 
         Args:
-            path: Of the file; it gets the ending ``.parquet`` if it has another one.
+            path: The file; it gets the ending ``.parquet`` if it has another one.
 
         Raises:
             ModelError: Something cannot be written: a function without a name, say.
@@ -204,7 +204,7 @@ class Recording:
         """Read a file of ``save``.
 
         Args:
-            path: Of the file.
+            path: The file.
             trusted: Packages other than this one whose functions may be mechanisms.
 
         Raises:
@@ -302,8 +302,8 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     any step is left out.
 
     Args:
-        env: Of this package. Wrappers that change actions, observations or rewards belong above the
-            recorder.
+        env: An environment of this package. Wrappers that change actions, observations or rewards
+            belong above the recorder.
         infos: Names in ``info`` that are kept; ``"all"`` for all numbers that every instant has,
             terms of the reward as ``"reward_terms.…"``; None for success and fractional success,
             if the task has them.
@@ -482,9 +482,9 @@ def record(
 
     Args:
         policy: Anything that ``as_agent`` reads.
-        env: Of this package; it may have wrappers that intervene, such as a curriculum.
+        env: An environment of this package, perhaps in wrappers that intervene: a curriculum, say.
         n: How many episodes.
-        seed: Of the noise.
+        seed: Seed of the noise.
         first: Number of the first episode within the noise.
         do: An intervention at every reset.
         infos: Names in ``info`` that are kept; see ``Recorder``.

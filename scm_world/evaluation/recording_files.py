@@ -155,7 +155,7 @@ def _plain(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, Subset):
         return value.model_dump(mode="json")
-    raise TypeError(f"{value!r} is no plain data")
+    raise TypeError(f"{value!r} is not plain data")
 
 
 def _reference(task: Task) -> str:
@@ -250,7 +250,7 @@ def from_parquet(
         table = read_table(data).combine_chunks()
         header = json.loads((table.schema.metadata or {}).get(KEY.encode(), "{}"))
         if header.get("format") != FORMAT:
-            raise ValueError("it is no recording")
+            raise ValueError("it is not a recording")
         starts = np.flatnonzero(np.diff(table["episode"].to_numpy(), prepend=-1))
         counts = np.diff([*starts, table.num_rows])
         episodes = [

@@ -81,7 +81,7 @@ class MlpPolicy:
             but the last are hidden.
         log_std: Logarithm of the standard deviations of the actions, shape (n,), if known.
         value: The layers of the network for the value of the state, if known.
-        made_for: What it was trained for, if known.
+        made_for: Metadata of its training, if known.
 
     Raises:
         ModelError: Layers do not fit one another, or are no finite numbers; all problems.
@@ -112,7 +112,7 @@ class MlpPolicy:
 
     @property
     def about(self) -> PolicyAbout:
-        """What it was trained for, and how; if that is not known, what it is taken for."""
+        """Metadata of its training, or the usual metadata if that is not known."""
         return self.made_for or _ANY
 
     @property
@@ -279,7 +279,7 @@ class MlpPolicy:
 
         Args:
             tensors: By name, 32-bit floats; a weight has shape (outputs, inputs).
-            about: What it was trained for, if known: a ``PolicyAbout``, its fields, or its JSON.
+            about: Metadata of its training, if known: a ``PolicyAbout``, its fields, or its JSON.
 
         Raises:
             ModelError: There are others, or they do not fit; all problems.
@@ -301,7 +301,7 @@ class MlpPolicy:
                 layers.append(Layer(left.pop(name).T, left.pop(bias)))
             networks.append(tuple(layers))
         log_std = left.pop("log_std", None)
-        wrong += [f"{name!r} is no tensor of a policy" for name in left]
+        wrong += [f"{name!r} is not a tensor of a policy" for name in left]
         if wrong:
             raise ModelError(wrong)
         return cls(networks[0], log_std, networks[1], made_for)
@@ -315,9 +315,9 @@ def save_policy(
     """Write a trained policy, whole or not at all.
 
     Args:
-        path: Of the file; it ends in ``.safetensors``.
+        path: The file; it ends in ``.safetensors``.
         network: A policy, or its tensors by name; see ``MlpPolicy.of``.
-        about: What it was trained for; that of the policy if None.
+        about: Metadata of its training; that of the policy if None.
 
     Returns:
         The path.
@@ -340,7 +340,7 @@ def load_policy(path: Path | str) -> MlpPolicy:
     """Read a trained policy. Nothing in the file is executed.
 
     Args:
-        path: Of the file; ``"zoo:pushing"``; or the folder of a training run, see ``file_of``.
+        path: The file; ``"zoo:pushing"``; or the folder of a training run, see ``file_of``.
 
     Raises:
         UnknownOption: The zoo has none of this name.
@@ -369,10 +369,10 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
     Nothing in the file is executed.
 
     Args:
-        path: Of the ``.zip`` archive.
+        path: The ``.zip`` archive.
 
     Raises:
-        UnreadableFile: It is no such archive, or the policy in it is no multilayer perceptron.
+        UnreadableFile: It is not such an archive, or the policy in it is no multilayer perceptron.
     """
     name = fspath(path)
     try:
