@@ -22,8 +22,7 @@ from scm_world.evaluation.episodes import LAST, METRICS
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Interval, performance_profile
 from scm_world.output.canvas import INK, PALETTE, blank, save, styled
-from scm_world.output.durable import removed
-from scm_world.output.remote import Location, located
+from scm_world.runs.files import Location, located, removed
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

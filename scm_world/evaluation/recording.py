@@ -26,6 +26,7 @@ from scm_world.errors import (
     SnapshotMismatch,
     UnknownOption,
     UnreadableFile,
+    in_one_line,
 )
 from scm_world.evaluation.episodes import Hook, play
 from scm_world.evaluation.recording_files import (
@@ -37,13 +38,11 @@ from scm_world.evaluation.recording_files import (
     to_parquet,
     whole,
 )
-from scm_world.output.durable import said, write_durably
-from scm_world.output.reading import LARGEST_TABLE, read_bytes
-from scm_world.output.remote import Location, located
 from scm_world.policies.agents import Agent, as_agent
 from scm_world.queries.episodes import as_names
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
+from scm_world.runs.files import Location, located, read_bytes, write_whole
 from scm_world.tasks import Task
 from scm_world.tasks.factories import refuse_untrusted
 
@@ -185,7 +184,7 @@ class Recording:
 
         Raises:
             ModelError: Something cannot be written: a function without a name, say.
-            UnwritableFolder: There is no such folder, no room, or no permission.
+            UnwritableFolder: There is no room, or no permission.
         """
         target = located(path)
         if target.suffix != ".parquet":
@@ -196,7 +195,7 @@ class Recording:
             "versions": dict(self.versions),
             "policy": None if self.policy is None else dict(self.policy),
         }
-        write_durably(target, to_parquet(about, self.episodes))
+        write_whole(target, to_parquet(about, self.episodes))
         return target
 
     @classmethod
@@ -212,10 +211,10 @@ class Recording:
             ModelError: A mechanism is a function of no trusted package.
         """
         try:
-            data = read_bytes(path, LARGEST_TABLE)
+            data = read_bytes(path)
         except OSError as error:
             advice = "give one that a Recording was saved to"
-            raise UnreadableFile(str(path), said(error), advice) from None
+            raise UnreadableFile(str(path), in_one_line(error), advice) from None
         header, episodes = from_parquet(data, str(path), trusted)
         about = header["environment"], tuple(episodes), header["versions"], header["policy"]
         return cls(*about, header["fingerprint"], tuple(trusted))

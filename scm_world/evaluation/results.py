@@ -21,7 +21,7 @@ from scm_world.evaluation.statistics import (
     find_causes,
     mean_interval,
 )
-from scm_world.output.remote import Location, located
+from scm_world.runs.files import Location, located
 
 KEYS = ("agent", "run", "engine", "protocol", "seed", "episode")
 """The columns that say which episode a row is of."""

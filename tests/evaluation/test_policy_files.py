@@ -24,7 +24,7 @@ from scm_world.errors import (
     UnwritableFolder,
 )
 from scm_world.evaluation import in_world
-from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, networks, save_policy
+from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
 from scm_world.policies.agents import agent_from, as_agent
 from scm_world.policies.cards import KEY, OPTIONS, USUAL, plain
 from scm_world.queries import World
@@ -235,16 +235,6 @@ def test_damaged_and_foreign_files_are_refused(tmp_path: Path, how: str, match: 
         as_agent(path)
     assert "a.safetensors" in str(caught.value)
     assert "give " in str(caught.value)
-
-
-def test_a_file_that_is_too_large_is_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its size is looked at first."""
-    path = trained(tmp_path / "a.safetensors")
-    monkeypatch.setattr(networks, "LARGEST", 1000)
-    with pytest.raises(UnreadableFile, match="at most 1,000 are read"):
-        load_policy(path)
 
 
 FULL = tensors(56, 16, 9)
