@@ -42,9 +42,10 @@ from scm_world.variables import (
 )
 from scm_world.variables.checks import check_bounds, check_space, coerce
 from scm_world.variables.subsets import AnyRegion
-from scm_world.world.compiled_task import CompiledTask, PendingInterventions, StepBase
+from scm_world.world.compiled_task import CompiledTask, PendingInterventions
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import uniforms
+from scm_world.world.snapshot import Snapshot
 from scm_world.world.structures import StructureCache, restructured
 
 ATTEMPTS = 1000
@@ -130,7 +131,7 @@ class Transaction:
     def __init__(
         self,
         structures: StructureCache,
-        base: StepBase,
+        base: Snapshot,
         request: Mapping[str, Any],
         space: AnyRegion | None,
         key: NoiseKey,
@@ -460,7 +461,7 @@ class Transaction:
 
     # --- bodies, and many draws ---------------------------------------------------------------
 
-    def compare(self, before: StepBase) -> list[Overlap]:
+    def compare(self, before: Snapshot) -> list[Overlap]:
         """Find what changes; list overlaps deeper than what physics left."""
         compiled, row, now = self.compiled, self.row, before.row
         self.changed = now.differing(row)
@@ -553,7 +554,7 @@ class Transaction:
 
 
 def difference(
-    now: StepBase, compiled: CompiledTask, then: Rows, changed: Iterable[str]
+    now: Snapshot, compiled: CompiledTask, then: Rows, changed: Iterable[str]
 ) -> Difference | None:
     """Return what a backend has to change; None if nothing.
 
@@ -579,8 +580,8 @@ def difference(
 
 
 def overlaps(
-    base: StepBase,
-    now: StepBase,
+    base: Snapshot,
+    now: Snapshot,
     compiled: CompiledTask,
     then: Rows,
     change: Difference,
@@ -600,8 +601,8 @@ def overlaps(
 
 def feasible(
     structures: StructureCache,
-    base: StepBase,
-    now: StepBase,
+    base: Snapshot,
+    now: Snapshot,
     request: Mapping[str, Any],
     space: AnyRegion | None,
     key: NoiseKey,
@@ -674,8 +675,8 @@ def feasible(
 def _nearest(
     wanted: str,
     structures: StructureCache,
-    base: StepBase,
-    now: StepBase,
+    base: Snapshot,
+    now: Snapshot,
     request: Mapping[str, Any],
     key: NoiseKey,
 ) -> Any:
