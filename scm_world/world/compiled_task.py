@@ -196,6 +196,7 @@ class CompiledTask(ActionVector):
         carried: States that follow others when these are set, by name, causes before effects.
         set_by_hand: Everything that is set at one instant: states, and the clock.
         set_parents: These others, by state.
+        carriers: All of these others.
         computed: Variables that are computed from what moves, causes before effects.
         static_names: Everything that interventions alone decide, causes before effects.
         static: The same, without their order.
@@ -221,6 +222,7 @@ class CompiledTask(ActionVector):
         measured = [v for v in ordered if isinstance(v, Measured)]
         self.set_parents = {v.name: found for v in measured if (found := v.set_parents())}
         self.carried = {v.name: v for v in measured if v.name in self.set_parents}
+        self.carriers = frozenset(name for found in self.set_parents.values() for name in found)
         self.set_by_hand = frozenset(v.name for v in self.model.variables if v.role == "state")
         problems = [
             f"{v.name!r} is drawn in every step, which a world does not do: use a noise of the task"

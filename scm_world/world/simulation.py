@@ -198,7 +198,7 @@ class Simulation(CausalSystem):
         if not self._checked:
             check_functions(self.compiled, self.evaluate())
             self._checked = True
-        self._keep_base(self._step_base(at_start=True))
+        self._base, self._base_step = self._step_base(at_start=True), self.index
 
     def _draw_nature(self) -> None:
         """Draw what is random by declaration: the noise of this episode."""
@@ -389,7 +389,8 @@ class Simulation(CausalSystem):
             InterventionError: The request was refused; the world is bit-identical to before.
             NotReset: There is no episode yet.
         """
-        self._require_state()
+        if not self._started or self._lost:
+            self._require_state()
         problems: list[InterventionError] = []
         flat, before = flatten(request, problems), self._step_base()
         base = self.base or before
@@ -403,7 +404,8 @@ class Simulation(CausalSystem):
         pending = done.kept()
         audit = self._commit(done, before, flat, check, at_start=base.at_start)
         rest = (base.structure, pending, drawn, base.at_start)
-        self._keep_base(Snapshot(base.compiled, base.model, base.row, *rest))
+        self._base = Snapshot(base.compiled, base.model, base.row, *rest)
+        self._base_step = self.index - self._offset
         return audit
 
     def _anew(
@@ -457,9 +459,6 @@ class Simulation(CausalSystem):
     def base(self) -> Snapshot | None:
         """The world at this control step before anyone intervened; None after a step."""
         return self._base if self.index - self._offset == self._base_step else None
-
-    def _keep_base(self, base: Snapshot | None) -> None:
-        self._base, self._base_step = base, self.index - self._offset
 
     def _commit(
         self,
@@ -654,7 +653,7 @@ class Simulation(CausalSystem):
             raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
         self._lost, self._offset = "", found.offset
         self.noise, self.episode = noise, found.episode
-        self._keep_base(found.base)
+        self._base, self._base_step = found.base, self.index - self._offset
 
     def close(self) -> None:
         """Free the engine. There is no episode any more."""
