@@ -16,9 +16,9 @@ from scm_world._types import Floats
 from scm_world.curricula import make_vec
 from scm_world.env import IDS
 from scm_world.errors import Diverged, UnknownOption
-from scm_world.output.durable import made, write_whole
 from scm_world.policies import save_policy
 from scm_world.queries.progress import Progress, Tell, clock
+from scm_world.runs.files import made, write_whole
 from scm_world.training.export import exported, mean, scored, words
 from scm_world.training.recipe import Recipe, curriculum_of
 from scm_world.training.sb3 import Sb3VecEnv
@@ -96,10 +96,6 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
         backend: Name of the engine.
         threads: Of a backend that steps many worlds in one call, or processes of another one; as
             many as there are cores if None. What comes out does not depend on it.
-
-    Raises:
-        UnknownOption: There is no such backend, or an option of the environment does not exist.
-        InterventionError: The curriculum names something that does not exist.
     """
     several = "workers" if backend == "bullet" else "threads"
     ids = {task: name for name, task in IDS.items()}
@@ -148,9 +144,6 @@ def scales_of(vec_env: Any, env: Mapping[str, Any]) -> Floats:
     Args:
         vec_env: For Stable-Baselines3.
         env: Options of the environment.
-
-    Raises:
-        UnknownOption: Observations are not normalized.
     """
     if env.get("normalize_observations") is False:
         raise UnknownOption("normalize_observations with network.scaled", False, ("True",))
@@ -172,9 +165,6 @@ def device_for(recipe: Recipe, device: str) -> str:
         recipe: How an agent is trained.
         device: ``"cpu"``, ``"cuda"``, or ``"auto"``: the GPU for SAC and TD3 if there is one; the
             networks of PPO are too small to gain from it.
-
-    Raises:
-        UnknownOption: There is no such device.
     """
     one_of("device", device, ("auto", "cpu", "cuda"))
     has_gpu = device != "cpu" and torch.cuda.is_available()
@@ -421,7 +411,7 @@ class Watch(BaseCallback):
         score = mean(scores)
         found = {"steps": steps, "metric": metric, "mean": score, "scores": scores}
         path = made(self._folder / "evaluations") / f"{steps}.json"
-        write_whole(json.dumps(found, indent=2), path)
+        write_whole(path, json.dumps(found, indent=2))
         self._tell(f"{steps:,} steps: {words(scores)}")
         for name, value in scores.items():
             self.logger.record(f"evaluation/{name}", value)

@@ -23,8 +23,7 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.acceptance import refuse_time
-from scm_world.graph.evaluate import AppliedIntervention, noise_of, source_of
+from scm_world.graph.evaluate import noise_of
 from scm_world.models import Difference
 from scm_world.models.scene import SURFACES, Overlap
 from scm_world.variables import (
@@ -41,7 +40,7 @@ from scm_world.variables import (
     divided,
     whole_of,
 )
-from scm_world.variables.checks import check_bounds, check_space, coerce
+from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import CompiledTask, PendingInterventions
 from scm_world.world.mechanisms import Rows
@@ -379,7 +378,7 @@ class Transaction:
                 case Mechanism():
                     wanted = self._followed(requested, act)
                 case Draw():
-                    source = source_of(AppliedIntervention(act, requested))
+                    source = act.drawn_from(requested)
                     wanted = self._key.draw(source, whole, requested.shape, self.row, act.stream)
                 case _:
                     wanted = present = self.compiled.coordinates(name, self.row)
@@ -521,7 +520,7 @@ class Transaction:
             whole = whole_of(act, asked)
             if type(act) is Draw and asked == name and whole in where:
                 requested = compiled.model.declared(whole)
-                source, shape = source_of(AppliedIntervention(act, requested)), requested.shape
+                source, shape = act.drawn_from(requested), requested.shape
                 if source.parents():
                     return None
                 streams = (key.stream(whole, act.stream, n) for n in attempts)
