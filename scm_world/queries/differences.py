@@ -90,7 +90,7 @@ def compare(
             rows[name] = 0, np.inf, 0, np.asarray(np.inf)
             continue
         apart = values[0] - values[1]
-        if any(is_category(world, Outcome(name)) for _, world in one.declarations):
+        if any(is_category(era.compiled, Outcome(name)) for era in one.eras):
             apart = (apart != 0.0).astype(float)
         sizes = np.abs(apart).reshape(len(apart), -1).max(axis=1, initial=0.0)
         differs, at = sizes > tolerance, int(np.argmax(sizes))
@@ -213,7 +213,7 @@ def consequences(
             world.do(request, space=space)
         other = replace(plain, plan=system.planned(request)).run(world, twins)
         engine = world.engine if is_world else ""
-    audit, models = other.audits[0], [ran.declarations[0][1].model for ran in (one, other)]
+    audit, models = other.audits[0], [ran.eras[0].compiled.model for ran in (one, other)]
     targets = {models[0].target(name) for name in audit.targets}
     follow = {
         name
