@@ -40,8 +40,9 @@ from evaluation_steps import shares
 
 from benchmarks import as_json
 from scm_world.evaluation.pipeline import evaluate, played
+from scm_world.evaluation.preparation import prepare
 from scm_world.evaluation.protocols import protocols_of
-from scm_world.evaluation.setups import SHARD, prepare
+from scm_world.evaluation.setups import SHARD
 
 TASK = "pushing"
 PUBLISHED = 200  # episodes of a protocol in the predecessor's benchmark
@@ -149,7 +150,7 @@ def whole(n: int, core: int) -> dict[str, Any]:
     return {
         "episodes": len(one),
         "versions": one.about["versions"],
-        "control steps": int(one.columns["steps"].sum()),
+        "control steps": int(one.frame["steps"].sum()),
         "one worker": single,
         "two workers": {"seconds": double["seconds"]},
         "shards": len(one.protocols) * -(-n // SHARD),

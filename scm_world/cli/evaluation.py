@@ -60,8 +60,8 @@ def evaluate(
     from scm_world import evaluation
     from scm_world.evaluation import METRICS
     from scm_world.evaluation.figures import write_figures
-    from scm_world.evaluation.files import CODECS
-    from scm_world.evaluation.setups import task_of
+    from scm_world.evaluation.files import FORMS
+    from scm_world.evaluation.preparation import task_of
 
     if trust or policy is not None:
         sys.path.insert(0, str(Path.cwd()))  # for what is defined beside where this is called
@@ -69,7 +69,7 @@ def evaluate(
     if policy is None:
         raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")
     one_of("metric", metric, (None, *METRICS))
-    one_of("format", format_, CODECS)
+    one_of("format", format_, FORMS)
     agents = policies_of(policy)
     task = task or task_of(agents)
     made = load_task(task, option)
@@ -144,7 +144,7 @@ def policies_of(text: str) -> dict[str, list[str]]:
         >>> policies_of("mine=a.zip+b.zip,random")
         {'mine': ['a.zip', 'b.zip'], 'random': ['random']}
     """
-    from scm_world.evaluation.players import NAMES
+    from scm_world.policies.agents import NAMES
 
     found: dict[str, list[str]] = {}
     for word in (part.strip() for part in text.split(",")):

@@ -12,9 +12,10 @@ from hashlib import blake2b
 from typing import Any, final
 
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
-from scm_world.evaluation.episodes import METRICS, EpisodeRow, EpisodeRunner
-from scm_world.evaluation.results import Evaluation, columns_of
-from scm_world.evaluation.setups import Setup, Shard, prepare
+from scm_world.evaluation.episodes import METRICS, EpisodeRow, EpisodeRunner, Hook
+from scm_world.evaluation.preparation import prepare
+from scm_world.evaluation.results import Evaluation, frame_of
+from scm_world.evaluation.setups import Setup, Shard, form_of
 from scm_world.output.durable import locked, made, write_whole
 from scm_world.output.reading import read_text
 from scm_world.output.remote import Location, located
@@ -42,23 +43,23 @@ class ShardRunner:
         """Play all episodes of a shard."""
         return [self.play(shard, episode) for episode in range(shard.first, shard.stop)]
 
-    def play(self, shard: Shard, episode: int, watch: Any = None) -> EpisodeRow:
+    def play(self, shard: Shard, episode: int, hooks: Sequence[Hook] = ()) -> EpisodeRow:
         """Play one episode of it."""
-        agent_run = self.setup.agents[shard.agent]
         return self.runner(shard).play(
-            agent_run.player,
+            self.setup.agents[shard.agent, shard.run],
             self.setup.protocols[shard.protocol],
             seed=shard.seed,
             episode=episode,
-            who=(agent_run.agent, agent_run.run),
-            watch=watch,
+            who=(shard.agent, shard.run),
+            hooks=hooks,
         )
 
     def runner(self, shard: Shard) -> EpisodeRunner:
         """Return the runner of a shard: its backend, and the options of its agent."""
-        key = self.setup.where(shard)
+        agent = self.setup.agents[shard.agent, shard.run]
+        key = json.dumps([shard.engine, form_of(agent)], sort_keys=True)
         if key not in self.runners:
-            self.runners[key] = EpisodeRunner(self.setup.env(shard))
+            self.runners[key] = EpisodeRunner(self.setup.env(shard.engine, agent))
         return self.runners[key]
 
     def close(self) -> None:
@@ -91,7 +92,7 @@ def evaluate(
 
     Args:
         policy: A policy; a list of policies, one for each training run of an agent; or either by
-            the name of the agent. What a policy can be is said at ``as_player``.
+            the name of the agent. What a policy can be is said at ``as_agent``.
         protocols: Names (``"P0,P5"``, ``"P2@100"`` for within the episodes), patterns,
             ``Protocol``, or several; all of the task if None.
         task: Name, or a task; if None the one that the policies were trained for, else pushing.
@@ -144,8 +145,8 @@ def evaluate(
         locked(folder) if folder is not None else nullcontext(),
     ):
         rows = played(setup, executor, folder=folder, progress=progress, tell=tell)
-    policies = {(one.agent, one.run): one.player.policy for one in setup.agents}
-    return Evaluation(setup.about(), columns_of(rows), policies)
+    policies = {who: agent.policy for who, agent in setup.agents.items()}
+    return Evaluation(setup.about(), frame_of(rows), policies)
 
 
 def played(
@@ -169,7 +170,8 @@ def played(
     keys = [setup.key(shard) if folder is not None else "" for shard in shards]
     found: dict[int, list[EpisodeRow]] = {}
     for place, (shard, key) in enumerate(zip(shards, keys, strict=True)):
-        noisy = setup.agents[shard.agent].about.get("repeats") == "no"  # who may be another by now
+        about = setup.agents[shard.agent, shard.run].about
+        noisy = about.get("repeats") == "no"  # it may act otherwise by now
         if folder is not None and not noisy:
             kept = read_part(folder, key, shard.stop - shard.first)
             if kept is not None:
@@ -178,7 +180,7 @@ def played(
     planned = sum(shard.stop - shard.first for shard in shards)
     before, begun = sum(map(len, found.values())), time.perf_counter()
 
-    def tell_progress(protocol: int | None = None) -> None:
+    def tell_progress(protocol: str | None = None) -> None:
         done = sum(map(len, found.values()))
         if progress is not None:
             progress(done, planned)
@@ -193,16 +195,16 @@ def played(
     with opened(executor) as player:
         if not isinstance(player, Serial):
             try:
-                player.check("task with several workers", setup.place.task)
+                player.check("task with several workers", setup.task)
             except UnknownOption as error:
                 allowed = (
                     "a name, a file or 'module:function' for a function that makes it",
                     f"workers=None ({error})",
                 )
-                given = setup.place.name
+                given = setup.made.name
                 raise UnknownOption("task with several workers", given, allowed) from error
-        for one in setup.agents:
-            player.check(f"policy {one.agent!r} with several workers", one.player.policy)
+        for (name, _), agent in setup.agents.items():
+            player.check(f"policy {name!r} with several workers", agent.policy)
         make = partial(ShardRunner, setup)
         for index, rows in player.run(make, [shards[place] for place in missing]):
             place = missing[index]

@@ -11,7 +11,6 @@ from stores import MemoryFileSystem, everything, fresh, refuse
 from scm_world.discovery import discover
 from scm_world.discovery.benchmarks import BenchmarkResult, benchmark
 from scm_world.discovery.data import Dataset, Design, collect, load, save
-from scm_world.discovery.run import Checkpoint
 from scm_world.errors import UnreadableFile, UnwritableFolder
 from scm_world.evaluation import Evaluation, evaluate
 from scm_world.evaluation.figures import write_figures
@@ -77,7 +76,7 @@ def test_a_dataset_is_the_same_in_a_store(tmp_path: Path) -> None:
     """Interrupted, gone on with, and made larger: every file is that of a folder."""
     local, folder = collected(tmp_path / "local"), fresh()
     with pytest.raises(KeyboardInterrupt):
-        collected(str(folder), progress=stop_at(6))
+        collected(str(folder), progress=stop_at(4))
     assert "shard-00001.parquet" not in everything(folder)
     assert len(load(str(folder), partial=True)) == 4
     assert collected(str(folder)) == local == load(str(folder))
@@ -95,12 +94,12 @@ def test_a_url_of_this_machine_is_a_folder(tmp_path: Path) -> None:
 
 
 def test_a_saved_dataset_is_the_same_in_a_store(tmp_path: Path) -> None:
-    """And a second one beside it is refused."""
+    """And nothing is saved over it."""
     table, folder = collected(tmp_path / "whole"), fresh()
     save(table, tmp_path / "saved")
     assert str(save(table, str(folder))) == str(folder)
     assert everything(folder) == below(tmp_path / "saved")
-    with pytest.raises(UnreadableFile, match=r"memory://.* another dataset"):
+    with pytest.raises(UnreadableFile, match=r"memory://.* not empty"):
         save(table.first(3), str(folder))
 
 
@@ -122,19 +121,13 @@ def test_a_benchmark_resumes_from_a_store() -> None:
 
 
 def test_a_discovery_goes_on_from_a_store() -> None:
-    """What is found is the same, and nothing is left in the end."""
-    file = fresh() / "progress.json"
+    """What is found is the same."""
+    folder = fresh() / "probes"
     whole = discover("reaching", probes=2, backend="fake")
     world = World("reaching", backend="fake")
-    discover(world, probes=1, checkpoint=str(file))
-    assert not file.exists()
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Checkpoint, "end", lambda _: None)
-        discover(world, probes=1, checkpoint=file)
-    assert file.exists()
-    assert set(discover(world, probes=2, checkpoint=file).found) == set(whole.found)
-    assert not file.exists()
+    discover(world, probes=1, checkpoint=str(folder))
+    assert set(everything(folder)) == {"study.json", "probe-0.json"}
+    assert set(discover(world, probes=2, checkpoint=folder).found) == set(whole.found)
 
 
 def test_a_recording_is_read_from_a_store() -> None:
@@ -195,5 +188,5 @@ def test_there_is_nothing_to_read() -> None:
     """The error names the URL."""
     with pytest.raises(UnreadableFile, match=r"memory://.*cannot be read"):
         Evaluation.load(str(fresh()))
-    with pytest.raises(UnreadableFile, match=r"memory://.*dataset\.json"):
+    with pytest.raises(UnreadableFile, match=r"memory://.*study\.json"):
         load(str(fresh()))

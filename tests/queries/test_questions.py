@@ -35,8 +35,8 @@ from scm_world.errors import (
     SnapshotMismatch,
     UnknownOption,
 )
-from scm_world.evaluation import as_player
 from scm_world.graph import from_json, to_json
+from scm_world.policies import as_agent
 from scm_world.queries import (
     Effect,
     Episode,
@@ -369,9 +369,7 @@ def pair() -> SCM:
         lambda m: nature_graph("x", {}, ["y"]),
         lambda m: nature_graph(m, {}, None),
         Laboratory,
-        lambda m: graph.d_separated({"x": []}, ["x"], ["y"]),
-        lambda m: graph.d_separated(m, ["x"], ["x"]),
-        lambda m: graph.d_separated(m, None, ["y"]),
+        lambda m: graph.to_dag({"x": []}),
         lambda m: graph.unrolled(m, 1.5),
         lambda m: graph.episode_outcome(None, ["y"]),
         lambda m: to_json("x"),
@@ -631,7 +629,7 @@ def test_an_episode_of_equations_is_no_policy(tmp_path: Path) -> None:
     saved = save_episode(SCM([RATE]).rollout(), tmp_path / "episode")
     for policy in (episode, saved):
         with pytest.raises(UnknownOption, match="an array of actions"):
-            as_player(policy)
+            as_agent(policy)
 
 
 def test_the_world_is_one_of_a_step_function() -> None:
