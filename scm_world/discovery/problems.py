@@ -18,7 +18,7 @@ from scm_world._arguments import one_of, typed, whole_number
 from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Floats, Value
 from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
-from scm_world.discovery.data.recorded import settable
+from scm_world.discovery.data.recorded import first_name, settable
 from scm_world.discovery.data.truth import GroundTruth as GroundTruth
 from scm_world.discovery.data.truth import observed_part, truth_of_model
 from scm_world.discovery.data.worlds import EpisodeRows
@@ -490,7 +490,9 @@ class WorldProblem:
             outcomes=self._outcomes,
             every_step=self._by_step,
         )
-        names = tuple(dict.fromkeys(column.variable for column in rows.columns))
+        place = {first_name(self._world.model, n): i for i, n in enumerate(self._causes)}
+        there = dict.fromkeys(column.variable for column in rows.columns)
+        names = sorted(there, key=lambda name: place.get(name, len(place)))
         return replace(observed_part(shown, rows.about["truth"], names), about=self._about())
 
     def _about(self) -> dict[str, Any]:
