@@ -20,12 +20,8 @@ from scm_world._types import Floats, Value
 from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
 from scm_world.discovery.data.recorded import first_name, settable
 from scm_world.discovery.data.truth import GroundTruth as GroundTruth
-from scm_world.discovery.data.truth import (
-    observed_part,
-    truth_of_episodes,
-    truth_of_model,
-    truth_of_steps,
-)
+from scm_world.discovery.data.truth import observed_part, truth_of_model
+from scm_world.discovery.data.worlds import EpisodeRows
 from scm_world.discovery.learners.paired import (
     EpisodeSimulator,
     PairedSimulator,
@@ -36,7 +32,7 @@ from scm_world.errors import ModelError, UnknownOption, UnknownVariable, Unreada
 from scm_world.graph import SCM, from_json
 from scm_world.output.reading import read_text
 from scm_world.policies.scripted import as_policy
-from scm_world.queries.outcomes import Outcome, as_outcome
+from scm_world.queries.outcomes import as_outcome
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.tasks import TASKS, Task, TriFingerTask, make_task
 from scm_world.tasks.factories import FILES, load_factory
@@ -416,8 +412,7 @@ class WorldProblem:
             self._causes = self._chosen()
             found = default_outcomes(self._world, every_step=True)
             self._outcomes = tuple(map(as_outcome, view.outcomes or found))
-            shown = problem_label(name, view)
-            self.truth = self._step_truth(shown) if self._by_step else self._outcome_truth(shown)
+            self.truth = self._truth(problem_label(name, view))
         except BaseException:
             self._world.close()
             raise
@@ -486,21 +481,19 @@ class WorldProblem:
             drawn["sensor_noise"] = self._view.sensor_noise
         return drawn
 
-    def _outcome_truth(self, shown: str) -> GroundTruth:
-        ends = [Outcome(outcome.name) for outcome in self._outcomes]
-        labels = {outcome: outcome.name for outcome in ends}
-        model = self._world.model
-        written = truth_of_episodes(model, self._contexts, self._causes, ends, labels)
-        named = (first_name(model, name) for name in self._causes)
-        names = tuple(dict.fromkeys((*named, *labels.values())))
-        return replace(observed_part(shown, written, names), about=self._about())
-
-    def _step_truth(self, shown: str) -> GroundTruth:
-        actions, bundles = self._world.compiled.actions, self._world.compiled.bundles
-        outcomes = (outcome.name for outcome in self._outcomes)
-        names = tuple(dict.fromkeys((*self._causes, *outcomes, *actions)))
-        written = truth_of_steps(self._world.model, names, bundles)
-        return replace(observed_part(shown, written, names), about=self._about())
+    def _truth(self, shown: str) -> GroundTruth:
+        rows = EpisodeRows(
+            self._world,
+            Design(),
+            Setting(self._policy, self._contexts, self._view.steps),
+            causes=self._causes,
+            outcomes=self._outcomes,
+            every_step=self._by_step,
+        )
+        place = {first_name(self._world.model, n): i for i, n in enumerate(self._causes)}
+        there = dict.fromkeys(column.variable for column in rows.columns)
+        names = sorted(there, key=lambda name: place.get(name, len(place)))
+        return replace(observed_part(shown, rows.about["truth"], names), about=self._about())
 
     def _about(self) -> dict[str, Any]:
         view, backend = self._view, self._world.backend
