@@ -20,12 +20,8 @@ from scm_world._types import Floats, Value
 from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
 from scm_world.discovery.data.recorded import first_name, settable
 from scm_world.discovery.data.truth import GroundTruth as GroundTruth
-from scm_world.discovery.data.truth import (
-    observed_part,
-    truth_of_episodes,
-    truth_of_model,
-    truth_of_steps,
-)
+from scm_world.discovery.data.truth import observed_part, truth_of_model
+from scm_world.discovery.data.worlds import EpisodeRows
 from scm_world.discovery.learners.paired import (
     EpisodeSimulator,
     PairedSimulator,
@@ -37,7 +33,7 @@ from scm_world.graph import SCM, from_json
 from scm_world.output.reading import read_text
 from scm_world.policies.scripted import as_policy
 from scm_world.queries.equations import Equations
-from scm_world.queries.outcomes import Outcome, as_outcome
+from scm_world.queries.outcomes import as_outcome
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.tasks import TASKS, Task, TriFingerTask, make_task
 from scm_world.tasks.factories import FILES, load_factory
@@ -487,14 +483,17 @@ class WorldProblem:
 
     def _truth(self, shown: str) -> GroundTruth:
         view, backend, model = self._view, self._world.backend, self._world.model
-        ends = [outcome.name for outcome in self._outcomes]
-        if self._by_step:
-            names = (*self._causes, *ends, *self._world.compiled.actions)
-            written = truth_of_steps(model, dict.fromkeys(names), self._world.compiled.bundles)
-        else:
-            names = (*(first_name(model, name) for name in self._causes), *ends)
-            labels = {Outcome(name): name for name in ends}
-            written = truth_of_episodes(model, self._contexts, self._causes, [*labels], labels)
+        rows = EpisodeRows(
+            self._world,
+            Design(),
+            Setting(self._policy, self._contexts, view.steps),
+            causes=self._causes,
+            outcomes=self._outcomes,
+            every_step=self._by_step,
+        )
+        place = {first_name(model, name): i for i, name in enumerate(self._causes)}
+        there = dict.fromkeys(column.variable for column in rows.columns)
+        names = sorted(there, key=lambda name: place.get(name, len(place)))
         about = {
             "kind": f"task, view by {view.view}",
             "budget": "control steps" if self._by_step else "episodes",
@@ -505,7 +504,7 @@ class WorldProblem:
             "options": {k: str(v) for k, v in view.options.items()},
             "arguments": {k: str(v) for k, v in view.arguments.items()},
         }
-        return replace(observed_part(shown, written, tuple(dict.fromkeys(names))), about=about)
+        return replace(observed_part(shown, rows.about["truth"], names), about=about)
 
     def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
         """Collect episodes; seven of ten interventional ones set half of the causes, in A|B."""

@@ -133,11 +133,7 @@ class MetricComparison:
 
 
 def comparisons_of(evaluation: Evaluation, metric: str) -> dict[str, MetricComparison]:
-    """Compare the agents on each backend over all protocols.
-
-    Raises:
-        UnknownOption: Agents have not played the same protocols, or one episode only.
-    """
+    """Compare the agents on each backend over all protocols."""
     return {
         engine: _compared(evaluation.only(engine=engine), metric) for engine in evaluation.engines
     }
@@ -433,7 +429,7 @@ def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
         ring = [scores.get((line, protocol)) for protocol in (*words, next(iter(words)))]
         known = [one or Interval(math.nan, math.nan, math.nan, 0.0, 0) for one in ring]
         gid, style = "|".join(line), look.line
-        beside = turns + look.shift * np.pi / (4 * len(words))
+        beside = turns + look.shift * np.pi / (8 * len(words))
         ax.plot(beside, [one.value for one in known], gid=gid, clip_on=False, zorder=3, **style)
         lows, highs = ([f(one.ends) for one in known] for f in (min, max))
         band = {"color": style["color"], "alpha": 0.16, "lw": 0, "gid": f"band {gid}"}

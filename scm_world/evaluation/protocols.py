@@ -116,11 +116,7 @@ class Protocol(Frozen):
 
 
 def named(what: str, name: Any) -> str:
-    """Check that something can stand in tables, in lists with commas, and in the names of files.
-
-    Raises:
-        UnknownOption: It cannot.
-    """
+    """Check that something can stand in tables, in lists with commas, and in the names of files."""
     is_word = isinstance(name, str) and name.isprintable() and name.strip() == name != ""
     if not is_word or len(name) > LONGEST or any(letter in name for letter in "/\\,"):
         allowed = f"a word or several, up to {LONGEST} letters, without slashes and commas"
@@ -135,9 +131,6 @@ def chosen(given: Any, known: Sequence[Protocol]) -> tuple[Protocol, ...]:
         given: None for all; a protocol, a name, a pattern, or several, in a list or with commas
             between them. ``P2@100`` is P2 within the episodes, after 100 control steps.
         known: Those of the task.
-
-    Raises:
-        UnknownOption: There is none of a name, or two have one name.
 
     Example:
         >>> known = [Protocol("P0"), Protocol("P1", "*.mass")]

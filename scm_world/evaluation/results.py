@@ -77,11 +77,7 @@ def is_settled(frame: pandas.DataFrame) -> bool:
 
 
 def paired(one: pandas.DataFrame, other: pandas.DataFrame, metric: str) -> Interval:
-    """Estimate by how much the scores of a table are higher, episode by episode.
-
-    Raises:
-        UnknownOption: They do not have the same episodes.
-    """
+    """Estimate by how much the scores of a table are higher, episode by episode."""
     mine, its = means(one, metric), means(other, metric)
     if not mine.index.equals(its.index):
         differ = mine.index.symmetric_difference(its.index)[0]

@@ -39,7 +39,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
+from scm_world.errors import (
+    DAMAGED,
+    ActionError,
+    ModelError,
+    UnknownOption,
+    UnreadableFile,
+    in_one_line,
+)
 from scm_world.output.durable import write_durably
 from scm_world.output.reading import LARGEST, read_arrays, read_bytes, refuse_large, regular
 from scm_world.output.remote import Location, located
@@ -130,11 +137,6 @@ class MlpPolicy:
         Returns:
             Shape (..., n_actions), in [-1, 1], dtype float32; each observation of a batch gets, bit
             for bit, the action that it gets alone.
-
-        Raises:
-            ActionError: The observation has another number of components, or other parts; or the
-                policy has a memory.
-            UnknownOption: There is a generator, but the standard deviations are not known.
         """
         found = self.mean(observation)
         if generator is not None:
@@ -351,17 +353,14 @@ def load_policy(path: Path | str) -> MlpPolicy:
         with safetensors.safe_open(regular(Path(name), LARGEST), framework="np") as file:
             text = (file.metadata() or {}).get(KEY)
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 # no mapping
-    except OSError as error:
-        raise UnreadableFile(name, error.strerror or str(error), _SAVED) from None
-    except (safetensors.SafetensorError, ValueError, TypeError, KeyError, AttributeError) as error:
-        reason = f"it is damaged, or of another kind ({error})"
-        raise UnreadableFile(name, reason, _SAVED) from None
-    if text is None:
-        raise UnreadableFile(name, f"its metadata has no {KEY!r}, what it is for", _SAVED)
-    try:
+        if text is None:
+            raise ModelError([f"its metadata has no {KEY!r}, what it is for"])
         return MlpPolicy.of(tensors, text)
-    except ModelError as error:
-        raise UnreadableFile(name, "; ".join(error.problems), _SAVED) from None
+    except DAMAGED as error:
+        reason = in_one_line(error)
+        if not isinstance(error, ModelError | OSError):
+            reason = f"it is damaged, or of another kind ({reason})"
+        raise UnreadableFile(name, reason, _SAVED) from None
 
 
 def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
@@ -392,17 +391,12 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
                 tensors[f"{prefix}.{number}.weight"] = found[f"model/{layer}/w:0"].T
                 tensors[f"{prefix}.{number}.bias"] = found[f"model/{layer}/b:0"]
         return MlpPolicy.of(tensors)
-    except KeyError as error:
-        raise UnreadableFile(name, f"it has no entry {error.args[0]!r}", _ARCHIVE) from None
-    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:  # or encrypted
-        reason = f"it is no zip archive, or damaged ({error})"
-        raise UnreadableFile(name, reason, _ARCHIVE) from None
-    except OSError as error:
-        raise UnreadableFile(name, error.strerror or str(error), _ARCHIVE) from None
-    except ModelError as error:
-        raise UnreadableFile(name, "; ".join(error.problems), _ARCHIVE) from None
-    except (ValueError, TypeError) as error:  # pickled objects, or no numbers at all
-        reason = f"its weights are no plain arrays ({error})"
+    except DAMAGED as error:
+        reason = f"it has no entry {error}" if type(error) is KeyError else in_one_line(error)
+        if isinstance(error, zipfile.BadZipFile | zlib.error | EOFError | RuntimeError):
+            reason = f"it is no zip archive, or damaged ({reason})"
+        elif type(error) in (ValueError, TypeError):  # pickled objects, or no numbers at all
+            reason = f"its weights are no plain arrays ({reason})"
         raise UnreadableFile(name, reason, _ARCHIVE) from None
 
 

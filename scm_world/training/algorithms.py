@@ -96,10 +96,6 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
         backend: Name of the engine.
         threads: Of a backend that steps many worlds in one call, or processes of another one; as
             many as there are cores if None. What comes out does not depend on it.
-
-    Raises:
-        UnknownOption: There is no such backend, or an option of the environment does not exist.
-        InterventionError: The curriculum names something that does not exist.
     """
     several = "workers" if backend == "bullet" else "threads"
     ids = {task: name for name, task in IDS.items()}
@@ -148,9 +144,6 @@ def scales_of(vec_env: Any, env: Mapping[str, Any]) -> Floats:
     Args:
         vec_env: For Stable-Baselines3.
         env: Options of the environment.
-
-    Raises:
-        UnknownOption: Observations are not normalized.
     """
     if env.get("normalize_observations") is False:
         raise UnknownOption("normalize_observations with network.scaled", False, ("True",))
@@ -172,9 +165,6 @@ def device_for(recipe: Recipe, device: str) -> str:
         recipe: How an agent is trained.
         device: ``"cpu"``, ``"cuda"``, or ``"auto"``: the GPU for SAC and TD3 if there is one; the
             networks of PPO are too small to gain from it.
-
-    Raises:
-        UnknownOption: There is no such device.
     """
     one_of("device", device, ("auto", "cpu", "cuda"))
     has_gpu = device != "cpu" and torch.cuda.is_available()

@@ -120,9 +120,6 @@ def begin_with(model: Any, recipe: Recipe, start: Path | str) -> None:
         model: Of Stable-Baselines3.
         recipe: How it is trained.
         start: The file.
-
-    Raises:
-        UnreadableFile: It is no policy, or one that observes, acts or is built in another way.
     """
     given, mine = load_policy(start), exported(model, recipe, {})
     theirs, ours = given.tensors(), mine.tensors()

@@ -255,11 +255,6 @@ def curriculum_of(given: Any) -> Curriculum:
         given: 0, 1 or 2 for the published ones; the path of a JSON file; a ``Curriculum``, a part
             of one, or plain data. None is 0.
 
-    Raises:
-        UnknownOption: It is none of these.
-        UnreadableFile: It is a path, and there is no curriculum.
-        ModelError: It calls a custom function.
-
     Example:
         >>> curriculum_of("1").part.kind
         'goal'

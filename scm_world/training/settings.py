@@ -19,11 +19,7 @@ from scm_world.variables.spaces import Frozen
 
 
 def known_task(task: str) -> str:
-    """Check that there is a task of this name, or that it may be a file or ``"module:function"``.
-
-    Raises:
-        UnknownOption: It is neither.
-    """
+    """Check that a text is the name of a task, or may be a file or ``"module:function"``."""
     if task not in tasks() and not is_model(task) and ":" not in task:
         raise UnknownOption("task", task, (*tasks(), *(f"file{end}" for end in FILES), "module:f"))
     return task

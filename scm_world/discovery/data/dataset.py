@@ -237,6 +237,7 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.values)
 
+    @typed
     def __getitem__(self, name: str) -> Floats:
         """Return a column, shape (n,), or all columns of a vector, shape (n, k)."""
         where = self._places([name])
@@ -563,17 +564,7 @@ class Dataset:
 
 
 def numbers(values: Any, names: Sequence[str]) -> Floats:
-    """Return columns of real numbers, shape (n, p).
-
-    Args:
-        values: Shape (n, p), or a data frame or mapping that has columns of these names.
-        names: Names of the columns.
-
-    Raises:
-        ModelError: A column holds something else than numbers, a name is not a text or occurs
-            twice, or there is another number of columns.
-        UnknownVariable: The frame has no such column.
-    """
+    """Return columns of real numbers of an array, a data frame or a mapping, shape (n, p)."""
     import pandas
 
     if not isinstance(names, Iterable):

@@ -39,11 +39,7 @@ def shard_name(index: int) -> str:
 
 
 def settings_of(about: dict[str, Any], columns: Sequence[Column], shard: int) -> dict[str, Any]:
-    """Return the settings of a study; its episodes may become more.
-
-    Raises:
-        ModelError: ``about`` is not plain data, or a column has a name that all files have.
-    """
+    """Return the settings of a study; its episodes may become more."""
     check_names(columns)
     found = {**about, ABOUT: {"columns": [asdict(c) for c in columns], "shard": shard}}
     try:
@@ -73,11 +69,7 @@ def write_count(folder: Location, episodes: int, files: int) -> None:
 
 
 def encoded(table: Dataset) -> bytes:
-    """Return rows as a Parquet file, the same bytes every time; regimes are in its metadata.
-
-    Raises:
-        ModelError: A plan has a function without a name.
-    """
+    """Return rows as a Parquet file, the same bytes every time; regimes are in its metadata."""
     import pyarrow as arrow
     from pyarrow import parquet
 
@@ -99,12 +91,7 @@ def encoded(table: Dataset) -> bytes:
 
 
 def decoded(data: bytes, columns: Sequence[Column], trusted: Sequence[str]) -> Dataset:
-    """Read what ``encoded`` returned.
-
-    Raises:
-        ValueError: It is damaged, or has other columns.
-        ModelError: A plan names a function outside of the trusted packages.
-    """
+    """Read what ``encoded`` returned."""
     import pyarrow as arrow
     from pyarrow import parquet
 
@@ -133,14 +120,11 @@ def decoded(data: bytes, columns: Sequence[Column], trusted: Sequence[str]) -> D
 def together(settings: Mapping[str, Any], parts: Sequence[Dataset]) -> Dataset:
     """Return the rows of all files as one table, with all that is said of its episodes."""
     about = {name: value for name, value in settings.items() if name != ABOUT}
-    said = {
-        name: {number: each for part in parts for number, each in part.about.get(name, {}).items()}
-        for name in ("refused", "touching")
-    }
-    about |= {"refused": said["refused"]} if said["refused"] else {}
-    if "contacts" in about and "touching" not in about:  # a saved table has it
-        whole = about["contacts"] == "episodes"
-        about["touching"] = {"whole": whole, "episodes": said["touching"]}
+    for name in ("refused", "touching"):
+        found = {
+            number: each for part in parts for number, each in part.about.get(name, {}).items()
+        }
+        about |= {name: found} if found else {}
     return replace(Dataset.joined([replace(part, about={}) for part in parts]), about=about)
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
-from itertools import groupby
 from typing import Any, final
 
 import numpy as np
@@ -68,23 +67,8 @@ class EpisodeRows:
     With ``every_step`` a row of a causal model has all variables at an instant; that of a model
     without lagged edges is ``model.do(regime(i).plan.at_start()).draw(1, seed=seed, first=i)``.
 
-    Args:
-        system: A world or an SCM. It is not changed; interventions given to it hold in every
-            episode.
-        design: The interventions at the beginning.
-        setting: Policy, context distribution, steps and seed.
-        causes: Patterns of the parameters that have columns; ``default_causes`` if None. The
-            targets of the design are among them.
-        outcomes: Names of variables or ``Outcome``; ``default_outcomes`` if None.
-        every_step: One row for each control step in place of one for each episode.
-        pictures: To take at each control step, or at the beginning and at the end; none if None.
-        contacts: Whether to record which bodies touch.
-
-    Raises:
-        InterventionError: A target, or a variable of the context, cannot be set to its values.
-        UnknownVariable: No variable has this name.
-        UnknownOption: An outcome is a function, sums up an episode with ``every_step``, or has a
-            column as a cause already; or there is no such camera.
+    Interventions given to the system hold in every episode; the targets of the design have columns
+    in any case. Arguments are those of ``collect``.
     """
 
     def __init__(
@@ -209,10 +193,11 @@ class EpisodeRows:
 
         def finish(_: int, result: Result) -> Any:
             if isinstance(result, InterventionError):
-                return str(result), [], {}
+                return str(result), [], []
             if isinstance(result, Exception):
                 raise result
-            return self._values(result), self._look(result), _runs(result.touched)
+            touched = [[list(pair) for pair in sorted(step)] for step in result.touched]
+            return self._values(result), self._look(result), touched
 
         written = {*self._watched} - {*world.compiled.slices, *world.static_names}
         names = tuple(name for name in self._watched if name in written)
@@ -228,14 +213,14 @@ class EpisodeRows:
                     kinds[id(regime)] = replace(unit, listens=self._contacts), rows
             units = [replace(kinds[id(regime)][0], number=number) for _, number, regime in cases]
             found = self._twins.run(units, finish, self._setting.workers)
-            for (number, _, regime), (values, seen, runs) in zip(cases, found, strict=True):
+            for (number, _, regime), (values, seen, touched) in zip(cases, found, strict=True):
                 if isinstance(values, str):
                     refused[str(number)] = values
                     continue
                 episodes.append((number, *kinds[id(regime)][1], values))
                 shots += ({"episode": number, **shot} for shot in seen)
-                touching[str(number)] = runs
-        about = {"refused": refused, "touching": touching if self._contacts else {}}
+                touching |= {str(number): touched} if self._contacts else {}
+        about = {"refused": refused, "touching": touching}
         table = Dataset.of_episodes(self.columns, episodes, about)
         keys = [f"{shot['episode']:08d}-{shot['step']:06d}" for shot in shots]
         return table, b"" if self._pictures is None else self._pictures.encoded(shots, keys)
@@ -294,20 +279,6 @@ class EpisodeRows:
         return values
 
 
-def _runs(steps: Sequence[frozenset[tuple[str, str]]]) -> dict[str, Any]:
-    """Return which bodies touched in each control step, as plain data.
-
-    Example:
-        >>> _runs([frozenset({("a", "b")}), frozenset({("a", "b")}), frozenset()])
-        {'pairs': [['a', 'b']], 'runs': [[2, [0]], [1, []]]}
-    """
-    pairs = sorted(frozenset[tuple[str, str]]().union(*steps))
-    runs = [
-        [len([*same]), [pairs.index(p) for p in sorted(which)]] for which, same in groupby(steps)
-    ]
-    return {"pairs": [list(pair) for pair in pairs], "runs": runs}
-
-
 def half_range(world: Simulation, name: str) -> Floats:
     """Return half the range of each number of a variable that a sensor measures, shape (k,).
 
@@ -361,11 +332,6 @@ class LaboratoryRows:
 
     Its permissions and its budget hold, and its errors are raised. A row has its outcomes as it
     reports them; its number of the unit is the number of the episode.
-
-    Args:
-        laboratory: Has the policy, the context distribution and the outcomes.
-        design: The interventions.
-        seed: Seed of the random choices of the design.
     """
 
     shard = 100

@@ -197,9 +197,6 @@ def as_score(given: Any) -> Score:
         given: The name of a variable, weights by name, or a ``Score``. Of a variable with several
             numbers their sum counts.
 
-    Raises:
-        UnknownOption: It is none of these.
-
     Example:
         >>> import numpy as np
         >>> score = as_score({"reward": 1.0, "joint_velocities": -0.1})
@@ -236,9 +233,6 @@ def nearness(task: Task) -> Score:
 
     Args:
         task: Of the world.
-
-    Raises:
-        UnknownOption: It has neither goals nor a reward.
     """
     goal = task.goal
     have, want = goal.achieved, goal.desired

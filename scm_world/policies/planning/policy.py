@@ -187,13 +187,7 @@ class CrossEntropy:
         self.__dict__.update(state, _programs=WeakKeyDictionary())
 
     def __call__(self, world: Simulation) -> Floats:
-        """Give the action of the present step.
-
-        Raises:
-            UnknownVariable: The objective names a variable that does not exist.
-            InterventionError: What is believed cannot be done to the present.
-            ModelError: The objective gives no finite number for each step of each rollout.
-        """
+        """Give the action of the present step."""
         program = self._programs.get(world)
         if program is None or program.plan != world.compiled.plan:  # other bodies are there
             program = self._programs[world] = _WorldPlans(self, world)
