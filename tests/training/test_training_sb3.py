@@ -184,7 +184,7 @@ def test_models_become_policy_files(algo: str, tmp_path: Path) -> None:
     seen = np.stack([env.observation_space.sample() for _ in range(5)])
     np.testing.assert_allclose(policy(seen), model.predict(seen, deterministic=True)[0], atol=1e-5)
     scores = [
-        evaluate(one, "P5", n=2, backend="fake", env={"max_episode_length": 4}).columns["return"]
+        evaluate(one, "P5", n=2, backend="fake", env={"max_episode_length": 4}).frame["return"]
         for one in (model, path)
     ]
     np.testing.assert_allclose(*scores, rtol=1e-3)
@@ -225,7 +225,7 @@ def test_archives_are_loaded_where_that_is_trusted(algo: str, tmp_path: Path) ->
     form = {name: value for name, value in RELATIVE.items() if name != "backend"}
     found = evaluate(path, "P0", backend="fake", env=form, **given)
     whole = evaluate(model, "P0", n=1, backend="fake", env={"max_episode_length": 4})
-    assert found.columns["return"] == whole.columns["return"]
+    assert [*found.frame["return"]] == [*whole.frame["return"]]
     with pytest.warns(UserWarning, match="does not say how it observes and acts"):
         evaluate(path, "P0", backend="fake", env={"max_episode_length": 4}, **given)
     done = CliRunner().invoke(
