@@ -77,7 +77,7 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
 
 @pytest.mark.parametrize("reader", READERS)
 def test_files_without_an_end_are_not_opened(reader: str, tmp_path: Path) -> None:
-    """Nobody waits for a pipe, reads a device to its end, or fills the memory."""
+    """Nobody waits for a pipe, or reads a device to its end."""
     ending, read = READERS[reader]
     path = tmp_path / (f"it{ending}" if reader != "dataset" else "study.json")
     os.mkfifo(path)
