@@ -20,7 +20,7 @@ from scm_world.cli.arguments import (
     refused,
     tag,
 )
-from scm_world.output.remote import Location
+from scm_world.runs.files import Location
 
 Describe = Annotated[
     bool,
@@ -87,7 +87,7 @@ def collect(
     """
     from scm_world.discovery.data import Design, Pictures, default_causes
     from scm_world.discovery.data import collect as collected
-    from scm_world.discovery.data.folders import SIDECAR
+    from scm_world.discovery.data.files import COUNT
     from scm_world.discovery.data.recorded import settable
     from scm_world.queries import SCM
     from scm_world.variables.kinds import SPACES
@@ -120,7 +120,7 @@ def collect(
             targets = settable(system, patterns) if patterns else default_causes(system)
         with (
             console.resumable(folder, "shard-*.*", f"of {-(-n // shard)} files"),
-            options.open_executor(executor, workers, address, "episodes") as (pool, tell),
+            options.open_pool(executor, workers, address, "episodes") as (pool, tell),
         ):
             found = collected(
                 system,
@@ -149,17 +149,19 @@ def collect(
         rows.append((f"and {len(names) - SHOWN} more targets", "", ""))
     rows.append(("columns", "", len(found.columns)))
     if impossible := found.about.get("refused"):
-        rows.append(("refused", len(impossible), f"see {SIDECAR}"))
+        rows.append(("refused", len(impossible), ""))
     title = f"Collected from {tag(task)} on {found.about.get('engine', used)}, seed {seed}"
     console.table(("", "episodes", "rows"), rows, title=title)
     if contacts and found.truth is not None:
-        acting = len(found.truth.for_rows(found).edges)
-        console.say(f"{acting} of {len(found.truth.edges)} edges could act in these rows")
+        acting, edges = found.acting().truth, len(found.truth.edges)
+        console.say(
+            f"{len(acting.edges) if acting else 0} of {edges} edges could act in these rows"
+        )
         most = sorted(found.contacts.items(), key=lambda item: -item[1])[:SHOWN]
         shares = [(f"{one}, {other}", f"{share:.1%}") for (one, other), share in most]
         console.table(("bodies that touched", "steps"), shares)
     shards = list[Location](folder.glob("shard-*.*"))
-    console.written(folder / SIDECAR, *sorted(shards, key=str)[:1], *described(folder, croissant))
+    console.written(folder / COUNT, *sorted(shards, key=str)[:1], *described(folder, croissant))
 
 
 def described(folder: Location, wanted: bool) -> list[Location]:
@@ -222,7 +224,7 @@ def triplets(
         with (
             plain.given(parse_assignments(given, "'--do'")) as system,
             console.resumable(folder, "triplets-*.*", "files"),
-            options.open_executor(executor, workers, address, "pairs") as (pool, tell),
+            options.open_pool(executor, workers, address, "pairs") as (pool, tell),
         ):
             written(
                 system,
@@ -275,7 +277,7 @@ def sweep(
         do: Further intervention at every point; repeat it for more.
     """
     from scm_world.discovery.data import sweep as swept
-    from scm_world.discovery.data.sweeps import ENDS, SUMMARY, TABLE, points_of
+    from scm_world.discovery.data.sweeps import ENDS, TABLE, points_of
 
     grid, held = read_over(over), parse_assignments(do, "'--do'")
     measured = [parse_outcome(text) for text in outcome or ()] or None
@@ -289,7 +291,7 @@ def sweep(
         whole = -(-n * len(points_of(grid, system.graph)) // shard)
         with (
             console.resumable(folder, "shard-*.*", f"of {whole} files"),
-            options.open_executor(executor, workers, address, "episodes") as (pool, tell),
+            options.open_pool(executor, workers, address, "episodes") as (pool, tell),
         ):
             found = swept(
                 system,
@@ -327,7 +329,7 @@ def sweep(
         title=f"Sweep of {tag(task)} on {used}, seed {seed}, with 95 % intervals",
         caption=f"and {len(rows) - POINTS} more points, see {TABLE}" if len(rows) > POINTS else "",
     )
-    console.written(folder / TABLE, folder / SUMMARY)
+    console.written(folder / TABLE)
 
 
 def read_over(texts: Iterable[str]) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def evaluate(
     from scm_world import evaluation
     from scm_world.evaluation import METRICS
     from scm_world.evaluation.figures import write_figures
-    from scm_world.evaluation.files import CODECS
+    from scm_world.evaluation.files import FORMS
     from scm_world.evaluation.setups import task_of
 
     if trust or policy is not None:
@@ -69,7 +69,7 @@ def evaluate(
     if policy is None:
         raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")
     one_of("metric", metric, (None, *METRICS))
-    one_of("format", format_, CODECS)
+    one_of("format", format_, FORMS)
     agents = policies_of(policy)
     task = task or task_of(agents)
     made = load_task(task, option)
@@ -82,7 +82,7 @@ def evaluate(
     )
     with (
         console.resumable(folder, "parts/*.json", "files"),
-        options.open_executor(executor, workers, address, "episodes") as (pool, tell),
+        options.open_pool(executor, workers, address, "episodes") as (pool, tell),
     ):
         found = evaluation.evaluate(
             agents,

@@ -14,9 +14,8 @@ import numpy as np
 
 from scm_world.discovery.benchmarks import BenchmarkResult, BenchmarkRun
 from scm_world.discovery.learners.registry import baselines
-from scm_world.output.canvas import PALETTE, blank, save, styled
-from scm_world.output.durable import write_whole
-from scm_world.output.remote import Location
+from scm_world.runs.canvas import PALETTE, blank, save, styled
+from scm_world.runs.files import Location, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -213,7 +212,7 @@ def size(result: BenchmarkResult, name: str) -> str:
 
 def write_files(result: BenchmarkResult, folder: Location) -> None:
     """Write ``results.csv`` and ``budget.png``; a missing number is empty."""
-    write_whole(_csv(result), folder / "results.csv")
+    write_whole(folder / "results.csv", _csv(result))
     save(draw_budgets(result), folder / "budget.png")
 
 

@@ -15,9 +15,6 @@ from scm_world._arguments import typed, whole_number
 from scm_world.discovery.metrics import GraphScore, score
 from scm_world.errors import DAMAGED, UnreadableFile
 from scm_world.graph import SCM
-from scm_world.output.durable import made, removed, write_durably, write_whole
-from scm_world.output.reading import read_text
-from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import probes as probe_states
@@ -33,6 +30,7 @@ from scm_world.queries.verification import (
     listed,
     outcome,
 )
+from scm_world.runs.files import Location, located, made, read_text, removed, write_whole
 from scm_world.world import Simulation
 
 CHECKPOINT = "scm_world/discovery-progress/4"
@@ -110,7 +108,7 @@ class DiscoveryReport(GraphReport):
         Raises:
             UnwritableFolder: There is no such folder, no room, or no permission.
         """
-        write_whole(self.to_json(), path)
+        write_whole(path, self.to_json())
 
 
 @typed
@@ -262,7 +260,7 @@ class Checkpoint:
             "refused": effects.refused,
         }
         made(self._path.parent)
-        write_durably(self._path, json.dumps(data).encode())
+        write_whole(self._path, json.dumps(data).encode())
 
     def end(self) -> None:
         """Remove the file: there is a result now."""

@@ -13,8 +13,8 @@ from scm_world.env.many import ScmWorldVectorEnv
 from scm_world.env.native import NativeVectorEnv
 from scm_world.env.processes import ProcessVectorEnv
 from scm_world.errors import UnknownOption
+from scm_world.runs.processes import cores
 from scm_world.tasks import ModelTask, Task
-from scm_world.work.processes import cores
 from scm_world.world.structures import as_task
 
 MODEL_ID = "scm_world/Model-v0"

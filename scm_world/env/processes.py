@@ -19,7 +19,7 @@ from scm_world._types import Floats, Integers
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.env.many import ScmWorldVectorEnv, act, member_shapes, read_mode, row_of
 from scm_world.errors import EngineFailure, ScmWorldError
-from scm_world.work.processes import PROCESS, children_single_threaded, pickled
+from scm_world.runs.processes import PROCESS, children_single_threaded, pickled
 from scm_world.world.batch import Mask, located
 
 ANEW = "make the environments again"

@@ -26,9 +26,8 @@ from scm_world.evaluation.statistics import (
     performance_profile,
     probability_of_improvement,
 )
-from scm_world.output.canvas import INK, PALETTE, blank, save, styled
-from scm_world.output.durable import removed
-from scm_world.output.remote import Location, located
+from scm_world.runs.canvas import INK, PALETTE, blank, save, styled
+from scm_world.runs.files import Location, located, removed
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

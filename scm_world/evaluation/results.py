@@ -23,7 +23,7 @@ from scm_world.evaluation.statistics import (
     find_causes,
     mean_interval,
 )
-from scm_world.output.remote import Location, located
+from scm_world.runs.files import Location, located
 
 TEXTS = ("agent", "engine", "protocol", "hash")
 WHOLE = ("run", "seed", "episode", "steps")

@@ -40,10 +40,8 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
-from scm_world.output.durable import write_durably
-from scm_world.output.reading import LARGEST, read_arrays, read_bytes, refuse_large, regular
-from scm_world.output.remote import Location, located
 from scm_world.policies.cards import KEY, PolicyAbout
+from scm_world.runs.files import Location, located, read_arrays, read_bytes, regular, write_whole
 from scm_world.tasks import tasks
 
 Weights = NDArray[np.float32]
@@ -330,7 +328,7 @@ def save_policy(
         raise UnknownOption("ending of a policy file", target.suffix, (".safetensors",))
     tensors = network.tensors() if isinstance(network, MlpPolicy) else network
     said = network.made_for if about is None and isinstance(network, MlpPolicy) else about
-    write_durably(target, MlpPolicy.of(tensors, {} if said is None else said).content())
+    write_whole(target, MlpPolicy.of(tensors, {} if said is None else said).content())
     return target
 
 
@@ -342,13 +340,13 @@ def load_policy(path: Path | str) -> MlpPolicy:
 
     Raises:
         UnknownOption: The zoo has none of this name.
-        UnreadableFile: It is damaged, of another kind, too large, or not there.
+        UnreadableFile: It is damaged, of another kind, or not there.
     """
     from scm_world.policies.zoo import file_of  # which reads cards by this function
 
     name = str(file_of(path))
     try:
-        with safetensors.safe_open(regular(Path(name), LARGEST), framework="np") as file:
+        with safetensors.safe_open(regular(Path(name)), framework="np") as file:
             text = (file.metadata() or {}).get(KEY)
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 # no mapping
     except OSError as error:
@@ -377,9 +375,8 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
     """
     name = fspath(path)
     try:
-        with zipfile.ZipFile(io.BytesIO(read_bytes(Path(name), LARGEST))) as archive:
-            refuse_large("its weights", archive.getinfo("parameters").file_size, LARGEST)
-            arrays = read_arrays(archive.read("parameters"), LARGEST)
+        with zipfile.ZipFile(io.BytesIO(read_bytes(Path(name)))) as archive:
+            arrays = read_arrays(archive.read("parameters"))
         found = {key: np.asarray(array, dtype=np.float32) for key, array in arrays.items()}
         hidden = ["shared_fc0"]
         while f"model/shared_fc{len(hidden)}/w:0" in found:

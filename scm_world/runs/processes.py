@@ -130,6 +130,10 @@ class Worker:
             self._processes = _Processes(1, self._work)
         try:
             result, error = self._processes.submit(job).result(timeout)
+        except BrokenProcessPool:
+            said = self._processes.said()
+            self.close()
+            raise BrokenProcessPool(said) from None
         except BaseException:
             self.close()
             raise
@@ -161,7 +165,7 @@ def outcomes(workers: int, work: bytes, jobs: Sequence[bytes]) -> Iterator[Outco
                 if lost[place] < TRIES:
                     suspects.append(place)
                     continue
-                said = f"it was tried {TRIES} times, and each time its process ended"
+                said = f"it was tried {TRIES} times, and then {processes.said()}"
                 yield place, None, EngineFailure(said, PROCESS)
             never_begun = 0 if processes.begun.is_set() else never_begun + 1
             if never_begun == TRIES:
@@ -219,6 +223,12 @@ class _Processes:
             self._children |= set(multiprocessing.active_children()) - before
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
+    def said(self) -> str:
+        """Say how the only process ended."""
+        (child,) = self._children
+        child.join(1.0)
+        return f"its process ended with exit code {child.exitcode}"
+
     def end(self) -> None:
         """Kill the processes."""
         for child in self._children:
@@ -259,11 +269,13 @@ def answered(work: list[Any], job: bytes) -> tuple[Any, Exception | None]:
         if isinstance(work[0], bytes):
             work[0] = pickle.loads(work[0])  # noqa: S301 # written by our own process
         return work[0](*pickle.loads(job)), None  # noqa: S301 # as above
-    except Exception as error:  # reported to the process that asked
+    except BaseException as error:  # also of a learner that ends Python; for the process that asked
         error.add_note("".join(traceback.format_exception(error)).rstrip())
         try:
-            if type(pickle.loads(pickle.dumps(error))) is type(error):  # noqa: S301 # our own
-                return None, error
-        except Exception as unreadable:
-            error.add_note(in_one_line(unreadable))
-        return None, EngineFailure(in_one_line(error), PROCESS)
+            again = pickle.loads(pickle.dumps(error))  # noqa: S301 # our own
+        except Exception:
+            again = None
+        if isinstance(error, Exception) and type(again) is type(error):
+            return None, error
+        said = "".join(traceback.format_exception_only(error)).split("\n")[0]
+        return None, EngineFailure(said, PROCESS)

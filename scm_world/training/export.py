@@ -12,9 +12,9 @@ import numpy as np
 from scm_world._arguments import load
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, UnreadableFile
 from scm_world.evaluation import evaluate
-from scm_world.output.durable import write_durably
 from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
 from scm_world.policies.cards import FORM, KEY, OPTIONS
+from scm_world.runs.files import write_whole
 from scm_world.training.recipe import Recipe
 from scm_world.training.settings import Trials
 
@@ -250,7 +250,7 @@ def to_onnx(policy: MlpPolicy | Path | str, path: Path | str) -> Path:
     made.metadata_props.add(key=KEY, value=given.about.text())
     onnx.checker.check_model(made)
     target = Path(path)
-    write_durably(target, made.SerializeToString())
+    write_whole(target, made.SerializeToString())
     return target
 
 

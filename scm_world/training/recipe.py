@@ -22,7 +22,7 @@ from scm_world.curricula import Curriculum, everything, goals
 from scm_world.env import ENV_OPTIONS
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
 from scm_world.evaluation.protocols import chosen, protocols_of
-from scm_world.output.reading import read_text
+from scm_world.runs.files import read_text
 from scm_world.tasks import TASKS, Task, make_task
 from scm_world.tasks.factories import refuse_untrusted
 from scm_world.training.settings import (

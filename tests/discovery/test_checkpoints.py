@@ -17,8 +17,8 @@ from scm_world import World, discover
 from scm_world.cli import app
 from scm_world.discovery import DiscoveryReport
 from scm_world.errors import UnreadableFile, UnwritableFolder
-from scm_world.output import durable
-from scm_world.output.durable import write_whole
+from scm_world.runs import files
+from scm_world.runs.files import write_whole
 
 PROBES = 3
 
@@ -97,7 +97,7 @@ def test_files_are_on_the_disk_before_they_have_their_name(
 ) -> None:
     """Where the disk fails, the last checkpoint and the last text are as they were."""
     path, text = tmp_path / "progress.json", tmp_path / "study.json"
-    write_whole("first\n", text)
+    write_whole(text, "first\n")
 
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left")
@@ -105,11 +105,11 @@ def test_files_are_on_the_disk_before_they_have_their_name(
     with World("pushing", backend="fake") as world:
         interrupted(world, path, 1)
         before = path.read_bytes()
-        monkeypatch.setattr(durable.os, "fsync", full)
+        monkeypatch.setattr(files.os, "fsync", full)
         with pytest.raises(UnwritableFolder, match=r"progress\.json: No space left"):
             discover(world, probes=PROBES, seed=3, checkpoint=path)
     with pytest.raises(UnwritableFolder, match=r"study\.json: No space left"):
-        write_whole("second\n", text)
+        write_whole(text, "second\n")
     assert (path.read_bytes(), text.read_text()) == (before, "first\n")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["progress.json", "study.json"]
 

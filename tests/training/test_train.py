@@ -411,7 +411,7 @@ def test_a_full_disk_ends_the_training_with_the_last_checkpoint_whole(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("scm_world.output.durable.os.fsync", full)
+        patch.setattr("scm_world.runs.files.os.fsync", full)
         with pytest.raises(UnwritableFolder, match="No space left"):
             run("ppo", folder, every=0.0)
     assert run("ppo", folder).steps == 256

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from scm_world.env import vector_env
 from scm_world.env.native import NativeVectorEnv
 from scm_world.env.processes import ProcessVectorEnv
 from scm_world.errors import EngineFailure, OutOfBounds, UnknownOption
-from scm_world.work.processes import Worker, cores
+from scm_world.runs.processes import Worker, cores
 
 
 def test_how_many_work_at_the_same_time_changes_nothing() -> None:
@@ -83,8 +82,9 @@ def test_an_interrupted_step_ends_the_processes(monkeypatch: pytest.MonkeyPatch)
 def test_in_a_process_of_a_pool_no_process_is_started() -> None:
     """One that ends with its parent may have no children."""
     pytest.importorskip("pybullet")
-    with Worker(partial(partial, _kind)) as worker:
-        assert worker.ask("__call__") == "NativeVectorEnv"
+    worker = Worker(_kind)
+    assert worker.ask() == "NativeVectorEnv"
+    worker.close()
 
 
 def _kind() -> str:
