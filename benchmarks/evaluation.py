@@ -40,8 +40,9 @@ from evaluation_steps import shares
 
 from benchmarks import as_json
 from scm_world.evaluation.pipeline import ShardRunner, evaluate
+from scm_world.evaluation.preparation import prepare
 from scm_world.evaluation.protocols import protocols_of
-from scm_world.evaluation.setups import SHARD, prepare
+from scm_world.evaluation.setups import SHARD
 
 TASK = "pushing"
 PUBLISHED = 200  # episodes of a protocol in the predecessor's benchmark

@@ -10,9 +10,9 @@ from typing import Any
 from evaluation_policy import Mlp
 
 from scm_world.env import ScmWorldEnv
-from scm_world.evaluation.episodes import EpisodeRunner, Fingerprint
-from scm_world.evaluation.players import as_player
+from scm_world.evaluation.episodes import EpisodeRunner, Hook, Scores
 from scm_world.evaluation.protocols import Protocol, protocols_of
+from scm_world.policies.agents import as_agent
 from scm_world.world import WorldSnapshot
 
 
@@ -29,6 +29,14 @@ class Recorder:
         self.observations.append(observation)
         self.actions.append(self._policy(observation))
         return self.actions[-1]
+
+
+class Beginning(Hook):
+    """Keeps the beginning of an episode."""
+
+    def begin(self, env: ScmWorldEnv, observation: Any) -> None:
+        """Save the world after the reset."""
+        self.snapshot: WorldSnapshot = env.world.snapshot()
 
 
 def shares(task: str, episodes: int) -> dict[str, float]:
@@ -53,16 +61,11 @@ def shares(task: str, episodes: int) -> dict[str, float]:
 
 def split(arena: EpisodeRunner, protocol: Protocol, episode: int) -> dict[str, float]:
     """Play an episode, and then its parts alone, from the same beginning."""
-    recorder, beginning = Recorder(), list[WorldSnapshot]()
-
-    def watch(env: ScmWorldEnv) -> None:
-        if not beginning:
-            beginning.append(env.world.snapshot())
-
-    arena.play(as_player(recorder), protocol, seed=0, episode=episode, watch=watch)
+    recorder, beginning = Recorder(), Beginning()
+    arena.play(as_agent(recorder), protocol, seed=0, episode=episode, hooks=[beginning])
     env, world, actions = arena.env, arena.env.world, recorder.actions
     commands = [env.command(action) for action in actions]
-    player = as_player(Mlp())
+    player = as_agent(Mlp())
 
     def raw(command: Any) -> None:
         world.backend.step(command, world.substeps)
@@ -72,13 +75,15 @@ def split(arena: EpisodeRunner, protocol: Protocol, episode: int) -> dict[str, f
         "episode": busy(lambda _: arena.play(player, protocol, seed=0, episode=episode), [None]),
         "policy": busy(player.act, recorder.observations),
     }
-    world.restore(beginning[0])
+    world.restore(beginning.snapshot)
     found["env.step"] = busy(env.step, actions)
-    world.restore(beginning[0])
+    world.restore(beginning.snapshot)
     found["physics, in env.step"] = busy(raw, commands)
-    world.restore(beginning[0])
-    mark = Fingerprint(env)
-    found["fingerprint"] = busy(mark.act, actions) + busy(lambda _: mark.look(), actions)
+    world.restore(beginning.snapshot)
+    measured = Scores()
+    measured.begin(env, None)
+    found["fingerprint"] = busy(lambda action: measured.choose(None, action), actions)
+    found["fingerprint"] += busy(lambda _: measured.after(None, 0.0, {}), actions)
     return found
 
 

@@ -9,7 +9,8 @@ import sys
 import tempfile
 from typing import Any
 
-from scm_world.evaluation import Evaluation, Protocol, WorldPolicy, evaluate, why
+from scm_world.evaluation import Evaluation, Protocol, evaluate, why
+from scm_world.policies import WorldPolicy
 
 STEPS = 100
 

@@ -19,9 +19,8 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import ScmWorldError
 from scm_world.evaluation import Evaluation, evaluate
 from scm_world.evaluation import files as evaluation_files
-from scm_world.evaluation.again import shard_runner_of
+from scm_world.evaluation.preparation import again, task_of
 from scm_world.evaluation.recording import Recording, record
-from scm_world.evaluation.setups import task_of
 from scm_world.graph.files import from_json
 from scm_world.policies import MlpPolicy, save_policy
 from scm_world.queries import Episode, Plan, load_episode, save_episode
@@ -131,21 +130,21 @@ def _evaluation(change: Callable[[dict[str, Any]], None]) -> Evaluation:
 
 def _check_policy(reference: str) -> None:
     policy = {"kind": "function", "name": reference, "sees": "world"}
-    shard_runner_of(_evaluation(lambda about: about["agents"][0].update(policy=policy)))
+    again(_evaluation(lambda about: about["agents"][0].update(policy=policy)))
 
 
 def _check_task(reference: str) -> None:
-    shard_runner_of(_evaluation(lambda about: about.update(task=reference)))
+    again(_evaluation(lambda about: about.update(task=reference)))
 
 
 def _check_start(reference: str) -> None:
     start = {"stage_friction": _mechanism(reference)}
-    shard_runner_of(_evaluation(lambda about: about["env"].update(start=start)))
+    again(_evaluation(lambda about: about["env"].update(start=start)))
 
 
 def _check_protocol(reference: str) -> None:
     part = {"kind": "do", "request": {"stage_friction": _mechanism(reference)}}
-    shard_runner_of(_evaluation(lambda about: about["protocols"][0].update(act=part)))
+    again(_evaluation(lambda about: about["protocols"][0].update(act=part)))
 
 
 def _recording(reference: str) -> Recording:
@@ -209,4 +208,4 @@ def test_policies_and_models_of_this_package_need_no_trust() -> None:
     """They run no code that a file could choose."""
     known = {"kind": "function", "name": "scm_world.policies.scripted:Random", "sees": "world"}
     found = _evaluation(lambda about: about["agents"][0].update(policy=known))
-    shard_runner_of(found).close()
+    again(found)

@@ -61,7 +61,7 @@ def evaluate(
     from scm_world.evaluation import METRICS
     from scm_world.evaluation.figures import write_figures
     from scm_world.evaluation.files import FORMS
-    from scm_world.evaluation.setups import task_of
+    from scm_world.evaluation.preparation import task_of
 
     if trust or policy is not None:
         sys.path.insert(0, str(Path.cwd()))  # for what is defined beside where this is called
@@ -144,7 +144,7 @@ def policies_of(text: str) -> dict[str, list[str]]:
         >>> policies_of("mine=a.zip+b.zip,random")
         {'mine': ['a.zip', 'b.zip'], 'random': ['random']}
     """
-    from scm_world.evaluation.players import NAMES
+    from scm_world.policies.agents import NAMES
 
     found: dict[str, list[str]] = {}
     for word in (part.strip() for part in text.split(",")):

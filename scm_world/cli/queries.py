@@ -60,7 +60,8 @@ def do(
             refuse_settings(space=space)
         folder = console.results_folder(out, "do", tag(task), used, f"seed{seed}", option=option)
         found = consequences(system, request, steps=steps, seed=seed, space=space)  # type: ignore[arg-type] # it checks the space
-    steps, rows, astray = found.steps, found.variables, found.astray
+    steps, astray = found.steps, found.astray
+    rows: list[Any] = [*found.variables.itertuples()]
     result = {
         "format": "scm_world/do/1",
         "task": task,
@@ -73,7 +74,7 @@ def do(
         "versions": versions(found.engine),
     }
     console.say(f"do() in {tag(task)} on {found.engine or used}, seed {seed}:", found.audit, "")
-    descendants = [row for row in rows.values() if row.descendant]
+    descendants = [row for row in rows if row.descendant]
     console.table(
         (
             *("descendant", "unit", "before", "right after", f"after {steps} steps"),
@@ -81,7 +82,7 @@ def do(
         ),
         [
             (
-                Text(name, style="bold"),
+                Text(row.Index, style="bold"),
                 row.unit,
                 console.show(row.before),
                 _or_same(row.right_after, row.before),
@@ -89,7 +90,7 @@ def do(
                 _or_same(row.without, row.after),
                 Text(f"{row.difference:.3g}", style="bold" if row.difference else "dim"),
             )
-            for name, row in rows.items()
+            for row in rows
             if row.descendant and (row.moved or show_all)
         ],
         title="What followed",
@@ -233,19 +234,14 @@ def counterfactual(
         "without it (a)",
         apart,
     )
+    variables, contacts = apart.variables, apart.contacts.rename(columns={"episode": "in"})
+    contacts["in"] = contacts["in"].map({"a": "episode", "b": "counterfactual"})
     result = {
         "format": "scm_world/counterfactual/1",
         "at": at,
         "steps": episode.steps,
-        "variables": {
-            name: {"first": d.first, "largest": d.largest, "at": d.at, "final": d.final}
-            for name, d in apart.variables.items()
-            if np.isfinite(d.largest)
-        },
-        "contacts_in_one_only": [
-            {"step": step, "bodies": pair, "in": ("episode", "counterfactual")[which]}
-            for step, pair, which in apart.contacts
-        ],
+        "variables": variables[np.isfinite(variables["largest"])].to_dict("index"),
+        "contacts_in_one_only": contacts.to_dict("records"),
     }
     with console.staged(folder) as draft:
         save_episode(episode, draft / "episode.npz")

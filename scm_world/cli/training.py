@@ -38,7 +38,7 @@ def train(
 ) -> None:
     """Train an agent; write its policy, its learning curve and checkpoints.
 
-    Ctrl-C ends after the present round with a checkpoint (exit code 130); the same command resumes.
+    After Ctrl-C it writes a checkpoint and ends (exit code 130); the same command resumes.
     Example: scm-world train reaching --set n_steps=128 --out my-reacher
 
     Args:
@@ -91,7 +91,7 @@ def train(
     used = backend or load_task(task).backend
     folder: Any = console.results_folder(out, "train", tag(made.task), made.algo, made.name, seed)
     bar = nullcontext() if quiet else console.progress("steps", lines=10)
-    with console.resumable(folder, "checkpoints/*.pt", "checkpoints"), bar as tell:
+    with console.resumable(folder, "checkpoints/*.zip", "checkpoints"), bar as tell:
         found = loop.train(
             made,
             out=folder,

@@ -15,6 +15,7 @@ from scm_world._arguments import typed, whole_number
 from scm_world.discovery.metrics import GraphScore, score
 from scm_world.errors import DAMAGED, UnreadableFile
 from scm_world.graph import SCM
+from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import probes as probe_states
@@ -113,7 +114,7 @@ class DiscoveryReport(GraphReport):
 
 @typed
 def discover(
-    system: Simulation | SCM | str,
+    system: System | SCM | str,
     *,
     probes: int = 32,
     seed: int = 0,

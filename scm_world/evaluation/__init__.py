@@ -1,4 +1,4 @@
-"""Where does an agent generalise, and how sure are we: protocols, scores, explanations.
+"""Evaluation: protocols, episodes, scores with intervals, explanations.
 
 An evaluation is one call::
 
@@ -8,10 +8,9 @@ An evaluation is one call::
     found.save("results")
 """
 
-from scm_world.evaluation.episodes import METRICS
+from scm_world.evaluation.episodes import METRICS, Hook, in_world, play
 from scm_world.evaluation.explanation import Explanation, Otherwise, why
 from scm_world.evaluation.pipeline import evaluate
-from scm_world.evaluation.players import Player, WorldPolicy, as_player, in_world, player_from
 from scm_world.evaluation.protocols import Protocol, protocols_of
 from scm_world.evaluation.recording import Recorder, Recording, record
 from scm_world.evaluation.results import Evaluation
@@ -22,17 +21,15 @@ __all__ = [
     "Causes",
     "Evaluation",
     "Explanation",
+    "Hook",
     "Interval",
     "Otherwise",
-    "Player",
     "Protocol",
     "Recorder",
     "Recording",
-    "WorldPolicy",
-    "as_player",
     "evaluate",
     "in_world",
-    "player_from",
+    "play",
     "protocols_of",
     "record",
     "why",

@@ -1,25 +1,36 @@
-"""Run an episode of an evaluation: an environment, a policy, a protocol."""
+"""Episodes: one loop of an environment with an agent, its hooks, and the scores of an episode."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Any, final
 
+import gymnasium
 import numpy as np
 
+from scm_world._types import Floats
 from scm_world.curricula import CurriculumEnv, Part
 from scm_world.curricula.base import nested
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption, UnknownVariable
-from scm_world.evaluation.players import Player
+from scm_world.errors import (
+    ActionError,
+    EvaluationError,
+    ScmWorldError,
+    UnknownOption,
+    UnknownVariable,
+)
 from scm_world.evaluation.protocols import Protocol
+from scm_world.policies.agents import as_agent
+from scm_world.policies.cards import FORM
+from scm_world.policies.scripted import Policy
 from scm_world.tasks.base import OVERLAP
 from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED
 from scm_world.variables import Null, Subset
 from scm_world.variables.reserved import SENSOR_NOISE
+from scm_world.world import Simulation
 
 LAST = 20
 """Control steps over which the end of an episode is averaged."""
@@ -32,28 +43,91 @@ FRACTIONS = (
 """The published scores: at the end, over the last steps, over all steps."""
 
 METRICS = (*FRACTIONS, "success", "return", "published_overlap")
-"""What is measured of every episode, as far as the task says what success is. The last one is the
-fractional success at the end as CausalWorld 1.2 computes it, of axis-aligned boxes."""
+"""The scores of an episode, as far as the task defines success. The last one is the fractional
+success at the end as CausalWorld 1.2 computes it, of axis-aligned boxes."""
 
-Watch = Callable[[ScmWorldEnv], Any]
+
+# --- the loop -------------------------------------------------------------------------------------
+
+
+class Hook:
+    """Follows an episode of ``play``; a subclass defines the methods that it needs."""
+
+    def begin(self, env: ScmWorldEnv, observation: Any) -> None:
+        """See the beginning of an episode, after the interventions of its reset."""
+
+    def choose(self, observation: Any, action: Any) -> Any:
+        """Return the action that is played, before every control step."""
+        return action
+
+    def after(self, observation: Any, reward: float, info: Mapping[str, Any]) -> bool:
+        """See a control step; return whether the episode ends here."""
+        return False
+
+
+def play(
+    env: gymnasium.Env[Any, Any],
+    agent: Any,
+    plan: Mapping[str, Any] | None = None,
+    hooks: Sequence[Hook] = (),
+    *,
+    seed: int | None = None,
+    episode: int | None = None,
+) -> dict[str, Any]:
+    """Run an episode of an environment with an agent; return the info of its end.
+
+    Args:
+        env: An environment of this package, in any wrappers.
+        agent: An ``Agent``, or anything with its methods ``start`` and ``act``.
+        plan: Interventions of the episode, as in ``options["do"]`` of ``reset``.
+        hooks: They follow the episode in this order.
+        seed: Seed of the noise; the present noise if None.
+        episode: Number of the episode within the noise; the next one if None.
+
+    Example:
+        >>> env = gymnasium.make("scm_world/Pushing-v0", backend="fake", max_episode_length=3)
+        >>> info = play(env, as_agent("random"), {"tool_block.mass": 0.03}, seed=0)
+        >>> round(env.unwrapped.world["tool_block.mass"].item(), 3)
+        0.03
+    """
+    given: dict[str, Any] = {} if plan is None else {"do": plan}
+    given |= {} if episode is None else {"episode": episode}
+    observation, info = env.reset(seed=seed, options=given)
+    inner: Any = env.unwrapped
+    agent.start(inner)
+    for hook in hooks:
+        hook.begin(inner, observation)
+    over = False
+    while not over:
+        action = agent.act(observation)
+        for hook in hooks:
+            action = hook.choose(observation, action)
+        observation, reward, terminated, truncated, info = env.step(action)
+        over = terminated or truncated
+        for hook in hooks:
+            over |= hook.after(observation, float(reward), info)
+    return info
+
+
+# --- scores ---------------------------------------------------------------------------------------
 
 
 @final
 @dataclass(frozen=True)
 class EpisodeRow:
-    """What is kept of an episode.
+    """An episode in the table of an evaluation.
 
     Attributes:
         agent: Name of the agent.
         run: Number of the training run of this agent.
         engine: Name of the physics engine.
         protocol: Name of the protocol.
-        seed: Of the noise.
+        seed: Seed of the noise.
         episode: Its number within the noise.
-        steps: How many control steps it had.
+        steps: Number of control steps.
         scores: By those names of ``METRICS`` that the task has.
-        drawn: The values of what was intervened on, by variable.
-        hash: Sums up all states, parameters and actions, bit for bit.
+        drawn: The values of the variables that were intervened on.
+        hash: Digest of all states, parameters and actions, bit for bit.
     """
 
     agent: str
@@ -69,193 +143,77 @@ class EpisodeRow:
 
 
 @final
-class Fingerprint:
-    """Sums up an episode, bit for bit.
+class Scores(Hook):
+    """Measures an episode: its scores, the values that were drawn, and a digest of all of it."""
 
-    Args:
-        env: At the beginning of the episode.
-    """
+    def begin(self, env: ScmWorldEnv, observation: Any) -> None:
+        """Begin to measure."""
+        self._env, self._digest, self._version = env, blake2b(digest_size=16), -1
+        self._fractions: list[float] = []
+        self._total, self.steps = 0.0, 0
+        self.drawn = self._values(0)
+        self._look()
 
-    def __init__(self, env: ScmWorldEnv) -> None:
-        self._world = env.world
-        self._sum = blake2b(digest_size=16)
-        self._version = -1
-        self.look()
+    def choose(self, observation: Any, action: Any) -> Any:
+        """Keep the action: a policy may return one array again."""
+        kept = action.copy()
+        self._digest.update(kept.tobytes())
+        return kept
 
-    def look(self) -> None:
+    def after(self, observation: Any, reward: float, info: Mapping[str, Any]) -> bool:
+        """Measure a control step."""
+        self._total += reward
+        self.steps += 1
+        if info.get(FRACTION) is not None:
+            self._fractions.append(info[FRACTION])
+        done, index = self._env.interventions, self._env.world.index
+        if done and done[-1][0] == index:
+            self.drawn |= self._values(index)
+        self._success = info.get(SUCCESS)
+        self._look()
+        return False
+
+    def scores(self) -> dict[str, float]:
+        """Return the scores of the episode."""
+        found = scored(self._fractions, success=self._success, total=self._total)
+        goal = self._env.world.task.goal
+        if OVERLAP in goal.measures:
+            vectors = goal.vectors(self._env.world.evaluate(()))
+            found[OVERLAP] = float(goal.measures[OVERLAP](*vectors))
+        return found
+
+    def digest(self) -> str:
+        """Return the digest of the episode so far."""
+        return self._digest.hexdigest()
+
+    def _look(self) -> None:
         """Take in the state, and the parameters after an intervention."""
-        world = self._world
+        world = self._env.world
         if world.version != self._version:
             self._version = world.version
             for name in world.static_names:
-                self._sum.update(name.encode())
-                self._sum.update(np.asarray(world.row[name]).tobytes())
-        self._sum.update(world.vector.tobytes())
+                self._digest.update(name.encode())
+                self._digest.update(np.asarray(world.row[name]).tobytes())
+        self._digest.update(world.vector.tobytes())
 
-    def act(self, action: Any) -> None:
-        """Take in an action."""
-        self._sum.update(action.tobytes())
-
-    def __str__(self) -> str:
-        return self._sum.hexdigest()
-
-
-def under(protocol: Protocol, env: ScmWorldEnv) -> CurriculumEnv:
-    """Return an environment under a protocol.
-
-    Raises:
-        UnknownOption: It depends on what happened in other episodes, or acts after their end.
-        EvaluationError: It names something that does not exist, or a region that is impossible.
-    """
-    if protocol.step >= env.world.max_episode_length:
-        allowed = (f"control steps from 0 to {env.world.max_episode_length - 1}",)
-        raise UnknownOption(f"step of protocol {protocol.name}", protocol.step, allowed)
-    if any(part.kind == "stages" for part in nested(protocol.part, Part)):
-        allowed = ("parts without stages: an episode must not depend on others",)
-        raise UnknownOption(f"act of protocol {protocol.name}", "stages", allowed)
-    try:
-        found = CurriculumEnv(env, protocol.curriculum())
-        if isinstance(protocol.space, Subset) and not env.world.structures.head:
-            for pattern in protocol.space.unused(env.world.model):
-                raise UnknownVariable(pattern, env.world.model)
-    except ScmWorldError as error:
-        place = {"protocol": protocol.name, "task": env.world.task.name}
-        raise EvaluationError(place, str(error)) from error
-    return found
-
-
-@final
-class EpisodeRunner:
-    """Runs episodes in one environment.
-
-    Args:
-        env: It is reset again and again.
-    """
-
-    def __init__(self, env: ScmWorldEnv) -> None:
-        self.env = env
-        self._under: dict[str, tuple[Protocol, CurriculumEnv]] = {}
-
-    def play(
-        self,
-        player: Player,
-        protocol: Protocol,
-        *,
-        seed: int,
-        episode: int,
-        who: tuple[str, int] = ("", 0),
-        watch: Watch | None = None,
-    ) -> EpisodeRow:
-        """Run an episode.
-
-        Args:
-            player: The policy.
-            protocol: What is done.
-            seed: Of the noise.
-            episode: Its number within the noise.
-            who: Name and number of the run, for the row.
-            watch: Called before every control step and at the end.
-
-        Raises:
-            EvaluationError: The policy gave no action, or an intervention was refused; with the
-                place.
-        """
-        env, engine = self.env, self.env.world.backend.name
-        named = (who[0], engine, protocol.name, seed, episode)
-        place = dict(zip(("agent", "engine", "protocol", "seed", "episode"), named, strict=True))
-        with _placed(place, env):
-            acting, observation = self.begin(protocol, seed=seed, episode=episode)
-            drawn = _drawn(env, 0)
-            player.begin(env)
-            mark = Fingerprint(env)
-            fractions: list[float] = []
-            total, steps, over = 0.0, 0, False
-            while not over:
-                if watch is not None:
-                    watch(env)
-                action = player.act(observation).copy()  # a policy may return one array again
-                mark.act(action)
-                observation, reward, terminated, truncated, info = acting.step(action)
-                over = terminated or truncated
-                total += reward
-                steps += 1
-                if info.get(FRACTION) is not None:
-                    fractions.append(info[FRACTION])
-                if env.interventions[-1:] and env.interventions[-1][0] == env.world.index:
-                    drawn |= _drawn(env, env.world.index)
-                mark.look()
-            if watch is not None:
-                watch(env)
-        scores = scored(fractions, success=info.get(SUCCESS), total=float(total))
-        goal = env.world.task.goal
-        if OVERLAP in goal.measures:
-            vectors = goal.vectors(env.world.evaluate(()))
-            scores[OVERLAP] = float(goal.measures[OVERLAP](*vectors))
-        return EpisodeRow(
-            *who, engine, protocol.name, seed, episode, steps, scores, drawn, str(mark)
+    def _values(self, step: int) -> dict[str, list[float]]:
+        """Read the values of the variables that were intervened on at a control step."""
+        world = self._env.world
+        asked: Mapping[str, Any] = {
+            name: act
+            for at, request in self._env.interventions
+            if at == step
+            for name, act in request.items()
+        }
+        names = tuple(
+            name
+            for name, act in asked.items()
+            if not isinstance(act, Null)
+            and name in world.model
+            and name not in world.compiled.actions
         )
-
-    def try_out(self, protocol: Protocol, *, seed: int) -> None:
-        """Check that a protocol fits: begin the first episode with it.
-
-        Raises:
-            UnknownOption: It depends on what happened in other episodes, or acts after their end.
-            EvaluationError: What it does is impossible, with the place.
-        """
-        self._env(protocol)
-        place = {"engine": self.env.world.backend.name, "protocol": protocol.name}
-        with _placed({**place, "seed": seed, "episode": 0}, self.env):
-            self.begin(protocol, seed=seed, episode=0)
-
-    def begin(self, protocol: Protocol, *, seed: int, episode: int) -> tuple[CurriculumEnv, Any]:
-        """Begin an episode, with the interventions of a protocol at its reset.
-
-        Returns:
-            The environment under the protocol, and the observation.
-
-        Raises:
-            UnknownOption: The protocol does not fit; see ``under``.
-            EvaluationError: It names something that does not exist, or a region that is
-                impossible.
-            InterventionError: An intervention was refused.
-        """
-        found = self._env(protocol)
-        return found, found.reset(seed=seed, options={"episode": episode})[0]
-
-    def _env(self, protocol: Protocol) -> CurriculumEnv:
-        kept, found = self._under.get(protocol.name, (None, None))
-        if found is None or kept != protocol:
-            found = under(protocol, self.env)
-            self._under[protocol.name] = protocol, found
-        return found
-
-    def close(self) -> None:
-        """Free the engine."""
-        self.env.close()
-
-
-def unrelated(env: ScmWorldEnv, about: Mapping[str, Any]) -> tuple[str, ...]:
-    """Name what cannot matter: no directed path leads from it to the score or the observation.
-
-    Of pictures nothing is named, since everything counts that can be seen, nor for a function of
-    the whole world, nor where a variable decides which bodies, and so which paths, there are.
-    Named policies of this package read states.
-
-    Args:
-        env: Where a policy acts.
-        about: Of its ``Player``.
-    """
-    if env.observed is None or about.get("sees") == "world" or len(env.world.structures.head):
-        return ()
-    model = env.world.model
-    observed = env.observed
-    if about["kind"] == "named":
-        observed = tuple(name for name in model if model.declared(name).role == "state")
-    scored_by = (FRACTION, SUCCESS, TERMINATED, "reward", SENSOR_NOISE)
-    counted = {name for name in (*observed, *scored_by) if name in model}
-    counted |= {cause for name in tuple(counted) for cause in model.ancestors(name)}
-    settable = (name for name in model if model.declared(name).settable)
-    return tuple(name for name in settable if counted.isdisjoint(model.targets(name)))
+        now = world.evaluate(names) if names else {}
+        return {name: np.ravel(now[name]).astype(float).tolist() for name in names}
 
 
 def scored(fractions: list[float], *, success: bool | None, total: float) -> dict[str, float]:
@@ -288,23 +246,97 @@ def scored(fractions: list[float], *, success: bool | None, total: float) -> dic
     return {**found, "return": total}
 
 
-def _drawn(env: ScmWorldEnv, step: int) -> dict[str, list[float]]:
-    """Read the values of what was intervened on at a control step."""
-    asked: Mapping[str, Any] = {
-        name: act
-        for at, request in env.interventions
-        if at == step
-        for name, act in request.items()
-    }
-    names = tuple(
-        name
-        for name, act in asked.items()
-        if not isinstance(act, Null)
-        and name in env.world.model
-        and name not in env.world.compiled.actions
-    )
-    now = env.world.evaluate(names) if names else {}
-    return {name: np.ravel(now[name]).astype(float).tolist() for name in names}
+# --- episodes under a protocol --------------------------------------------------------------------
+
+
+@final
+class EpisodeRunner:
+    """Runs episodes in one environment.
+
+    Args:
+        env: It is reset again and again.
+    """
+
+    def __init__(self, env: ScmWorldEnv) -> None:
+        self.env = env
+        self._under: dict[str, tuple[Protocol, CurriculumEnv]] = {}
+
+    def play(
+        self,
+        agent: Any,
+        protocol: Protocol,
+        *,
+        seed: int,
+        episode: int,
+        who: tuple[str, int] = ("", 0),
+        hooks: Sequence[Hook] = (),
+    ) -> EpisodeRow:
+        """Run an episode.
+
+        Args:
+            agent: The agent.
+            protocol: Which variables vary.
+            seed: Seed of the noise.
+            episode: Its number within the noise.
+            who: Name of the agent and number of its run, for the row.
+            hooks: They follow the episode.
+
+        Raises:
+            EvaluationError: The policy gave no action, or an intervention was refused; with the
+                place.
+        """
+        measured = Scores()
+        named = (who[0], self.env.world.backend.name, protocol.name, seed, episode)
+        place = dict(zip(("agent", "engine", "protocol", "seed", "episode"), named, strict=True))
+        with _placed(place, self.env):
+            acting = self.under(protocol)
+            play(acting, agent, hooks=(*hooks, measured), seed=seed, episode=episode)
+        row = (who[0], who[1], *named[1:], measured.steps)
+        return EpisodeRow(*row, measured.scores(), measured.drawn, measured.digest())
+
+    def try_out(self, protocol: Protocol, *, seed: int) -> None:
+        """Check that a protocol fits: begin the first episode with it.
+
+        Raises:
+            UnknownOption: It depends on what happened in other episodes, or acts after their end.
+            EvaluationError: An intervention is impossible, with the place.
+        """
+        found = self.under(protocol)
+        place = {"engine": self.env.world.backend.name, "protocol": protocol.name}
+        with _placed({**place, "seed": seed, "episode": 0}, self.env):
+            found.reset(seed=seed, options={"episode": 0})
+
+    def under(self, protocol: Protocol) -> CurriculumEnv:
+        """Return the environment under a protocol.
+
+        Raises:
+            UnknownOption: It depends on what happened in other episodes, or acts after their end.
+            EvaluationError: It names something that does not exist, or an impossible region.
+        """
+        kept, found = self._under.get(protocol.name, (None, None))
+        if found is not None and kept == protocol:
+            return found
+        world = self.env.world
+        if protocol.step >= world.max_episode_length:
+            allowed = (f"control steps from 0 to {world.max_episode_length - 1}",)
+            raise UnknownOption(f"step of protocol {protocol.name}", protocol.step, allowed)
+        if any(part.kind == "stages" for part in nested(protocol.part, Part)):
+            allowed = ("parts without stages: an episode must not depend on others",)
+            raise UnknownOption(f"act of protocol {protocol.name}", "stages", allowed)
+        try:
+            found = CurriculumEnv(self.env, protocol.curriculum())
+            if isinstance(protocol.space, Subset) and not world.structures.head:
+                for pattern in protocol.space.unused(world.model):
+                    raise UnknownVariable(pattern, world.model)
+        except ScmWorldError as error:
+            place = {"protocol": protocol.name, "task": world.task.name}
+            raise EvaluationError(place, str(error)) from error
+        self._under[protocol.name] = protocol, found
+        return found
+
+    def close(self) -> None:
+        """Free the engine."""
+        self.env.close()
 
 
 @contextmanager
@@ -318,3 +350,81 @@ def _placed(place: dict[str, Any], env: ScmWorldEnv) -> Iterator[None]:
         if env.world.index:
             place = {**place, "control step": env.world.index}
         raise EvaluationError(place, str(error)) from error
+
+
+def unrelated(env: ScmWorldEnv, about: Mapping[str, Any]) -> tuple[str, ...]:
+    """Name the variables without a directed path to the score or the observation.
+
+    Of pictures nothing is named, since everything counts that can be seen, nor for a function of
+    the whole world, nor where a variable decides which bodies, and so which paths, there are.
+    Named policies of this package read states.
+
+    Args:
+        env: Where a policy acts.
+        about: Description of its ``Agent``.
+    """
+    if env.observed is None or about.get("sees") == "world" or len(env.world.structures.head):
+        return ()
+    model = env.world.model
+    observed = env.observed
+    if about["kind"] == "named":
+        observed = tuple(name for name in model if model.declared(name).role == "state")
+    scored_by = (FRACTION, SUCCESS, TERMINATED, "reward", SENSOR_NOISE)
+    counted = {name for name in (*observed, *scored_by) if name in model}
+    counted |= {cause for name in tuple(counted) for cause in model.ancestors(name)}
+    settable = (name for name in model if model.declared(name).settable)
+    return tuple(name for name in settable if counted.isdisjoint(model.targets(name)))
+
+
+# --- agents in worlds -----------------------------------------------------------------------------
+
+
+def in_world(policy: Any, world: Simulation) -> Policy:
+    """Return a policy of observations as one of a world, for ``rollout`` and ``live``.
+
+    It observes what an environment would show it, and its actions are turned into commands.
+
+    Args:
+        policy: As in ``as_agent``; one that says how it was trained gets such observations.
+        world: In which it acts, or one like it.
+
+    Raises:
+        UnknownOption: There is no such policy, or it was trained with other options.
+        SnapshotMismatch: When it acts: that world has another task or other options.
+        ActionError: When it acts: it has a memory, and this is not the control step after the last
+            one, as in a branch of an episode.
+
+    Example:
+        >>> from scm_world.queries import World
+        >>> world = World("pushing", backend="fake")
+        >>> world.rollout(in_world("zoo:pushing", world), steps=2).actions.shape
+        (2, 9)
+    """
+    agent = as_agent(policy)
+    options = {} if agent.card is None else agent.card.unusual(FORM)
+    env = ScmWorldEnv(
+        world.structures.task,
+        backend=world.backend.name,
+        preset=world.options.preset,
+        resolution=world.options.resolution,
+        frame_skip=world.options.frame_skip,
+        max_episode_length=world.options.given_length,
+        conventions=world.options.conventions.name,
+        **options,
+    )
+    remembers = agent.card is not None and agent.card.memory > 0
+    last = (-1, -1, -1)
+
+    def act(now: Simulation) -> Floats:
+        nonlocal last
+        env.world.restore(now.snapshot())
+        present = now.noise.seed, now.episode, now.index
+        if now.index > 0 and remembers and present != (*last[:2], last[2] + 1):
+            problem = "a policy with a memory acts from the first control step on, in one world"
+            raise ActionError(f"{problem}; make one for each branch, and begin at step 0", None)
+        if now.index == 0 or present[:2] != last[:2]:
+            agent.start(env)
+        last = present
+        return env.command(agent.act(env.observe()))
+
+    return act

@@ -1,4 +1,4 @@
-"""Why an episode went as it did: what it would have been, had one variable been another."""
+"""Explanations: what the score of an episode would have been, had one variable been another."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from scm_world._arguments import one_of
 from scm_world.curricula import Part, Situation, follow
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
-from scm_world.evaluation.again import shard_runner_of
-from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner
+from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner, Hook
+from scm_world.evaluation.preparation import again
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
 from scm_world.queries.progress import Progress
@@ -116,6 +116,27 @@ def _numbers(value: Sequence[float]) -> str:
     return shown[0] if len(shown) == 1 else f"[{', '.join(shown)}]"
 
 
+@final
+class _Look(Hook):
+    """Keeps the value of a variable at a control step."""
+
+    def __init__(self, name: str, step: int) -> None:
+        self.name, self.step = name, step
+        self.seen: tuple[float, ...] = ()
+
+    def begin(self, env: ScmWorldEnv, observation: Any) -> None:
+        """Look at the reset."""
+        self._env = env
+        self.after(observation, 0.0, {})
+
+    def after(self, observation: Any, reward: float, info: Mapping[str, Any]) -> bool:
+        """Look after a control step."""
+        world = self._env.world
+        if world.index == self.step and self.name in world.model:
+            self.seen = tuple(np.ravel(world[self.name]).astype(float).tolist())
+        return False
+
+
 def why(
     evaluation: Evaluation,
     protocol: str,
@@ -138,11 +159,11 @@ def why(
             ``evaluation.only(agent=…, engine=…)``. Of several runs or seeds the first one is taken.
         protocol: Name of the protocol.
         episode: Number of the episode.
-        metric: What is compared.
+        metric: Name of the score that is compared.
         versus: ``"A"``: the variable drawn from its training space; ``"default"``: left as it is
             without the protocol. If None, A where the protocol draws from elsewhere.
         policy: Who acted, as it was given to ``evaluate``; only needed in another process, for
-            what is no file and has no name.
+            a policy without a file and without a name.
         task: Where, if it is a task of the user's own class.
         trusted: Packages whose functions may be policies, or parts of protocols.
         progress: Called with how many variables are done.
@@ -156,44 +177,30 @@ def why(
     one = evaluation.only(protocol=protocol, episode=episode)
     agent, engine = one.the("agent", None), one.the("engine", None)
     run, seed = (int(one.columns[name][0]) for name in ("run", "seed"))
-    where = {"agent": agent, "run": run, "engine": engine, "protocol": protocol, "seed": seed}
-    one = one.only(run=run, seed=seed)
     one_of("versus", versus, (None, *VERSUS))
+    setup = again(evaluation.only(agent=agent, engine=engine), policy, task, trusted)
+    actor, done_there = setup.agents[agent, run], setup.protocols[protocol]
+    where: dict[str, Any] = {"seed": seed, "episode": episode, "who": (agent, run)}
     found, left_out = [], {}
-    with closing(
-        shard_runner_of(evaluation, policy=policy, task=task, trusted=trusted)
-    ) as shard_runner:
-        shard = shard_runner.setup.shard_of({**where, "episode": episode})
-        row = shard_runner.play(shard, episode)
-        if row.hash != one.columns["hash"][0]:
+    with closing(EpisodeRunner(setup.env(engine, actor))) as runner:
+        row = runner.play(actor, done_there, **where)
+        if row.hash != one.only(run=run, seed=seed).columns["hash"][0]:
             raise SnapshotMismatch(f"{protocol}, episode {episode} does not happen again")
         if not row.drawn:
             allowed = ("an episode in which a protocol varies something",)
-            raise UnknownOption("episode", f"{row.protocol}, {row.episode}", allowed)
-        done_there = shard_runner.setup.protocols[shard.protocol]
-        player, runner = shard_runner.setup.agents[shard.agent].player, shard_runner.runner(shard)
+            raise UnknownOption("episode", f"{protocol}, {episode}", allowed)
         runner.env.reset(seed=seed, options={"episode": episode})
         usual = runner.env.world.values()  # without interventions
-        against: dict[str, Any] = {n: versus or _versus(runner, usual, n, row) for n in row.drawn}
+        against = {
+            name: versus or _versus(runner.env.world, usual, name, row) for name in row.drawn
+        }
         for done, (name, how) in enumerate(against.items()):
             is_set: set[str] = set()
             part = _instead(done_there.part, name, how, is_set)
-            seen: list[float] = []
-
-            def look(env: ScmWorldEnv, name: str = name, seen: list[float] = seen) -> None:
-                """Keep the value of the variable at the step of the protocol."""
-                if env.world.index == done_there.step and name in env.world.model:
-                    seen[:] = np.ravel(env.world[name]).astype(float).tolist()
-
+            look = _Look(name, done_there.step)
             try:
-                then = runner.play(
-                    player,
-                    Protocol(f"{protocol} without {name}", act=part),
-                    seed=seed,
-                    episode=episode,
-                    who=(row.agent, row.run),
-                    watch=look,
-                )
+                instead = Protocol(f"{protocol} without {name}", act=part)
+                then = runner.play(actor, instead, hooks=(look,), **where)
             except EvaluationError as error:
                 left_out[name] = error.reason
             else:
@@ -201,7 +208,7 @@ def why(
                 would = Otherwise(
                     name,
                     tuple(row.drawn[name]),
-                    tuple(then.drawn.get(name, seen)),
+                    tuple(then.drawn.get(name, look.seen)),
                     row.scores[metric],
                     then.scores[metric],
                     *(None if success is None else bool(success) for success in ends),
@@ -219,13 +226,13 @@ def why(
 def _no_answer(
     one: Otherwise, row: EpisodeRow, then: EpisodeRow, found: set[str], world: Simulation
 ) -> str:
-    """Say why what would have been says nothing about a variable; empty if it does."""
+    """Return why an alternative says nothing about a variable; empty if it does."""
     name, model = one.variable, world.model
     if name not in found:
         return "the protocol does not set it"
 
     def follows(other: str) -> bool:
-        """Tell whether the spaces of another variable follow, as a height follows a size."""
+        """Return whether the spaces of another variable follow, as a height follows a size."""
         if other not in model or name not in model:
             return False
         variable, causes = model.declared(other), {name, *model.descendants(model.target(name))}
@@ -241,9 +248,9 @@ def _no_answer(
     return SAME if one.was == one.would_be else ""
 
 
-def _versus(runner: EpisodeRunner, usual: Mapping[str, Any], name: str, row: EpisodeRow) -> str:
-    """Choose what a variable is compared with: A, unless its value lies in A already."""
-    model = runner.env.world.model
+def _versus(world: Simulation, usual: Mapping[str, Any], name: str, row: EpisodeRow) -> str:
+    """Choose the alternative of a variable: A, unless its value lies in A already."""
+    model = world.model
     if name not in model:
         return "default"
     variable = model.declared(name)

@@ -10,9 +10,10 @@ from dataclasses import asdict, dataclass, field
 from itertools import chain
 from typing import Any, final
 
-from scm_world.evaluation.episodes import METRICS, EpisodeRow, EpisodeRunner
+from scm_world.evaluation.episodes import METRICS, EpisodeRow, EpisodeRunner, Hook
+from scm_world.evaluation.preparation import prepare
 from scm_world.evaluation.results import Evaluation, columns_of
-from scm_world.evaluation.setups import Setup, Shard, prepare
+from scm_world.evaluation.setups import Setup, Shard, form_of
 from scm_world.queries.progress import Progress, Tell, clock
 from scm_world.runs.files import Location
 from scm_world.runs.pool import Pool, pool_of
@@ -36,23 +37,23 @@ class ShardRunner:
         """Play all episodes of a shard."""
         return [self.play(shard, episode) for episode in range(shard.first, shard.stop)]
 
-    def play(self, shard: Shard, episode: int, watch: Any = None) -> EpisodeRow:
+    def play(self, shard: Shard, episode: int, hooks: Sequence[Hook] = ()) -> EpisodeRow:
         """Play one episode of it."""
-        agent_run = self.setup.agents[shard.agent]
         return self.runner(shard).play(
-            agent_run.player,
+            self.setup.agents[shard.agent, shard.run],
             self.setup.protocols[shard.protocol],
             seed=shard.seed,
             episode=episode,
-            who=(agent_run.agent, agent_run.run),
-            watch=watch,
+            who=(shard.agent, shard.run),
+            hooks=hooks,
         )
 
     def runner(self, shard: Shard) -> EpisodeRunner:
         """Return the runner of a shard: its backend, and the options of its agent."""
-        key = self.setup.where(shard)
+        agent = self.setup.agents[shard.agent, shard.run]
+        key = json.dumps([shard.engine, form_of(agent)], sort_keys=True)
         if key not in self.runners:
-            self.runners[key] = EpisodeRunner(self.setup.env(shard))
+            self.runners[key] = EpisodeRunner(self.setup.env(shard.engine, agent))
         return self.runners[key]
 
     def close(self) -> None:
@@ -85,7 +86,7 @@ def evaluate(
 
     Args:
         policy: A policy; a list of policies, one for each training run of an agent; or either by
-            the name of the agent. What a policy can be is said at ``as_player``.
+            the name of the agent. What a policy can be is said at ``as_agent``.
         protocols: Names (``"P0,P5"``, ``"P2@100"`` for within the episodes), patterns,
             ``Protocol``, or several; all of the task if None.
         task: Name, or a task; if None the one that the policies were trained for, else pushing.
@@ -133,11 +134,11 @@ def evaluate(
         trusted=trusted,
     )
     with pool_of(engine, workers) as pool, Study(out, "evaluation", {}) as study:
-        pool.check("task with several workers", setup.place.task)
-        for one in setup.agents:
-            pool.check(f"policy {one.agent!r} with several workers", one.player.policy)
+        pool.check("task with several workers", setup.task)
+        for (name, _), agent in setup.agents.items():
+            pool.check(f"policy {name!r} with several workers", agent.policy)
         rows = _all_rows(setup, pool, study, progress, tell)
-    policies = {(one.agent, one.run): one.player.policy for one in setup.agents}
+    policies = {who: agent.policy for who, agent in setup.agents.items()}
     return Evaluation(setup.about(), columns_of(rows), policies)
 
 
@@ -149,7 +150,8 @@ def _all_rows(
     kept: dict[str, Shard] = {}
     others: dict[str, Shard] = {}
     for place, shard in enumerate(shards):
-        noisy = setup.agents[shard.agent].about.get("repeats") == "no"  # who may be another by now
+        about = setup.agents[shard.agent, shard.run].about
+        noisy = about.get("repeats") == "no"  # it may act otherwise by now
         is_kept = study.folder is not None and not noisy
         names.append(f"parts/{setup.key(shard)}.json" if is_kept else str(place))
         (kept if is_kept else others)[names[-1]] = shard

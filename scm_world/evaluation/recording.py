@@ -27,21 +27,20 @@ from scm_world.errors import (
     UnknownOption,
     UnreadableFile,
 )
-from scm_world.evaluation.players import as_player
+from scm_world.evaluation.episodes import Hook, play
 from scm_world.evaluation.recording_files import (
     Recorded,
+    as_data,
     from_parquet,
-    header_of,
     parts,
     to_minari,
     to_parquet,
 )
-from scm_world.output.durable import said, write_durably
-from scm_world.output.reading import LARGEST_TABLE, read_bytes
-from scm_world.output.remote import Location, located
+from scm_world.policies.agents import Agent, as_agent
 from scm_world.queries.episodes import as_names
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
+from scm_world.runs.files import Location, located, read_bytes, write_whole
 from scm_world.tasks import Task
 from scm_world.tasks.factories import refuse_untrusted
 
@@ -62,9 +61,6 @@ _UNUSED: Mapping[str, Any] = {
     "render_size": None,
 }
 """Arguments of an environment that repeats recorded interventions, and makes none itself."""
-
-_GONE = ("info_contacts", "info_state")
-"""Arguments of earlier versions, which decided nothing that is compared."""
 
 _CHANGING = (gymnasium.ActionWrapper, gymnasium.ObservationWrapper, gymnasium.RewardWrapper)
 
@@ -148,8 +144,7 @@ class Recording:
         """
         if task is None:
             refuse_untrusted(_name(self.environment), self.trusted)
-        kept = {name: v for name, v in self.environment.items() if name not in _GONE}
-        arguments = {**kept, **_UNUSED}
+        arguments = {**self.environment, **_UNUSED}
         unknown = arguments.keys() - {*ENV_OPTIONS}
         if unknown:
             raise SnapshotMismatch(
@@ -192,9 +187,13 @@ class Recording:
         target = located(path)
         if target.suffix != ".parquet":
             target = target.with_name(target.name + ".parquet")
-        about = self.environment, self.versions, self.policy, self.episodes, self.fingerprint
-        header = header_of(*about)
-        write_durably(target, to_parquet(header, self.episodes))
+        about = {
+            "environment": as_data(self.environment),
+            "fingerprint": dict(self.fingerprint),
+            "versions": dict(self.versions),
+            "policy": None if self.policy is None else dict(self.policy),
+        }
+        write_whole(target, to_parquet(about, self.episodes))
         return target
 
     @classmethod
@@ -210,10 +209,10 @@ class Recording:
             ModelError: A mechanism is a function of no trusted package.
         """
         try:
-            data = read_bytes(path, LARGEST_TABLE)
+            data = read_bytes(path)
         except OSError as error:
             advice = "give one that a Recording was saved to"
-            raise UnreadableFile(str(path), said(error), advice) from None
+            raise UnreadableFile(str(path), error.strerror or str(error), advice) from None
         header, episodes = from_parquet(data, str(path), trusted)
         about = header["environment"], tuple(episodes), header["versions"], header["policy"]
         return cls(*about, header["fingerprint"], tuple(trusted))
@@ -247,7 +246,7 @@ class Recording:
             "algorithm_name": str((self.policy or {}).get("name", "unknown")),
             "description": f"{self!r}, recorded by scm_world.",
         }
-        return to_minari(self.episodes, dataset_id, **{**usual, **about})
+        return to_minari(self.environment, self.episodes, dataset_id, **{**usual, **about})
 
 
 def _name(made_with: Mapping[str, Any]) -> str:
@@ -345,6 +344,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._wanted = chosen if chosen == ALL else as_names(chosen)
         self._made: list[Recorded] = []
         self._now: _Episode | None = None
+        self._label: Any = None
         self._version = -1
 
     def reset(
@@ -362,12 +362,12 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._write(self._now, observation, info)
         return observation, info
 
-    def step(self, action: Any, label: Any = None) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Advance one control step.
+    def label(self, action: Any) -> None:
+        """Record the action that a teacher would take in the next control step."""
+        self._label = action
 
-        Args:
-            action: That is played.
-            label: What should be done here instead, if that is known; shape (n_actions,).
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Advance one control step.
 
         Raises:
             NotReset: There is no episode.
@@ -381,7 +381,8 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         taken = np.array(action if single else doubles(action, n))  # as the environment reads it
         observation, reward, terminated, truncated, info = self.env.step(action)
         episode.actions.append(taken)
-        episode.labels.append(label)
+        episode.labels.append(self._label)
+        self._label = None
         episode.returns.append((float(reward), bool(terminated), bool(truncated)))
         self._write(episode, observation, info)
         return observation, reward, terminated, truncated, info
@@ -455,7 +456,6 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 is_logical = all(isinstance(value, bool | np.bool_) for value in values)
                 infos[name] = np.array(values, dtype=np.bool_ if is_logical else np.float64)
         return Recorded(
-            environment=self._inner.made_with,
             seed=episode.seed,
             number=episode.number,
             interventions=tuple((step, Plan(did)) for step, did in episode.interventions),
@@ -506,7 +506,7 @@ def record(
     as ``labels``, that is a round of DAgger. ``Recording.pairs`` gives the labels.
 
     Args:
-        policy: Anything that ``as_player`` reads.
+        policy: Anything that ``as_agent`` reads.
         env: Of this package; it may have wrappers that intervene, such as a curriculum.
         n: How many episodes.
         seed: Of the noise.
@@ -532,36 +532,49 @@ def record(
         >>> record("random", env, 2)
         Recording of 2 episodes, 10 control steps, of reaching
     """
-    player, recorder = as_player(policy), Recorder(env, infos)
-    teacher = player if labels in (None, TEACHER) else as_player(labels)
+    agent, recorder = as_agent(policy), Recorder(env, infos)
+    teacher = agent if labels in (None, TEACHER) else as_agent(labels)
     whole_number("n", n, least=1)
     if not (isinstance(noise, int | float) and 0.0 <= noise < np.inf):
         raise UnknownOption("noise", noise, ("a standard deviation of actions, 0 or more",))
-    inner = unwrapped_env(env, "Recorder")
-    space: Any = env.action_space
-    start: dict[str, Any] = {"seed": seed, "options": {"episode": first, "do": do}}
-    for _ in range(n):
-        observation, _info = recorder.reset(**start)
-        start = {"options": {"do": do}}  # the next episode
-        player.begin(inner)
-        if teacher is not player:
-            teacher.begin(inner)
-        random = np.random.default_rng([inner.world.noise.seed, inner.world.episode])
-        scale = noise * random.uniform()
-        noises = action_noise(random, inner.world.compiled.n_actions)
-        over = False
-        while not over:
-            action = player.act(observation)
-            right = action if teacher is player else teacher.act(observation)
-            label = None if labels is None else np.clip(right, space.low, space.high)
-            if noise:
-                action = np.clip(action + scale * next(noises), space.low, space.high)
-            observation, _, ended, cut, _info = recorder.step(action, label)
-            over = ended or cut
-    found = recorder.recording(player.about)
+    shown = _Shown(recorder, agent, teacher, noise=noise, has_labels=labels is not None)
+    for number in range(n):
+        start: dict[str, Any] = {"seed": seed, "episode": first} if number == 0 else {}
+        play(recorder, agent, do, [shown], **start)
+    found = recorder.recording(agent.about)
     if out is not None:
         found.save(out)
     return found
+
+
+@final
+class _Shown(Hook):
+    """Asks a teacher in every control step, and disturbs the action that is played."""
+
+    def __init__(
+        self, recorder: Recorder, agent: Agent, teacher: Agent, *, noise: float, has_labels: bool
+    ) -> None:
+        self.recorder, self.agent, self.teacher = recorder, agent, teacher
+        self.noise, self.has_labels = noise, has_labels
+
+    def begin(self, env: ScmWorldEnv, observation: Any) -> None:
+        """Draw how much noise there is in this episode."""
+        if self.teacher is not self.agent:
+            self.teacher.start(env)
+        random = np.random.default_rng([env.world.noise.seed, env.world.episode])
+        self.scale = self.noise * random.uniform()
+        self.noises = action_noise(random, env.world.compiled.n_actions)
+
+    def choose(self, observation: Any, action: Any) -> Any:
+        """Record what the teacher would do; add the noise."""
+        space: Any = self.recorder.action_space
+        if self.has_labels:
+            same = self.teacher is self.agent
+            right = action if same else self.teacher.act(observation)
+            self.recorder.label(np.clip(right, space.low, space.high))
+        if self.noise:
+            action = np.clip(action + self.scale * next(self.noises), space.low, space.high)
+        return action
 
 
 def _refuse_changes(env: gymnasium.Env[Any, Any], inside: ScmWorldEnv) -> None:

@@ -56,7 +56,7 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
         bounds = variable.bounds
         if bounds is not None and not bounds.parents() and not bounds.contains(number, {}):
             check_bounds(variable, number, {})
-        return Hard(number.tolist())
+        return Hard.of(number)
     if kind is Draw:
         check_draw(variable, value)
         _known(declared, source_of(AppliedIntervention(value, variable)).parents())

@@ -123,11 +123,13 @@ class SCM:
 
     __slots__ = (
         "_acts",
+        "_adds_edges",
         "_declared",
         "_drawable",
         "_evaluator",
         "_interventions",
         "_order",
+        "_settable",
         "_structure",
         "_targets",
         "_temporal",
@@ -139,10 +141,12 @@ class SCM:
         self._order: tuple[str, ...] = edges.order
         self._evaluator = Evaluator(self._declared)
         self._targets: dict[str, tuple[str, ...]] = {}  # looked up once
+        self._settable: dict[Any, Variable] = {}  # those that an intervention was accepted on
         self._drawable: set[tuple[str, str]] = set()  # variables and spaces that they have
         self._temporal: frozenset[str] | None = None
         self._interventions: dict[str, Intervention] = {}
         self._acts: dict[str, AppliedIntervention] = {}
+        self._adds_edges = False
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return what decides its values: declarations by entity, functions, interventions."""
@@ -220,6 +224,11 @@ class SCM:
     def interventions(self) -> Mapping[str, Intervention]:
         """The interventions, by requested name; those on a bundle by the names of its parts."""
         return dict(self._interventions)
+
+    @property
+    def adds_edges(self) -> bool:
+        """Whether an intervention adds edges: a mechanism, or a draw from a space with parents."""
+        return self._adds_edges
 
     @property
     def structure(self) -> EdgeIndex:
@@ -353,12 +362,13 @@ class SCM:
             model._acts[target] = AppliedIntervention(intervention, requested)
             model._interventions[name] = intervention
         model._structure = None if acts else self._structure
-        # Cutting edges keeps every causal order valid.
-        adds = False
+        model._adds_edges = False
         for held in model._acts.values():
             kind = type(held.intervention)
-            adds |= kind is Mechanism or (kind is Draw and bool(source_of(held).parents()))
-        model._order = model.structure.order if adds else self._order
+            if kind is Mechanism or (kind is Draw and source_of(held).parents()):
+                model._adds_edges = True
+        # Cutting edges keeps every causal order valid.
+        model._order = model.structure.order if model._adds_edges else self._order
         return model
 
     def without_cycles(self, acts: Mapping[str, Intervention]) -> tuple[Self, list[ClosesCycle]]:
@@ -376,13 +386,17 @@ class SCM:
 
     def _copy(self, other: SCM) -> None:
         self._declared, self._temporal = other._declared, other._temporal
-        self._targets, self._drawable = other._targets, other._drawable
+        self._targets, self._settable = other._targets, other._settable
+        self._drawable = other._drawable
         self._evaluator, self._order = other._evaluator, other._order
         self._interventions, self._acts = {**other._interventions}, {**other._acts}
-        self._structure = other._structure
+        self._structure, self._adds_edges = other._structure, other._adds_edges
 
     def accept(self, name: str, value: Any, *, any_variable: bool = False) -> Intervention:
         """Return one checked intervention: name, type, shape, finite, fixed bounds."""
+        known = self._settable.get(name) if type(name) is str else None
+        if known is not None and type(value) not in (Draw, Mechanism):
+            return accepted(self._declared, known, value)
         if not isinstance(name, str) or name not in self._declared:
             settable = (n for n, v in self._declared.items() if v.settable or any_variable)
             raise UnknownVariable(name, settable)
@@ -395,6 +409,8 @@ class SCM:
         if not any_variable and not target.settable:
             reason = "is a constant" if isinstance(target, Fixed) else "is measured, not set"
             raise NotIntervenable(name, reason, settable_causes(self._declared, target.name))
+        if target.settable:
+            self._settable[name] = self._declared[name]
         if type(value) is not Draw or not isinstance(value.source, str):
             return accepted(self._declared, self._declared[whole], value)
         if (whole, value.source) not in self._drawable:
@@ -514,10 +530,19 @@ class SCM:
                     kept[earlier(parent.name, lag)] = before
         return kept
 
-    def evaluate(self, name: str, values: Values, key: NoiseKey | None = None) -> Value:
-        """Compute one variable from the values of all its parents."""
+    def evaluate(
+        self,
+        name: str,
+        values: Values,
+        key: NoiseKey | None = None,
+        act: AppliedIntervention | None = None,
+    ) -> Value:
+        """Compute one variable from the values of all its parents; under an intervention, if any.
+
+        ``act`` takes the place of the one that the model has.
+        """
         known = self.declared(name).name
-        return self._evaluator.evaluate(known, self._acts.get(known), values, {}, key)
+        return self._evaluator.evaluate(known, act or self._acts.get(known), values, {}, key)
 
     def draw(
         self, n: int, *, seed: int, first: int = 0, steps: int | None = None

@@ -3,8 +3,13 @@
 from scm_world.policies.scripted import Random
 from scm_world.queries.abduction import Counterfactuals
 from scm_world.queries.comparison import Comparison
-from scm_world.queries.consequences import Consequence, Consequences, consequences
-from scm_world.queries.differences import ButFor, Divergence, EpisodeDifference, but_for, compare
+from scm_world.queries.differences import (
+    Consequences,
+    EpisodeDifference,
+    but_for,
+    compare,
+    consequences,
+)
 from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.estimates import Effect
@@ -20,12 +25,9 @@ from scm_world.queries.world import World
 
 __all__ = [
     "SCM",
-    "ButFor",
     "Comparison",
-    "Consequence",
     "Consequences",
     "Counterfactuals",
-    "Divergence",
     "Effect",
     "Episode",
     "EpisodeDifference",

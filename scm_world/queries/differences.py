@@ -1,72 +1,63 @@
-"""How two episodes differ, and which of several causes made the difference."""
+"""Pairs of runs: how two episodes differ, what an intervention changed, and which cause mattered.
+
+Each answer is a data frame.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from scm_world._arguments import real_number, whole_number
-from scm_world._types import Floats
+from scm_world._arguments import one_of, real_number, whole_number
 from scm_world.errors import UnknownOption
-from scm_world.queries.episodes import Episode, as_names
+from scm_world.queries.episodes import ALL, Episode, Unit, as_names
+from scm_world.queries.experiments.effects import gap
 from scm_world.queries.outcomes import Outcome, as_outcome, is_category, read
+from scm_world.queries.plans import has_times
+from scm_world.queries.questions import SCM, Questions
+from scm_world.queries.twins import asked
+from scm_world.queries.world import World
 from scm_world.variables import Natural
+from scm_world.variables.kinds import SPACES, SpaceName
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# --- two episodes ---------------------------------------------------------------------------------
 
 
 @final
-@dataclass(frozen=True)
-class Divergence:
-    """How a variable differs between two episodes.
-
-    Attributes:
-        first: The first instant at which it does.
-        largest: The largest difference of a component; 1 where categories differ.
-        at: The instant of that.
-        final: The difference at the end, shape of the variable.
-    """
-
-    first: int
-    largest: float
-    at: int
-    final: Floats
-
-
-@final
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EpisodeDifference:
     """How two episodes differ.
 
     Attributes:
-        variables: Those that do, by name, the earliest first.
-        contacts: Pairs of bodies that touch in one of the two only: instant, pair, and 0 or 1 for
-            the episode in which they do.
+        variables: The variables that differ, by name, the earliest first: the ``first`` instant at
+            which they do, the ``largest`` difference of a component (1 where categories differ),
+            the instant of that (``at``), and the difference at the end (``final``).
+        contacts: Pairs of bodies that touch in one of the two only: ``step``, ``bodies``, and
+            ``"a"`` or ``"b"`` for the ``episode`` in which they do.
     """
 
-    variables: Mapping[str, Divergence]
-    contacts: tuple[tuple[int, tuple[str, str], int], ...]
+    variables: pd.DataFrame
+    contacts: pd.DataFrame
 
     @property
     def first(self) -> int | None:
         """The first instant at which anything differs; None if nothing does."""
-        return min((found.first for found in self.variables.values()), default=None)
+        return int(self.variables["first"].min()) if len(self.variables) else None
 
     def __str__(self) -> str:
-        if not self.variables:
+        if not len(self.variables):
             return "no difference"
-        lines = [
-            f"{name}: from {d.first} on, at most {d.largest:.4g} (at {d.at})"
-            for name, d in self.variables.items()
-        ]
-        if self.contacts:
-            at, pair, one = self.contacts[0]
-            lines.append(
-                f"{len(self.contacts)} contacts in one only, first {pair[0]}–{pair[1]} in "
-                f"{'ab'[one]} at {at}"
-            )
+        lines = [self.variables.drop(columns="final").to_string(float_format="{:.4g}".format)]
+        if len(self.contacts):
+            where, one = f"{len(self.contacts)} contacts in one only, first", self.contacts.iloc[0]
+            lines.append(f"{where} {'–'.join(one.bodies)} in {one.episode} at {one.step}")
         return "\n".join(lines)
 
 
@@ -84,23 +75,41 @@ def compare(
     Raises:
         UnknownOption: They are not equally long, or no episodes.
     """
+    import pandas as pd
+
     for given in (one, other):
         _check_episode(given)
     real_number("tolerance", tolerance, least=0.0)
     if one.steps != other.steps:
         raise UnknownOption("episode", other, (f"one of {one.steps} steps",))
     both = [name for name in one.names if name in set(other.names)]
-    wanted = both if names is None else as_names(names)
+    rows: dict[str, Any] = {}
+    for name in both if names is None else as_names(names):
+        values = np.asarray(one[name], float), np.asarray(other[name], float)
+        if values[0].shape != values[1].shape:  # a body came or went in one of them
+            rows[name] = 0, np.inf, 0, np.asarray(np.inf)
+            continue
+        apart = values[0] - values[1]
+        if any(is_category(world, Outcome(name)) for _, world in one.declarations):
+            apart = (apart != 0.0).astype(float)
+        sizes = np.abs(apart).reshape(len(apart), -1).max(axis=1, initial=0.0)
+        differs, at = sizes > tolerance, int(np.argmax(sizes))
+        if differs.any():
+            rows[name] = int(np.argmax(differs)), float(sizes[at]), at, np.asarray(apart[-1])
+    columns = ["first", "largest", "at", "final"]
+    found = pd.DataFrame([*rows.values()], index=[*rows], columns=columns, dtype=object)
+    found = found.astype({"first": int, "largest": float, "at": int})
     touching = zip(one.replay().touching, other.replay().touching, strict=True)
-    found = {name: _divergence(one, other, name, tolerance) for name in wanted}
-    apart = [(name, d) for name, d in found.items() if d is not None]
-    contacts = tuple(
-        (step, pair, which)
-        for step, sets in enumerate(touching)
-        for which in (0, 1)
-        for pair in sorted(sets[which] - sets[1 - which])
+    contacts = [
+        (step, pair, episode)
+        for step, (mine, its) in enumerate(touching)
+        for episode, alone in (("a", mine - its), ("b", its - mine))
+        for pair in sorted(alone)
+    ]
+    return EpisodeDifference(
+        found.sort_values("first", kind="stable"),
+        pd.DataFrame(contacts, columns=["step", "bodies", "episode"]),
     )
-    return EpisodeDifference(dict(sorted(apart, key=lambda item: item[1].first)), contacts)
 
 
 def _check_episode(given: Any) -> None:
@@ -108,48 +117,131 @@ def _check_episode(given: Any) -> None:
         raise UnknownOption("episode", given, ("what rollout or counterfactual gave",))
 
 
-def _divergence(first: Episode, second: Episode, name: str, tolerance: float) -> Divergence | None:
-    one, other = np.asarray(first[name], float), np.asarray(second[name], float)
-    if one.shape != other.shape:
-        return Divergence(0, float("inf"), 0, np.asarray(np.inf))
-    if any(is_category(world, Outcome(name)) for _, world in first.declarations):
-        one, other = (one != other).astype(float), np.zeros_like(one)
-    sizes = np.abs(one - other).reshape(len(one), -1).max(axis=1, initial=0.0)
-    differs, at = sizes > tolerance, int(np.argmax(sizes))
-    if not differs.any():
-        return None
-    final = np.asarray(one[-1] - other[-1])
-    return Divergence(int(np.argmax(differs)), float(sizes[at]), at, final)
+# --- one intervention -----------------------------------------------------------------------------
 
 
 @final
-@dataclass(frozen=True)
-class ButFor:
-    """What an outcome would have been without a cause.
+@dataclass(frozen=True, eq=False)
+class Consequences:
+    """What an intervention changed.
 
     Attributes:
-        causes: Variables whose values were other ones.
-        outcome: What it is.
-        without: What it would have been.
+        audit: What was done.
+        steps: Control steps since then.
+        variables: A row for each variable that is there with and without it, but for targets
+            without descendants: its ``unit``; whether it is a ``descendant`` of a target; whether
+            it ``moved`` from before, or from what it would have been; its value ``before`` the
+            intervention, ``right_after`` it, ``after`` all steps, and then ``without`` it; the
+            largest ``difference`` of a component of the last two, of categories 0 or 1.
+        scenes: Of a world: at the beginning without it, and at the end with it.
+        engine: Version of the physics engine; empty without one.
     """
 
-    causes: tuple[str, ...]
-    outcome: Floats
-    without: Floats
+    audit: Any
+    steps: int
+    variables: pd.DataFrame
+    scenes: tuple[Any, ...]
+    engine: str
 
     @property
-    def mattered(self) -> bool:
-        """Whether the outcome would have been another one."""
-        return not np.array_equal(self.outcome, self.without)
+    def astray(self) -> tuple[str, ...]:
+        """Variables that moved and are no descendants of a target: the graph is wrong."""
+        table = self.variables
+        return tuple(table.index[table["moved"] & ~table["descendant"]])
 
-    @property
-    def size(self) -> float:
-        """By how much, at most, over the components."""
-        return float(np.abs(self.outcome - self.without).max(initial=0.0))
+    def as_dict(self) -> dict[str, Any]:
+        """Return all but the scenes by name; values stay arrays."""
+        audit, parts = self.audit, ("requested", "applied", "read_back")
+        followed, engine = (
+            {name: {"before": old, "after": new} for name, (old, new) in pairs.items()}
+            for pairs in (audit.followed, audit.engine)
+        )
+        return {
+            "steps": self.steps,
+            "audit": {n: {p: getattr(t, p) for p in parts} for n, t in audit.targets.items()},
+            "followed": followed,
+            "engine": engine,
+            "came": audit.came,
+            "went": audit.went,
+            "variables": self.variables.to_dict("index"),
+            "moved_without_a_path": list(self.astray),
+        }
 
-    def __str__(self) -> str:
-        verb = "mattered" if self.mattered else "did not matter"
-        return f"{' and '.join(self.causes)} {verb}: {self.outcome} instead of {self.without}"
+
+def consequences(
+    system: World | SCM,
+    request: Mapping[str, Any],
+    *,
+    steps: int = 25,
+    seed: int = 0,
+    space: SpaceName | None = None,
+) -> Consequences:
+    """Intervene at the start of an episode, and compare it with the same one without that.
+
+    The idle action is taken in both; noise is the same. The system itself is left alone.
+
+    Args:
+        system: A world, or equations.
+        request: The intervention, without a time.
+        steps: Control steps afterwards; none where nothing depends on time.
+        seed: Of the noise.
+        space: Of a world: in which all values must lie.
+
+    Raises:
+        UnknownOption: There is no such space.
+        InterventionError: The intervention is refused.
+
+    Example:
+        >>> found = consequences(World("pushing", backend="fake"), {"tool_block.mass": 0.05})
+        >>> found.astray, bool(found.variables.descendant["tool_block.linear_velocity"])
+        ((), True)
+    """
+    import pandas as pd
+
+    one_of("space", space, (None, *SPACES))
+    if not isinstance(system, Questions):
+        raise UnknownOption("system", system, ("a World", "an SCM"))
+    if has_times(request):
+        raise UnknownOption("request", request, ("interventions without a time",))
+    steps = whole_number("steps", steps, least=0) if system.graph.is_temporal else 0
+    twins, is_world = asked(system)[0], isinstance(system, World)
+    plain = Unit(seed, 0, system.planned(None), None, steps, (ALL,))
+    with twins.twin() as world:
+        one = plain.run(world, twins)
+        if space is not None and is_world:
+            world.reset(seed=seed, do=plain.plan)
+            world.do(request, space=space)
+        other = replace(plain, plan=system.planned(request)).run(world, twins)
+        engine = world.engine if is_world else ""
+    audit, models = other.audits[0], [ran.declarations[0][1].model for ran in (one, other)]
+    targets = {models[0].target(name) for name in audit.targets}
+    follow = {
+        name
+        for model in models  # the intervention may change which bodies there are
+        for target in targets & {*model}
+        for name in model.descendants(target)
+    }
+    rows: dict[str, Any] = {}
+    for name in models[0]:
+        if name not in models[1] or (name in targets and name not in follow):
+            continue
+        before, right_after = one[name][0], other[name][0]
+        after, without = other.final(name), one.final(name)
+        difference, variable = gap(after, without), models[0].declared(name)
+        moved = difference > 0.0 or gap(right_after, before) > 0.0
+        if variable.dtype == "categorical":
+            difference = float(difference > 0.0)
+        values = before, right_after, after, without
+        rows[name] = variable.unit, name in follow, moved, *values, difference
+    columns = ["unit", "descendant", "moved", "before", "right_after", "after", "without"]
+    table = pd.DataFrame([*rows.values()], index=[*rows], columns=[*columns, "difference"])
+    scenes = (one.scene(0)[0], other.scene(steps)[0]) if is_world else ()
+    return Consequences(
+        audit, steps, table.astype({"descendant": bool, "moved": bool}), scenes, engine
+    )
+
+
+# --- several causes -------------------------------------------------------------------------------
 
 
 def but_for(
@@ -160,7 +252,7 @@ def but_for(
     at: int = 0,
     most: int = 1,
     workers: int | None = None,
-) -> tuple[ButFor, ...]:
+) -> pd.DataFrame:
     """Ask, for each cause, whether the outcome would have been the same without it.
 
     Args:
@@ -175,11 +267,15 @@ def but_for(
         workers: Threads, see ``Setting``.
 
     Returns:
-        One entry for each set of causes, those that matter first, the largest first.
+        A row for each set of ``causes``, the largest difference first: whether it ``mattered``, by
+        how much at most over the components (``size``), the ``outcome``, and the outcome
+        ``without`` them.
 
     Raises:
         UnknownOption: A cause without another value was not intervened on, or an argument is none.
     """
+    import pandas as pd
+
     _check_episode(episode)
     most, at = whole_number("most", most, least=1), whole_number("at", at, least=0)
     if isinstance(over, Mapping):
@@ -193,9 +289,9 @@ def but_for(
                 raise UnknownOption("cause", name, allowed)
     wanted = as_outcome(outcome)
     actual = read(wanted, episode)
-    found: list[ButFor] = []
+    rows: list[tuple[Any, ...]] = []
     for size in range(1, most + 1):
-        decisive = [set(entry.causes) for entry in found if entry.mattered]
+        decisive = [set(causes) for causes, mattered, *_ in rows if mattered]
         groups = [
             group
             for group in combinations(contrasts, size)
@@ -203,8 +299,10 @@ def but_for(
         ]
         dos = [{name: contrasts[name] for name in group} for group in groups]
         others = episode.worlds(dos, at=at, workers=workers)
-        found += [
-            ButFor(group, actual, read(wanted, other))
-            for group, other in zip(groups, others, strict=True)
-        ]
-    return tuple(sorted(found, key=lambda entry: (-entry.size, len(entry.causes))))
+        for group, other in zip(groups, others, strict=True):
+            value = read(wanted, other)
+            reach = float(np.abs(actual - value).max(initial=0.0))
+            rows.append((group, not np.array_equal(actual, value), reach, actual, value))
+    columns = ["causes", "mattered", "size", "outcome", "without"]
+    found = pd.DataFrame(rows, columns=columns).astype({"mattered": bool, "size": float})
+    return found.sort_values("size", ascending=False, kind="stable", ignore_index=True)

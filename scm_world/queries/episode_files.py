@@ -58,56 +58,45 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
     episode, target = episode.episode(), Path(path)
     if target.suffix != ".npz":
         target = target.with_name(target.name + ".npz")
-    made = io.BytesIO()
-    np.savez_compressed(made, about=np.array(json.dumps(_about(episode))), actions=episode.actions)
-    write_whole(target, made.getvalue())
-    return target
-
-
-def _about(episode: Episode) -> dict[str, Any]:
     with episode.twins.twin() as twin:
-        is_world = isinstance(twin, Simulation)
-        return {
+        system: Any = twin if isinstance(twin, Simulation) else twin.model
+        about = {
             "format": FORMAT,
-            "fingerprint": fingerprint(twin if is_world else twin.model, libraries=False),
-            **(_world(episode.twins) if is_world else {"equations": _written(twin.model)}),
+            "fingerprint": fingerprint(system, libraries=False),
+            **_written(system, episode.twins),
             "seed": episode.seed,
             "number": episode.number,
             "plan": episode.plan.as_dict(),
             "instants": _hashes(episode),
-            "versions": versions(twin.engine if is_world else ""),
+            "versions": versions(getattr(system, "engine", "")),
         }
+    made = io.BytesIO()
+    np.savez_compressed(made, about=np.array(json.dumps(about)), actions=episode.actions)
+    write_whole(target, made.getvalue())
+    return target
 
 
-def _world(twins: Twins) -> dict[str, Any]:
-    task, options = twins.task, dict(twins.options)
+def _written(system: Simulation | SCM, twins: Twins) -> dict[str, Any]:
+    """Write a system as plain data, with None for what can only be given again as an object."""
+    if isinstance(system, SCM):
+        try:
+            return {"equations": to_dict(system)}
+        except ModelError:
+            return {"equations": None}
+    task: Task = twins.task
+    options, arguments = dict(twins.options), None
     if isinstance(options.get("variables_space"), Subset):
         options["variables_space"] = options["variables_space"].model_dump(mode="json")
-    return {"task": task.name, "arguments": _arguments(task), "options": options}
-
-
-def _written(model: SCM) -> dict[str, Any] | None:
-    """Return a model as plain data; None if it has a function without a name."""
-    try:
-        return to_dict(model)
-    except ModelError:
-        return None
-
-
-def _arguments(task: Task) -> dict[str, Any] | None:
-    """Write down what a task was made with; None where it can only be given again as a world."""
-    registered = task.name in tasks()
     problem = f"give the arguments of {task.name!r} by name, so that they can be saved"
     if task.is_named:
         try:
-            written = json.dumps(task.given, allow_nan=False, default=lambda value: value.tolist())
-            found: dict[str, Any] = json.loads(written)
-            return found
+            text = json.dumps(task.given, allow_nan=False, default=lambda value: value.tolist())
+            arguments = json.loads(text)
         except (TypeError, ValueError, AttributeError) as error:
             problem = f"an argument of {task.name!r} cannot be written: {error}"
-    if registered:
+    if arguments is None and task.name in tasks():
         raise ModelError([problem])
-    return None
+    return {"task": task.name, "arguments": arguments, "options": options}
 
 
 def _hashes(episode: Episode) -> list[str]:
@@ -149,8 +138,14 @@ def load_episode(
         about, actions = json.loads(str(arrays["about"])), arrays["actions"]
         if about["format"] != FORMAT:
             raise UnreadableFile(str(file), f"its format is {about['format']!r}", _ADVICE)
-        twins = _twins(about, world, file, trusted)
-        plan = Plan.from_dict(about["plan"], trusted=trusted)
+        system = _read(about, trusted) if world is None else world
+        kind, changed = SCM if "equations" in about else Simulation, ["kinds of system"]
+        if isinstance(system, kind):
+            changed = differing(about["fingerprint"], fingerprint(system, libraries=False))
+        if changed:
+            problem = f"{file} happened in another system, or one that was changed since"
+            raise SnapshotMismatch(f"{problem}: {', '.join(changed)} differ")
+        twins, plan = asked(system)[0], Plan.from_dict(about["plan"], trusted=trusted)
         given = Given(list(actions))
         unit = Unit(about["seed"], about["number"], plan, given, len(actions))
         with twins.twin() as twin:
@@ -168,33 +163,18 @@ def load_episode(
     return episode
 
 
-def _twins(
-    about: dict[str, Any], world: Simulation | SCM | None, file: Path, trusted: Sequence[str]
-) -> Twins:
-    """Return where the episode is run again; refuse a world or a model that is another one."""
-    kind, system = (SCM, world) if "equations" in about else (Simulation, world)
-    if world is None and kind is Simulation:
-        system = _made(about)
-    elif world is None:
+def _read(about: dict[str, Any], trusted: Sequence[str]) -> Simulation | SCM:
+    """Make the system of an episode from its file."""
+    if "equations" in about:
         if about["equations"] is None:
-            problem = f"{file} holds no model, since a function of it has no name"
-            raise ModelError([f"{problem}; pass it: load_episode(path, world=model)"])
-        system = from_dict(about["equations"], trusted=trusted)
-    changed = ["kinds of system"]
-    if isinstance(system, kind):
-        changed = differing(about["fingerprint"], fingerprint(system, libraries=False))
-    if changed:
-        problem = f"{file} happened in another system, or one that was changed since"
-        raise SnapshotMismatch(f"{problem}: {', '.join(changed)} differ")
-    return asked(system)[0]
-
-
-def _made(about: dict[str, Any]) -> Simulation:
+            remedy = "pass the model: load_episode(path, world=model)"
+            raise ModelError(
+                [f"the file holds no model, which has a function without a name; {remedy}"]
+            )
+        return from_dict(about["equations"], trusted=trusted)
     given = about["arguments"] or {}
     if about["task"] in tasks():
-        task = make_task(about["task"], **given)
-    elif "model" in given:
-        task = ModelTask(**given)
-    else:
-        raise UnknownOption("task", about["task"], (*tasks(), "any, with world=World(your task)"))
-    return Simulation(task, **about["options"])
+        return Simulation(make_task(about["task"], **given), **about["options"])
+    if "model" in given:
+        return Simulation(ModelTask(**given), **about["options"])
+    raise UnknownOption("task", about["task"], (*tasks(), "any, with world=World(your task)"))

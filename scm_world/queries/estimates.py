@@ -9,7 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Integers
 from scm_world.queries.equations import Equations, System
 from scm_world.queries.outcomes import as_outcome, label
 from scm_world.queries.plans import Plan
@@ -187,3 +187,17 @@ def effect_of(
         do=treated.plan,
         versus=control.plan,
     )
+
+
+def alike(place: Floats, bins: int) -> list[Integers]:
+    """Sort units into groups by their middle rank; a single unit joins the group before it."""
+    values, which, counts = np.unique(place, return_inverse=True, return_counts=True)
+    middle = np.cumsum(counts) - 0.5 * counts
+    number = np.arange(len(values)) if len(values) <= bins else middle * bins // len(place)
+    groups: list[Integers] = []
+    for each in np.unique(number):
+        units = np.flatnonzero(number[which.reshape(-1)] == each)
+        if groups and min(len(units), len(groups[-1])) < 2:
+            units = np.concatenate([groups.pop(), units])
+        groups.append(units)
+    return groups

@@ -1,15 +1,12 @@
-"""A world with permissions, a budget and a log, for discovery algorithms and agents."""
+"""A world with permissions and a budget, for discovery algorithms and agents."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
-from functools import partial
 from typing import Any, final
-
-import numpy as np
 
 from scm_world._arguments import one_of, whole_number
 from scm_world._fingerprint import fingerprint
@@ -20,34 +17,12 @@ from scm_world.queries.equations import length
 from scm_world.queries.outcomes import Outcome, as_outcomes, column
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Samples, Setting, refuse_late, sample
-from scm_world.queries.tables import read_protocol
 from scm_world.queries.twins import twins_of
 from scm_world.variables import Contact, Fixed, Reaches
 from scm_world.world import Simulation
 from scm_world.world.interventions import merged
 
 QUESTIONS = ("see", "do", "counterfactual")
-
-
-@final
-@dataclass(frozen=True)
-class Experiment:
-    """One experiment.
-
-    Attributes:
-        kind: ``"see"``, ``"do"`` or ``"counterfactual"``, after ``"refused "`` where it failed.
-        samples: Interventions, units and outcomes.
-        at: From which control step a counterfactual differs.
-    """
-
-    kind: str
-    samples: Samples
-    at: int = 0
-
-    @property
-    def episodes(self) -> int:
-        """How many episodes it cost."""
-        return len(self.samples.numbers)
 
 
 @final
@@ -68,7 +43,7 @@ class Laboratory:
         setting: ``policy``, ``nature``, ``steps``, ``seed`` and ``workers``; see ``Setting``.
 
     Attributes:
-        records: All experiments, in their order.
+        spent: How many episodes were used.
 
     Raises:
         UnknownOption: A pattern matches nothing, or a question or a setting does not exist.
@@ -116,7 +91,8 @@ class Laboratory:
             if outcome.name not in self.visible:
                 raise Forbidden(f"see {outcome.name}", self.visible)
         self._lock = threading.Lock()
-        self.records: list[Experiment] = []
+        self._units: list[Plan] = []  # what was done in each new episode, refused ones included
+        self.spent = 0
 
     def terms(self) -> dict[str, Any]:
         """Return what decides the results of an experiment, as plain data."""
@@ -131,11 +107,6 @@ class Laboratory:
             "steps": setting.steps,
             "outcomes": [outcome.model_dump() for outcome in self.outcomes],
         }
-
-    @property
-    def spent(self) -> int:
-        """How many episodes were used."""
-        return sum(record.episodes for record in self.records)
 
     @property
     def remaining(self) -> int | None:
@@ -188,76 +159,28 @@ class Laboratory:
             self._permit("counterfactual", request, 1)
             if at >= self._steps:
                 raise UnknownOption("at", at, (f"a control step from 0 to {self._steps - 1}",))
-            units = self._units()
-            if unit not in units:
-                there = f"units 0 to {len(units) - 1}" if units else "none yet: see or do first"
+            if unit >= len(self._units):
+                last = len(self._units) - 1
+                there = f"units 0 to {last}" if last >= 0 else "none yet: see or do first"
                 raise Forbidden(f"imagine unit {unit}, which was never seen", (there,))
-            plan, names = self._with(units[unit]), [outcome.name for outcome in self.outcomes]
+            plan, names = self._with(self._units[unit]), [one.name for one in self.outcomes]
             episode = self._setting.episode(self._twins, self._world, plan, unit, ())
-
-            def run() -> dict[str, Floats]:
-                other = episode.counterfactual(request, at=at, record=dict.fromkeys(names))
-                return {column(outcome): outcome.of(other)[None] for outcome in self.outcomes}
-
-            found = self._record("counterfactual", request, (unit,), run, at)
-        return {name: np.asarray(value[0]) for name, value in found.items()}
-
-    def run(self, protocol: Iterable[Mapping[str, Any]]) -> tuple[Samples, ...]:
-        """Run a protocol: a table of settings in, a data set out.
-
-        Args:
-            protocol: Rows, as of ``csv.DictReader``: values by variable (``name[i]`` for a
-                component) and, if wanted, ``n``; an empty cell leaves a variable alone.
-
-        Raises:
-            UnknownOption: A cell is not a number.
-            Forbidden: As in ``do``, for the whole table, before anything is carried out.
-        """
-        rows = [
-            ("do" if request else "see", request, n)
-            for request, n in read_protocol(protocol, self._world.model)
-        ]
-        for row in rows:
-            self._permit(*row)
-        self._afford(sum(n for *_, n in rows))
-        return tuple(self._experiment(*row) for row in rows)
-
-    def _units(self) -> dict[int, Plan]:
-        """Return what was done in each new episode, refused ones included."""
-        new = (r.samples for r in self.records if not r.kind.endswith("counterfactual"))
-        return {unit: samples.plan for samples in new for unit in samples.numbers}
+            self.spent += 1
+            other = episode.counterfactual(request, at=at, record=dict.fromkeys(names))
+        return {column(outcome): outcome.of(other) for outcome in self.outcomes}
 
     def _with(self, request: Mapping[str, Any]) -> Plan:
         return Plan(merged(self._world.model, self._given, Plan(request)))
 
     def _experiment(self, kind: str, request: Mapping[str, Any], n: int) -> Samples:
-        count = whole_number("n", n, least=1)
+        n = whole_number("n", n, least=1)
         with self._lock:
-            self._permit(kind, request, count)
-            first = len(self._units())
-            asked = self._twins, self._world, self._with(request), count, self.outcomes
-            numbers = tuple(range(first, first + count))
-            run = partial(sample, *asked, self._setting, first=first)
-            return self._record(kind, request, numbers, run)
-
-    def _record(
-        self,
-        kind: str,
-        request: Mapping[str, Any],
-        numbers: tuple[int, ...],
-        run: Callable[[], Mapping[str, Floats]],
-        at: int = 0,
-    ) -> Samples:
-        """Carry out an experiment, and keep a copy of its outcomes; one that fails is paid."""
-        held = Samples({}, numbers, self._setting.seed, Plan(request))
-        try:
-            found = dict(run())
-        except Exception:
-            self.records.append(Experiment(f"refused {kind}", held, at))
-            raise
-        copies = {name: values.copy() for name, values in found.items()}
-        self.records.append(Experiment(kind, replace(held, columns=copies), at))
-        return replace(held, columns=found)
+            self._permit(kind, request, n)
+            first, asked = len(self._units), (self._twins, self._world, self._with(request), n)
+            self._units += [Plan(request)] * n
+            self.spent += n
+            found = sample(*asked, self.outcomes, self._setting, first=first)
+        return replace(found, plan=Plan(request))
 
     # --- permissions --------------------------------------------------------------------------
 
@@ -285,9 +208,6 @@ class Laboratory:
             for parent in getattr(act, "parents", ()):
                 if parent.name not in self.visible:
                     raise Forbidden(f"let {name} follow {parent.name}", self.visible)
-        self._afford(n)
-
-    def _afford(self, n: int) -> None:
         left = self.remaining
         if left is not None and n > left:
             raise Forbidden(f"run {n} more episodes", [f"{left} episodes"])

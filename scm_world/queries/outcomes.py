@@ -61,17 +61,12 @@ class Outcome(Frozen):
             values = np.ascontiguousarray(flat[..., self.component])
         if not instants:
             raise UnknownOption("outcome", self.name, ("a variable that is there",))
-        match self.how:
-            case "final":
-                return np.asarray(values[:, -1])
-            case "first":
-                return np.asarray(values[:, 0])
-            case "change":
-                return np.asarray(values[:, -1] - values[:, 0])
-            case "path":
-                return values
-        later = np.ascontiguousarray(values[:, 1:] if instants > 1 else values)
-        return np.asarray(getattr(later, self.how)(axis=1))
+        if self.how in ("mean", "max", "min", "sum"):
+            later = np.ascontiguousarray(values[:, 1:] if instants > 1 else values)
+            return np.asarray(getattr(later, self.how)(axis=1))
+        first, last = values[:, 0], values[:, -1]
+        found = {"final": last, "first": first, "change": last - first, "path": values}
+        return np.asarray(found[self.how])
 
     def __str__(self) -> str:
         part = "" if self.component is None else f"[{self.component}]"
@@ -99,6 +94,15 @@ def is_category(system: System, outcome: Any) -> bool:
     if not isinstance(outcome, Outcome) or outcome.name not in system.model:
         return False
     return system.model.declared(outcome.name).dtype == "categorical"
+
+
+def refuse_category(system: System, outcome: Any) -> None:
+    """Refuse an outcome that has no mean."""
+    wanted = as_outcome(outcome)
+    if is_category(system, wanted):
+        event = f"lambda episode: episode.final({wanted.name!r}) == …"
+        allowed = ("a number", f"a function whose mean is a probability, as {event}")
+        raise UnknownOption("outcome of an effect", outcome, allowed)
 
 
 def usual_outcomes(world: System) -> tuple[str, ...]:

@@ -4,24 +4,33 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Self, final
+from typing import TYPE_CHECKING, Any, Self, final
 
 import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world._types import Floats, Integers
 from scm_world.errors import UnknownOption
 from scm_world.graph import scm as graph
 from scm_world.queries.abduction import Counterfactuals, counterfactuals
 from scm_world.queries.episodes import Episode, Unit, as_names
 from scm_world.queries.equations import CompiledModel, Equations, System, length
-from scm_world.queries.estimates import Effect, effect_of
-from scm_world.queries.outcomes import Outcome, as_outcome, is_category, usual_outcomes
+from scm_world.queries.estimates import Effect, alike, effect_of
+from scm_world.queries.identification import Identification, identify
+from scm_world.queries.outcomes import (
+    Outcome,
+    as_outcome,
+    is_category,
+    refuse_category,
+    usual_outcomes,
+)
 from scm_world.queries.plans import Plan, numbered
 from scm_world.queries.progress import Progress, part
 from scm_world.queries.samples import Samples, Setting, sample
-from scm_world.queries.twins import Twins, twins_of
+from scm_world.queries.twins import Twins, asked
 from scm_world.variables import Variable
+
+if TYPE_CHECKING:
+    from scm_world.queries.verification import Verification
 
 
 class Questions(ABC):
@@ -30,21 +39,21 @@ class Questions(ABC):
     __slots__ = ()
 
     @abstractmethod
+    def planned(self, do: Mapping[str, Any] | None) -> Plan:
+        """Return the plan of an episode: what is given in every one, and an intervention."""
+
     def _asked(self) -> tuple[Twins, System]:
         """Return where episodes are run, and a system that knows what is declared."""
+        return asked(self)
 
-    @abstractmethod
-    def _with(self, do: Mapping[str, Any] | None) -> Plan:
-        """Add something to what is given in every episode."""
+    def close(self) -> None:  # noqa: B027 # equations have none
+        """Free the engine, if there is one."""
 
-    def _averaged(self, outcome: Any) -> System:
-        """Return a system that knows what is declared; refuse an outcome without a mean."""
-        system, wanted = self._asked()[1], as_outcome(outcome)
-        if is_category(system, wanted):
-            event = f"lambda episode: episode.final({wanted.name!r}) == …"
-            allowed = ("a number", f"a function whose mean is a probability, as {event}")
-            raise UnknownOption("outcome of an effect", outcome, allowed)
-        return system
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def rollout(
         self,
@@ -72,7 +81,7 @@ class Questions(ABC):
             InterventionError: An intervention was refused.
             ActionError: The policy is none, or gave no action.
         """
-        twins, plan = self._asked()[0], self._with(do)
+        twins, plan = self._asked()[0], self.planned(do)
         with twins.twin() as world:
             names = as_names(record)
             unit = Unit(seed, episode, plan, policy, length(world, steps), names)
@@ -91,7 +100,7 @@ class Questions(ABC):
         Arguments and errors are those of ``rollout``; the policy acts where ``step`` is given no
         action.
         """
-        made = Episode.live(self._asked()[0], Unit(seed, episode, self._with(do), policy, 1))
+        made = Episode.live(self._asked()[0], Unit(seed, episode, self.planned(do), policy, 1))
         try:
             made.begin()
         except BaseException:
@@ -131,7 +140,7 @@ class Questions(ABC):
                 ended, or there is no such setting.
         """
         twins, system = self._asked()
-        made, plan = Setting.of(system, setting), self._with(do)
+        made, plan = Setting.of(system, setting), self.planned(do)
         wanted = usual_outcomes(system) if outcomes is None else outcomes
         return sample(twins, system, plan, n, wanted, made, first=first, progress=progress)
 
@@ -144,15 +153,19 @@ class Questions(ABC):
         setting: Mapping[str, Any],
         *,
         paired: bool = True,
+        least: int = 2,
     ) -> list[Samples]:
-        """Sample under one intervention after another, in the same units if they are paired."""
-        (twins, system), total = self._asked(), n * len(plans)
-        made = Setting.of(system, setting)
-        arms = []
-        for before, plan in zip(range(0, total, n), map(self._with, plans), strict=True):
-            first, share = 0 if paired else before, part(progress, before, total)
-            given = twins, system, plan, n, outcomes, made
-            arms.append(sample(*given, first=first, progress=share))
+        """Sample under one intervention after another, in the same units if they are paired.
+
+        An outcome that has no mean, the first one, is refused.
+        """
+        (twins, system), n = self._asked(), whole_number("n", n, least=least)
+        refuse_category(system, outcomes[0])
+        made, arms = Setting.of(system, setting), list[Samples]()
+        for number, plan in enumerate(map(self.planned, plans)):
+            share = part(progress, number * n, n * len(plans))
+            first = 0 if paired else number * n
+            arms.append(sample(twins, system, plan, n, outcomes, made, first=first, progress=share))
         return arms
 
     def effect(
@@ -185,9 +198,8 @@ class Questions(ABC):
             UnknownOption: The outcome is a category, which has no mean: ask for the probability of
                 one, with a function.
         """
-        system, count = self._averaged(outcome), whole_number("n", n, least=2)
-        arms = self._arms((outcome,), (do, versus), count, progress, setting, paired=paired)
-        return effect_of(system, outcome, *arms, paired=paired)
+        arms = self._arms((outcome,), (do, versus), n, progress, setting, paired=paired)
+        return effect_of(self._asked()[1], outcome, *arms, paired=paired)
 
     def direct_effect(
         self,
@@ -217,17 +229,17 @@ class Questions(ABC):
         if isinstance(mediators, Mapping):
             held, other = ({**Plan(given), **mediators} for given in (do, versus))
             return self.effect(outcome, do=held, versus=other, n=n, progress=progress, **setting)
-        system, names, twins = self._averaged(outcome), as_names(mediators), self._asked()[0]
+        (twins, system), names = self._asked(), as_names(mediators)
+        n = whole_number("n", n, least=2)
         if not isinstance(system, Equations) or system.model.is_temporal:
             allowed = ("values of mediators by name, such as {'m': 1.0}: the controlled effect",)
             raise UnknownOption("mediators of several instants", names, allowed)
-        count, made = whole_number("n", n, least=2), Setting.of(system, setting)
-        asked = twins, system, self._with(versus), count, (outcome, *map(Outcome, names)), made
-        control = sample(*asked, progress=part(progress, 0, 2 * count))
+        outcomes = (outcome, *map(Outcome, names))
+        (control,) = self._arms(outcomes, (versus,), n, part(progress, 0, 2 * n), setting)
         _, *kept = control.values()
         each = [dict(zip(names, row, strict=True)) for row in zip(*kept, strict=True)]
-        asked = twins, system, self._with(do), count, (outcome,), made
-        treated = sample(*asked, each=each, progress=part(progress, count, 2 * count))
+        given = twins, system, self.planned(do), n, (outcome,), Setting.of(system, setting)
+        treated = sample(*given, each=each, progress=part(progress, n, 2 * n))
         return effect_of(system, outcome, treated, control)
 
     def effect_over(
@@ -249,10 +261,9 @@ class Questions(ABC):
             raise UnknownOption("name", name, ("the name of a variable",))
         if not isinstance(values, Sequence | np.ndarray) or len(values) < 2:
             raise UnknownOption("values", values, ("two or more values of the variable",))
-        system, count = self._averaged(outcome), whole_number("n", n, least=2)
         plans = [{name: value} for value in values]
-        control, *others = self._arms((outcome,), plans, count, progress, setting)
-        return tuple(effect_of(system, outcome, one, control) for one in others)
+        control, *others = self._arms((outcome,), plans, n, progress, setting)
+        return tuple(effect_of(self._asked()[1], outcome, one, control) for one in others)
 
     def effect_by(
         self,
@@ -276,37 +287,34 @@ class Questions(ABC):
         Returns:
             For each group the ends of the covariate, and the effect.
         """
-        system, covariate = self._averaged(outcome), as_outcome(by)
-        count = whole_number("n", n, least=2 * whole_number("bins", bins, least=1))
-        treated, control = self._arms((outcome, by), (do, versus), count, progress, setting)
-        _, place = control.values()
+        plans, least = (do, versus), 2 * whole_number("bins", bins, least=1)
+        treated, control = self._arms((outcome, by), plans, n, progress, setting, least=least)
+        system, (_, place) = self._asked()[1], control.values()
         if place.ndim != 1:
             allowed = ("one number for each unit, such as Outcome(name, 'first', 0)",)
             raise UnknownOption("by", by, allowed)
         kinds = len(np.unique(place))
-        if is_category(system, covariate) and kinds > bins:
+        if is_category(system, as_outcome(by)) and kinds > bins:
             raise UnknownOption("bins", bins, (f"{kinds} or more: categories have no order",))
         return tuple(
             (
                 (float(place[group].min()), float(place[group].max())),
                 effect_of(system, outcome, treated, control, rows=group),
             )
-            for group in _alike(place, bins)
+            for group in alike(place, bins)
         )
 
+    def verify(self, **options: Any) -> Verification:
+        """Check the declared graph against what realises it; see ``scm_world.verify``."""
+        from scm_world.queries.verify import verify
 
-def _alike(place: Floats, bins: int) -> list[Integers]:
-    """Sort units into groups by their middle rank; a single unit joins the group before it."""
-    values, which, counts = np.unique(place, return_inverse=True, return_counts=True)
-    middle = np.cumsum(counts) - 0.5 * counts
-    number = np.arange(len(values)) if len(values) <= bins else middle * bins // len(place)
-    groups: list[Integers] = []
-    for each in np.unique(number):
-        units = np.flatnonzero(number[which.reshape(-1)] == each)
-        if groups and min(len(units), len(groups[-1])) < 2:
-            units = np.concatenate([groups.pop(), units])
-        groups.append(units)
-    return groups
+        system: Any = self
+        return verify(system, **options)
+
+    def identify(self, treatment: str, outcome: str, **options: Any) -> Identification:
+        """Say what to observe, to estimate an effect; see ``scm_world.queries.identify``."""
+        system: Any = self
+        return identify(system.graph, treatment, outcome, **options)
 
 
 @final
@@ -418,18 +426,13 @@ class SCM(Questions, graph.SCM):
         """Give the model in which this is done too: the same as ``do``."""
         return self.do(do)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
     def _asked(self) -> tuple[Twins, System]:
         if not hasattr(self, "_system"):
             self._system = Equations(CompiledModel(self))
-        return twins_of(self._system), self._system
+        return asked(self._system)
 
-    def _with(self, do: Mapping[str, Any] | None) -> Plan:
+    def planned(self, do: Mapping[str, Any] | None) -> Plan:
+        """Return the plan of an intervention; labels of categories become their numbers."""
         return planned(self, do)
 
 

@@ -1,13 +1,11 @@
-"""Samples: episodes of a world or model, as a table."""
+"""Samples: outcomes of episodes of a world or model, as a table."""
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
-from typing import Any, final
+from itertools import chain, count
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
@@ -30,6 +28,9 @@ from scm_world.queries.progress import Progress
 from scm_world.queries.twins import Result, Twins
 from scm_world.world.interventions import merged
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 STEPS = 25
 """Control steps of an episode by default: one second at 25 steps a second."""
 
@@ -48,9 +49,7 @@ class Setting:
         workers: Threads; the result does not depend on how many. Where the backend steps many
             worlds in one call, and the policy does not look at the world (``"random"``,
             ``"sweep"``, ``"across"``, given actions, None), these are threads of the backend; None
-            is as many as there are cores, or one in a worker process. Else None is one. On an
-            backend that steps one world at a time, two or more stand for processes as soon as
-            these pay; a script needs ``if __name__ == "__main__"`` then.
+            is as many as there are cores, or one in a worker process. Else None is one.
     """
 
     policy: Any = "random"
@@ -66,7 +65,7 @@ class Setting:
             one_of("setting", name, [field.name for field in fields(cls)])
         defaults: dict[str, Any] = {}
         if isinstance(system, Equations):
-            defaults = {"steps": STEPS if system.model.is_temporal else 0, "policy": None}
+            defaults = {"steps": None if system.model.is_temporal else 0, "policy": None}
         found = cls(**{**defaults, **given})
         length(system, found.steps)
         if found.workers is not None:
@@ -119,36 +118,15 @@ class Samples(Mapping[str, Floats]):
     def __len__(self) -> int:
         return len(self.columns)
 
-    @property
-    def targets(self) -> tuple[str, ...]:
-        """Which variables were intervened on: what learners from interventions ask for."""
-        return tuple(self.plan)
+    def frame(self) -> pd.DataFrame:
+        """Return a data frame of all numbers: a row for each episode, by its number."""
+        import pandas as pd
 
-    def matrix(self) -> tuple[Floats, tuple[str, ...]]:
-        """Give all numbers as one table, shape (n, m), and the names of its columns."""
-        parts, names = [], []
+        found: dict[str, Floats] = {}
         for name, values in self.columns.items():
-            flat = values.reshape(len(self.numbers), -1)
-            parts.append(flat)
-            many = flat.shape[1] > 1
-            names += [f"{name}[{i}]" if many else name for i in range(flat.shape[1])]
-        table = np.concatenate(parts, axis=1) if parts else np.empty((len(self.numbers), 0))
-        return table, tuple(names)
-
-    def to_csv(self, path: Path | str) -> None:
-        """Write the table as CSV, and beside it what was done as JSON."""
-        table, names = self.matrix()
-        target = Path(path)
-        with target.open("w", newline="") as stream:
-            writer = csv.writer(stream)
-            writer.writerow(("episode", *names))
-            writer.writerows(
-                (number, *map(repr, row))
-                for number, row in zip(self.numbers, table.tolist(), strict=True)
-            )
-        beside = target.with_name(target.name.removesuffix(".csv") + ".json")
-        about = {"seed": self.seed, "plan": self.plan.as_dict(), "targets": list(self.targets)}
-        beside.write_text(json.dumps(about, indent=1) + "\n")
+            parts = values.reshape(len(self.numbers), -1).T
+            found |= {f"{name}[{i}]" if len(parts) > 1 else name: p for i, p in enumerate(parts)}
+        return pd.DataFrame(found, index=pd.Index(self.numbers, name="episode"))
 
 
 def refuse_late(plan: Plan, steps: int) -> None:
@@ -175,7 +153,7 @@ def sample(
 
     Each episode may have further interventions of its own (``each``).
     """
-    count, first = whole_number("n", n, least=1), whole_number("first", first, least=0)
+    n, first = whole_number("n", n, least=1), whole_number("first", first, least=0)
     wanted = as_outcomes(outcomes)
     for one in wanted:
         if is_category(system, one) and one.how not in ORDERLESS:
@@ -183,19 +161,16 @@ def sample(
     names = tuple(dict.fromkeys(one.name for one in wanted if isinstance(one, Outcome)))
     unit = setting.unit(system, do, first, names)
     refuse_late(Plan(do), unit.steps)
-    units = [replace(unit, number=number) for number in range(first, first + count)]
+    units = [replace(unit, number=number) for number in range(first, first + n)]
     if each:
         units = [replace(u, plan=u.plan.do(more)) for u, more in zip(units, each, strict=True)]
-    told = 0
 
     def finish(place: int, result: Result) -> list[Floats]:
-        nonlocal told
         if isinstance(result, Exception):
             raise result
         row = [read(outcome, result) for outcome in wanted]
-        told += 1
         if progress is not None:
-            progress(told, count)
+            progress(place + 1, n)
         return row
 
     if twins.model is not None and all(isinstance(one, Outcome) for one in wanted):
@@ -203,7 +178,7 @@ def sample(
         read_off = (one.of_many(twins.model.read(one.name, vectors)) for one in wanted)
         found = [as_numbers(v, one) for v, one in zip(read_off, wanted, strict=True)]
         if progress is not None:
-            progress(count, count)
+            progress(n, n)
     else:
         rows = twins.run(units, finish, setting.workers)
         try:
@@ -213,10 +188,7 @@ def sample(
             raise UnknownOption("value of an outcome", "of several shapes", allowed) from None
     columns: dict[str, Floats] = {}
     for outcome, values in zip(wanted, found, strict=True):
-        name = text = column(outcome)
-        number = 1
-        while name in columns:
-            number += 1
-            name = f"{text} ({number})"
-        columns[name] = values
+        text = column(outcome)
+        names_of_it = chain([text], (f"{text} ({number})" for number in count(2)))
+        columns[next(name for name in names_of_it if name not in columns)] = values
     return Samples(columns, tuple(unit.number for unit in units), setting.seed, Plan(do))

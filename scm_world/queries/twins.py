@@ -1,7 +1,6 @@
 """Copies of a system on which questions are run, one episode at a time or many together.
 
-Many run in a batch where the backend has one; else in processes, threads, or one by one. Results
-do not depend on which.
+Results do not depend on which.
 """
 
 from __future__ import annotations
@@ -9,12 +8,9 @@ from __future__ import annotations
 import copy
 import math
 import multiprocessing
-import pickle
 import threading
-import weakref
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from typing import Any, TypeVar, final
@@ -51,15 +47,6 @@ LEAST = 4
 PRICE = 32
 """Control steps of one thread that it costs to make a world."""
 
-PAYS = 10_000
-"""Control steps that pay for the start of processes."""
-
-GOES_ON = 200
-"""Control steps that are worth sending to processes that are there."""
-
-SHARE = 4
-"""Jobs for each process, so that none waits long for the last one."""
-
 
 @final
 class Twins:
@@ -77,6 +64,7 @@ class Twins:
 
     def __init__(self, system: System) -> None:
         self.model = system.compiled if isinstance(system, Equations) else None
+        self.batches = False
         if isinstance(system, Simulation):
             self._build, (self._kind, self.task, self.options, _), *_ = system.__reduce__()
             self.batches = system.backend.batch is not EngineBatch
@@ -87,15 +75,12 @@ class Twins:
         self._lock = threading.RLock()  # the collector may give a twin back within it
         self._members: list[Simulation] = []  # of batches
         self._batching = threading.RLock()
-        self._pool: tuple[int, ProcessPoolExecutor] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Copy and pickle without the twins."""
-        private = ("_free", "_lock", "_members", "_batching", "_pool")
+        private = ("_free", "_lock", "_members", "_batching")
         return {name: value for name, value in self.__dict__.items() if name not in private}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Begin without twins."""
         self.__dict__.update(state)
         self._clear()
 
@@ -141,8 +126,6 @@ class Twins:
         """How many twins there are that can be stepped together."""
         return len(self._members)
 
-    # --- many units ---------------------------------------------------------------------------
-
     def run(
         self,
         units: Sequence[Unit],
@@ -159,22 +142,19 @@ class Twins:
         Returns:
             What ``finish`` returned, in the order of the units.
         """
-        given = None if workers is None else whole_number("workers", workers, least=1)
+        given = 1 if workers is None else whole_number("workers", workers, least=1)
         is_child = multiprocessing.parent_process() is not None  # one of many that share the cores
-        threads = given or (1 if is_child else cores())
-        results: Generator[Result, None, None]
+        threads = given if workers is not None or is_child else cores()
         if self.model is not None:
             results = self._solved(units)
         elif n := self._batch_size(units, threads):
             results = self._in_batches(units, n, threads)
-        elif not self.batches and not is_child and self._pays(units, given or 1):
-            results = self._in_processes(units, given or 1)
-        elif (given or 1) == 1:
+        elif given == 1:
             results = (self._alone(unit) for unit in units)
         else:
             with ThreadPoolExecutor(given) as pool:  # backends compute without Python's lock
                 return [*map(finish, range(len(units)), pool.map(self._alone, units))]
-        with closing(results):
+        with closing(results):  # type: ignore[type-var] # all of these are generators
             return [finish(place, result) for place, result in enumerate(results)]
 
     def _alone(self, unit: Unit) -> Result:
@@ -195,10 +175,7 @@ class Twins:
         most = min(max(worth, self.batched), MOST)
         return math.ceil(len(units) / math.ceil(len(units) / most))
 
-    def _in_batches(
-        self, units: Sequence[Unit], n: int, threads: int
-    ) -> Generator[Result, None, None]:
-        """Run units together, n at a time."""
+    def _in_batches(self, units: Sequence[Unit], n: int, threads: int) -> Iterator[Result]:
         with self.together(n, units[0].names, threads) as batch:
             for first in range(0, len(units), n):
                 some = units[first : first + n]
@@ -206,53 +183,6 @@ class Twins:
                     yield from run_together(batch, some, self)
                 except EngineFailure:  # run separately, it ends its own unit only
                     yield from map(self._alone, some)
-
-    # --- in processes -------------------------------------------------------------------------
-
-    def _pays(self, units: Sequence[Unit], workers: int) -> bool:
-        """Tell whether processes pay, and everything can be sent to them."""
-        steps = sum(unit.steps - unit.first for unit in units)
-        worth = GOES_ON if self._pool is not None and self._pool[0] == workers else PAYS
-        if workers < 2 or len(units) < 2 or steps < worth:
-            return False
-        try:
-            pickle.dumps((self, [_sent(unit) for unit in units]))
-        except Exception:  # such as a policy that is a lambda: it acts in this process
-            return False
-        return True
-
-    def _in_processes(self, units: Sequence[Unit], workers: int) -> Generator[Result, None, None]:
-        """Run units in other processes; yield the results in the order of the units."""
-        size = math.ceil(len(units) / (SHARE * workers))
-        jobs = [units[i : i + size] for i in range(0, len(units), size)]
-        pool = self._processes(workers)
-        futures = [pool.submit(_run_there, self, [*map(_sent, job)]) for job in jobs]
-        try:
-            with self.twin() as world:
-                for job, future in zip(jobs, futures, strict=True):
-                    for unit, result in zip(job, future.result(), strict=True):
-                        yield _unpacked(result, world, self, unit)
-        except BrokenProcessPool:
-            self._end_processes()
-            raise EngineFailure("a worker process ended", "the backend of a worker") from None
-        finally:
-            for future in futures:
-                future.cancel()
-
-    def _processes(self, workers: int) -> ProcessPoolExecutor:
-        """Return processes, which end with the twins."""
-        if self._pool is not None and self._pool[0] == workers:
-            return self._pool[1]
-        self._end_processes()
-        made = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
-        weakref.finalize(self, made.shutdown, wait=False, cancel_futures=True)
-        self._pool = workers, made
-        return made
-
-    def _end_processes(self) -> None:
-        if self._pool is not None:
-            self._pool[1].shutdown(wait=False, cancel_futures=True)
-            self._pool = None
 
     # --- equations ----------------------------------------------------------------------------
 
@@ -264,7 +194,7 @@ class Twins:
         with self.twin() as system:
             return np.array([unit.run(system).vectors for unit in units])
 
-    def _solved(self, units: Sequence[Unit]) -> Generator[Result, None, None]:
+    def _solved(self, units: Sequence[Unit]) -> Iterator[Result]:
         """Run units of equations: together where they can be, else one by one."""
         together = None
         with suppress(Exception):  # run separately, it ends its own unit only
@@ -272,16 +202,10 @@ class Twins:
         if together is None:
             yield from map(self._alone, units)
             return
+        begin: list[Any] = [(0, self.model)]
         for unit, vectors, actions in zip(units, *together, strict=True):
-            begin: list[Any] = [(0, self.model)]
-            yield Episode(
-                self,
-                unit,
-                vectors=[*vectors],
-                statics=[(0, {})],
-                declarations=begin,
-                taken=[*actions],
-            )
+            known: dict[str, Any] = {"statics": [(0, {})], "declarations": begin}
+            yield Episode(self, unit, vectors=[*vectors], taken=[*actions], **known)
 
     def _solved_together(self, units: Sequence[Unit]) -> tuple[Floats, Floats] | None:
         """Run units as one, if nothing in them depends on the plan of one of them."""
@@ -318,7 +242,6 @@ class _Groups:
         self._plans = plans
 
     def due(self, world: System, step: int, fired: Any) -> dict[int, Any]:
-        """Return what is due in each group in which something is."""
         dues = (plan.due(world, step, fired) for plan in self._plans)
         return {group: due for group, due in enumerate(dues) if due}
 
@@ -415,41 +338,6 @@ class _Together:
         for name in self._names:
             if name in rows:
                 episode.values[name].extend(np.array(rows[name]))
-
-
-# --- what is sent to other processes --------------------------------------------------------------
-
-
-_THERE: dict[bytes, Twins] = {}
-"""In a worker process: the twins that it has, by what was sent."""
-
-
-def _run_there(twins: Twins, units: Sequence[Unit]) -> list[Any]:
-    """Run units in this process for another one, and pack what each leaves behind."""
-    kept = _THERE.setdefault(pickle.dumps(twins), twins)
-    with kept.twin() as world:
-        here = [replace(u, past=_unpacked(u.past, world, None, u)) for u in units]
-        return [_packed(unit.result(world)) for unit in here]
-
-
-def _sent(unit: Unit) -> Unit:
-    return replace(unit, past=_packed(unit.past))
-
-
-def _packed(result: Any) -> Any:
-    """Write down an episode for another process: of a structure, what decides it."""
-    if not isinstance(result, Episode):
-        return result
-    plans = [(step, compiled.plan) for step, compiled in result.declarations]
-    sent: Any = None
-    return replace(result, twins=sent, unit=sent, declarations=plans)
-
-
-def _unpacked(result: Any, world: Simulation, twins: Any, unit: Unit) -> Any:
-    if not isinstance(result, Episode):
-        return result
-    found = [(step, world.structures.compiled(plan)) for step, plan in result.declarations]
-    return replace(result, twins=twins, unit=unit, declarations=found)
 
 
 _TWINS: WeakKeyDictionary[Any, Twins] = WeakKeyDictionary()

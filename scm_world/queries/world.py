@@ -5,8 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from types import MappingProxyType
-from typing import Any, Self, final
+from typing import Any, NamedTuple, Self, final
 
 import networkx as nx
 
@@ -15,16 +14,24 @@ from scm_world.backends import Backend
 from scm_world.errors import NotReset, UnknownOption
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.episodes import Episode
-from scm_world.queries.equations import CompiledModel, Equations, System
+from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Key, Plan, check_names, has_times
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions, planned
-from scm_world.queries.twins import Twins, twins_of
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, WorldSnapshot
 from scm_world.world.interventions import merged
+
+
+class _Course(NamedTuple):
+    """What a plan does in the present episode: events of the past, and when it acted last."""
+
+    plan: Plan = Plan()
+    fired: Mapping[Key, int] = {}  # replaced, never changed
+    space: AnyRegion | None = None
+    acted: int = -1
 
 
 @final
@@ -174,11 +181,8 @@ class World(Simulation, Questions):
             variables_space=variables_space,
         )
 
-    _standing: Plan = Plan()
-    _running: Plan = Plan()
-    _fired: Mapping[Key, int] = MappingProxyType({})
-    _space: AnyRegion | None = None
-    _acted = -1  # the last control step at which the plan was carried out
+    _standing = Plan()
+    _course = _Course()
 
     # --- another world ------------------------------------------------------------------------
 
@@ -202,10 +206,10 @@ class World(Simulation, Questions):
             InterventionError: The intervention was refused.
         """
         other = copy.deepcopy(self)
-        other._standing = self._with(do)
+        other._standing = self.planned(do)
         if other._started:
-            other._running = self._running.then(do, self.model, at=self.index)
-            other._acted = -1
+            plan = self._course.plan.then(do, self.model, at=self.index)
+            other._course = self._course._replace(plan=plan, acted=-1)
             other.act()
         return other
 
@@ -281,26 +285,9 @@ class World(Simulation, Questions):
         """
         return local_graph(self, action)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copy and pickle with what is given."""
-        build, arguments = super().__reduce__()
-        return (
-            build,
-            arguments,
-            {
-                "_standing": self._standing,
-                "_running": self._running,
-                "_fired": dict(self._fired),
-                "_space": self._space,
-                "_acted": self._acted,
-            },
-        )
+        """Copy and pickle with what is given; the snapshot has what is under way."""
+        return (*super().__reduce__(), {"_standing": self._standing})
 
     def reset(
         self,
@@ -316,15 +303,15 @@ class World(Simulation, Questions):
         """
         plan, region = Plan(), as_region("space", space)
         if len(self._standing) or (do and has_times(do)):
-            plan = self._with(do)
+            plan = self.planned(do)
         super().reset(seed=seed, episode=episode)
-        self._running, self._fired, self._space, self._acted = plan, {}, region, -1
+        self._course = _Course(plan, space=region)
         try:
             if len(plan):
                 return self.act()
             return self.do(do, space=space) if do else None
         except BaseException:
-            self._running = Plan()
+            self._course = _Course()
             raise
 
     def step(self, action: ArrayLike) -> None:
@@ -336,11 +323,12 @@ class World(Simulation, Questions):
     @property
     def is_planned(self) -> bool:
         """Whether the present episode has a plan, which acts within it."""
-        return len(self._running) > 0
+        return len(self._course.plan) > 0
 
     def may_act(self, step: int) -> bool:
         """Return whether the plan of the episode may still do something at a control step."""
-        return step != self._acted and self._running.concerns(self, step, self._fired)
+        course = self._course
+        return step != course.acted and course.plan.concerns(self, step, course.fired)
 
     def is_due(self) -> bool:
         """Return whether the plan of the episode may contain something for this instant."""
@@ -357,32 +345,27 @@ class World(Simulation, Questions):
         """
         if not self.may_act(self.index):
             return None
-        fired = dict(self._fired)
-        due = self._running.due(self, self.index, fired)
-        audit = self.do(due, space=self._space) if due else None
-        self._fired, self._acted = fired, self.index
+        fired = dict(self._course.fired)
+        due = self._course.plan.due(self, self.index, fired)
+        audit = self.do(due, space=self._course.space) if due else None
+        self._course = self._course._replace(fired=fired, acted=self.index)
         return audit
 
     def snapshot(self) -> WorldSnapshot:
         """Save everything, with the plan and the events that have happened."""
-        memory = (self._running, dict(self._fired), self._space, self._acted)
-        return replace(super().snapshot(), memory=memory)
+        return replace(super().snapshot(), memory=self._course)
 
     def restore(self, snapshot: WorldSnapshot) -> None:
         """Go back to a snapshot, bit for bit."""
         super().restore(snapshot)
         if snapshot.memory is not None:
-            self._running, fired, self._space, self._acted = snapshot.memory
-            self._fired = dict(fired)
+            self._course = snapshot.memory
 
-    def _with(self, do: Mapping[str, Any] | None) -> Plan:
-        """Add something to what is given; of two names of one quantity the later one counts."""
+    def planned(self, do: Mapping[str, Any] | None) -> Plan:
+        """Return the plan of an episode: what is given, and an intervention, which counts more."""
         plan = Plan(do)
         check_names(self, plan)
         return Plan(merged(self.model, self._standing, plan)) if len(self._standing) else plan
-
-    def _asked(self) -> tuple[Twins, System]:
-        return twins_of(self), self
 
 
 @final
@@ -413,9 +396,6 @@ class EquationWorld(Equations, Questions):
             raise NotReset
         return super()._now()
 
-    def close(self) -> None:
-        """Free nothing: there is no engine."""
-
     def given(self, do: Mapping[str, Any]) -> Self:
         """Return another world in which this is done too, at the same instant; see ``World``."""
         other = copy.copy(self)
@@ -424,14 +404,6 @@ class EquationWorld(Equations, Questions):
         other._changed()
         return other
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def _asked(self) -> tuple[Twins, System]:
-        return twins_of(self), self
-
-    def _with(self, do: Mapping[str, Any] | None) -> Plan:
+    def planned(self, do: Mapping[str, Any] | None) -> Plan:
+        """Return the plan of an intervention; labels of categories become their numbers."""
         return planned(self.model, do)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
@@ -19,21 +20,22 @@ from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation.episodes import EpisodeRunner
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.evaluation.episodes import EpisodeRunner, Hook, play
 from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.evaluation.recording import Recording, action_noise
-from scm_world.output.durable import locked, made, write_durably
-from scm_world.output.reading import read_arrays
 from scm_world.policies import MlpPolicy, load_policy, save_policy
 from scm_world.policies.cards import OPTIONS
 from scm_world.policies.scripted import NAMED
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress, Tell
+from scm_world.runs.files import made, read_arrays
+from scm_world.runs.pool import Pool, pool_of
+from scm_world.runs.study import Study
 from scm_world.tasks import TASKS, make_task
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.training.export import mean, scored, words
-from scm_world.training.loop import open_folder, torch_threads
+from scm_world.training.loop import torch_threads
 from scm_world.training.settings import (
     LESSONS,
     Count,
@@ -51,7 +53,6 @@ from scm_world.training.settings import (
     refused,
 )
 from scm_world.variables.spaces import Frozen
-from scm_world.work.executors import Executor, opened
 
 SHARD = 25
 """Episodes in a file."""
@@ -256,26 +257,23 @@ PAIRS = ("observations", "actions", "before", "after")
 """Arrays of ``Demonstrations`` with a row for each control step."""
 
 
-def _load(path: Path) -> Demonstrations:
-    """Read a file of demonstrations.
-
-    Raises:
-        UnreadableFile: It is something else, or damaged.
-    """
-    try:
-        file = read_arrays(path)
-        found = Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
-        shapes = [array.shape for array in vars(found).values()]
-        *pairs, scores, kept = shapes
-        same = len({shape[0] for shape in pairs}) == 1 and pairs[2] == pairs[3]
-        if any(len(shape) != 2 for shape in pairs) or not same or scores != kept:
-            raise ValueError(f"its arrays have the shapes {shapes}")
-        if not all(np.isfinite(getattr(found, name)).all() for name in PAIRS):
-            raise ValueError("a number is not finite")
-    except DAMAGED as error:
-        advice = "remove it: the same call makes it again"
-        raise UnreadableFile(str(path), f"it is damaged ({error})", advice) from None
+def _load(data: bytes) -> Demonstrations:
+    """Read the content of a file of demonstrations."""
+    file = read_arrays(data)
+    found = Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
+    *pairs, scores, kept = shapes = [array.shape for array in vars(found).values()]
+    same = len({shape[0] for shape in pairs}) == 1 and pairs[2] == pairs[3]
+    if any(len(shape) != 2 for shape in pairs) or not same or scores != kept:
+        raise ValueError(f"its arrays have the shapes {shapes}")
+    if not all(np.isfinite(getattr(found, name)).all() for name in PAIRS):
+        raise ValueError("a number is not finite")
     return found
+
+
+def _content(shown: Demonstrations) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **vars(shown))
+    return stream.getvalue()
 
 
 def joined(parts: Iterable[Demonstrations]) -> Demonstrations:
@@ -329,8 +327,7 @@ def demonstrated(
             episodes end.
     """
     env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
-    runner = EpisodeRunner(env)
-    try:
+    with closing(EpisodeRunner(env)) as runner:
         metrics = [name for name in (FRACTION, SUCCESS) if name in env.world.model]
         if not metrics:
             allowed = (
@@ -341,14 +338,13 @@ def demonstrated(
         taught = [one for name in lesson.protocols for one in chosen([name], known)]
         shown, scores = list[list[NDArray[np.float32]]](), list[float]()
         for number in numbers:
-            protocol = taught[number % len(taught)]
+            acting = runner.under(taught[number % len(taught)])
             random = np.random.default_rng([seed, round_, number])
-            _, observation = runner.begin(protocol, seed=SEED + seed, episode=number)
-            pairs, info = _episode(lesson, env, observation, random, learner, metrics[0])
-            shown.append([np.array(one, np.float32) for one in zip(*pairs, strict=True)])
+            teaching = Teaching(lesson, random, learner, metrics[0])
+            info = play(acting, teaching, hooks=[teaching], seed=SEED + seed, episode=number)
+            pairs = zip(*teaching.pairs, strict=True)
+            shown.append([np.array(one, np.float32) for one in pairs])
             scores.append(float(info[metrics[0]]))
-    finally:
-        runner.close()
     kept = np.array(scores) >= lesson.keep
     good = [one for one, is_good in zip(shown, kept, strict=True) if is_good]
     none = [array[:0] for array in shown[0]]
@@ -357,25 +353,48 @@ def demonstrated(
     return Demonstrations(**named, scores=np.array(scores), kept=kept)
 
 
-def _episode(
-    lesson: Lesson,
-    env: ScmWorldEnv,
-    observation: Any,
-    random: np.random.Generator,
-    learner: MlpPolicy | None,
-    metric: str,
-) -> tuple[list[tuple[Any, ...]], dict[str, Any]]:
-    """Run an episode; return the rows of ``PAIRS``, and the infos of its end."""
-    teacher: Any = NAMED[lesson.teacher]()
-    size = env.world.compiled.n_actions
-    scale, share = lesson.noise * random.uniform(), lesson.share * random.uniform(0.0, 2.0)
-    noises, learns, over, info = action_noise(random, size), False, False, dict[str, Any]()
-    pairs, row, said = list[tuple[Any, ...]](), 0, np.empty(0)
-    while not over:
+@final
+class Teaching(Hook):
+    """Acts in an episode as the teacher does, or now and then as the learner does.
+
+    Args:
+        lesson: How demonstrations are made.
+        random: Generator of all that is drawn.
+        learner: Acts now and then; never if None.
+        metric: How good the present is, by the name of its info.
+
+    Attributes:
+        pairs: The rows of ``PAIRS``.
+    """
+
+    def __init__(
+        self,
+        lesson: Lesson,
+        random: np.random.Generator,
+        learner: MlpPolicy | None,
+        metric: str,
+    ) -> None:
+        self._lesson, self._random, self._learner = lesson, random, learner
+        self._metric, self._learns, self._row = metric, False, 0
+        self._memory: Any = np.empty(0)
+        self.pairs: list[tuple[Any, ...]] = []
+
+    def start(self, env: ScmWorldEnv) -> None:
+        """Begin an episode."""
+        self._env = env
+        self._teacher: Any = NAMED[self._lesson.teacher]()
+        self._scale = self._lesson.noise * self._random.uniform()
+        self._share = self._lesson.share * self._random.uniform(0.0, 2.0)
+        self._noises = action_noise(self._random, env.world.compiled.n_actions)
+
+    def act(self, observation: Any) -> Any:
+        """Keep the action of the teacher; return the one that is played."""
+        env, lesson, teacher = self._env, self._lesson, self._teacher
         right = np.clip(env.as_action(teacher(env.world)), -1.0, 1.0)
-        now = teacher.memory(env.world) if lesson.memory else said
-        before, said = said if pairs else np.zeros_like(now), now
-        pairs.append((observation, right, before, said))
+        now = teacher.memory(env.world) if lesson.memory else self._memory
+        before = self._memory if self.pairs else np.zeros_like(now)
+        self._memory = now
+        self.pairs.append((observation, right, before, now))
         if lesson.symmetric:
             names = env.observed or ()
             symmetries = env.world.task.observation.symmetries
@@ -383,17 +402,20 @@ def _episode(
                 allowed = (f"False: {lesson.task} has no symmetries",)
                 raise UnknownOption("symmetric of a lesson", True, allowed)
             for scene, order in symmetries(env.world.evaluate(names), names):
-                pairs.append((env.observe_values(scene), right[list(order)], before, said))
-        if learner is not None and random.uniform() < 1.0 / lesson.stretch:
-            learns = random.uniform() < share
+                self.pairs.append((env.observe_values(scene), right[list(order)], before, now))
         action: Any = right
-        if learner is not None and learns:
-            action, _ = learner.predict(observation, before if lesson.memory else None)
-        given: Any = np.clip(action + scale * next(noises), -1.0, 1.0)
-        observation, _, terminated, truncated, info = env.step(given)
-        row = row + 1 if float(info[metric]) >= lesson.keep else 0
-        over = terminated or truncated or row == lesson.settled
-    return pairs, info
+        if self._learner is not None:
+            if self._random.uniform() < 1.0 / lesson.stretch:
+                self._learns = self._random.uniform() < self._share
+            if self._learns:
+                memory = before if lesson.memory else None
+                action, _ = self._learner.predict(observation, memory)
+        return np.clip(action + self._scale * next(self._noises), -1.0, 1.0)
+
+    def after(self, observation: Any, reward: float, info: Mapping[str, Any]) -> bool:
+        """End the episode where it has been good for long enough."""
+        self._row = self._row + 1 if float(info[self._metric]) >= self._lesson.keep else 0
+        return self._row == self._lesson.settled
 
 
 def given_demonstrations(
@@ -643,15 +665,18 @@ def clone(
         "recording": digest,
     }
     policies: list[MlpPolicy] = []
-    with locked(folder), torch_threads(1), opened(None, workers) as executor:
-        open_folder(folder / "clone.json", "scm_world/clone/1", identity, identity, say)
+    with (
+        torch_threads(1),
+        pool_of(None, workers) as pool,
+        Study(folder, "clone", identity) as study,
+    ):
         who = lesson.teacher if source is None else source
         say(f"Learning {lesson}; from {who} on {backend}, seed {number}, in {folder}")
         for round_ in range(lesson.rounds + 1):
             how: dict[str, Any] = {"backend": backend, "seed": number, "round_": round_}
             if source is None:
                 learner = policies[-1] if policies else None
-                shown += _collected(folder, lesson, executor, progress, learner=learner, **how)
+                shown += _collected(study, lesson, pool, progress, learner=learner, **how)
             path = made(folder / "rounds") / f"{round_:02}.safetensors"
             if not path.exists():
                 pairs = joined(shown)
@@ -716,9 +741,9 @@ def _checked(lesson: Lesson, backend: str, seed: int) -> str:
 
 
 def _collected(
-    folder: Path,
+    study: Study,
     lesson: Lesson,
-    executor: Executor,
+    pool: Pool,
     progress: Progress | None,
     *,
     backend: str,
@@ -729,27 +754,22 @@ def _collected(
     backends = backend.split(",")
     first = 0 if round_ == 0 else lesson.episodes + (round_ - 1) * lesson.more
     stop = first + (lesson.episodes if round_ == 0 else lesson.more)
-    begins = range(first, stop, SHARD)
-    made(folder / "demonstrations")
-    paths = [folder / "demonstrations" / f"{round_:02}-{begin:06}.npz" for begin in begins]
-    jobs = [
-        (range(begin, min(begin + SHARD, stop)), backends[begin // SHARD % len(backends)])
-        for begin in begins
-    ]
-    found = {place: _load(path) for place, path in enumerate(paths) if path.exists()}
-    missing = [place for place in range(len(jobs)) if place not in found]
-    done = first + sum(len(jobs[place][0]) for place in found)
-    show = partial(partial, _shown, lesson=lesson, round_=round_, **how)
-    total, tell = lesson.episodes + lesson.rounds * lesson.more, progress or (lambda *_: None)
-    tell(done, total)
-    for number, shown in executor.run(show, [jobs[place] for place in missing]):
-        stream, place = io.BytesIO(), missing[number]
-        np.savez(stream, allow_pickle=False, **vars(shown))
-        write_durably(paths[place], stream.getvalue())
-        found[place] = shown
-        done += len(jobs[place][0])
-        tell(done, total)
-    return [found[place] for place in range(len(jobs))]
+    cells = {
+        f"demonstrations/{round_:02}-{begin:06}.npz": (
+            range(begin, min(begin + SHARD, stop)),
+            backends[begin // SHARD % len(backends)],
+        )
+        for begin in range(first, stop, SHARD)
+    }
+    show = partial(_shown, lesson=lesson, round_=round_, **how)
+    done, total = first, lesson.episodes + lesson.rounds * lesson.more
+    found = {}
+    for name, shown in study.map(cells, show, read=_load, write=_content, pool=pool):
+        found[name] = shown
+        done += len(cells[name][0])
+        if progress is not None:
+            progress(done, total)
+    return [found[name] for name in cells]
 
 
 def _shown(job: tuple[range, str], *, lesson: Lesson, **how: Any) -> Demonstrations:

@@ -1,12 +1,9 @@
-"""Training an agent: resumable, the same bits whether it was interrupted or not."""
+"""Training an agent; what was interrupted goes on from its last checkpoint."""
 
 from __future__ import annotations
 
-import json
-import signal
-import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from importlib.metadata import version
@@ -16,18 +13,24 @@ from typing import Any, final
 from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world.backends import backends
-from scm_world.errors import DAMAGED, Diverged, UnknownOption, UnreadableFile
-from scm_world.evaluation.setups import EvaluationPlace
-from scm_world.output.durable import is_draft, locked, made, write_whole
-from scm_world.output.reading import read_bytes, read_text
+from scm_world.errors import (
+    Diverged,
+    ScmWorldError,
+    UnknownOption,
+    UnreadableFile,
+    UnwritableFolder,
+)
 from scm_world.policies import file_of, load_policy
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress, Tell
+from scm_world.runs.files import made, read_bytes
+from scm_world.runs.study import Study
+from scm_world.tasks import make_task
+from scm_world.training.export import begin_with
 from scm_world.training.recipe import Recipe
 
-FORMAT = "scm_world/run/1"
-EVERY = 60.0  # [s] between checkpoints
-STEPS = "time/total_timesteps"  # the column of the learning curves
+CHECKPOINTS = 20
+"""Number of checkpoints of a training, evenly spread."""
 LARGEST_SEED = 2**32 - 1  # of Stable-Baselines3
 
 
@@ -67,29 +70,25 @@ def train(
     tell: Tell | None = None,
     device: str = "auto",
     threads: int | None = None,
-    every: float = EVERY,
 ) -> Trained:
     """Train an agent.
 
-    What is learned follows from the recipe, the seed, the backend, ``threads`` and the versions.
-    If ``out`` holds a part of the same training, it resumes from its last checkpoint, also with
-    more steps than before if neither the learning rate nor the ceiling of the standard deviations
-    depends on how many there are; on a CPU the weights in the end are, bit for bit, those of a
-    training that was not interrupted. After Ctrl-C it writes a checkpoint at the end of the
-    present round and ends; a second one ends it immediately.
+    The result follows from the recipe, the seed, the backend, ``threads`` and the versions. If
+    ``out`` holds a part of the same training, it goes on from its last checkpoint, also with more
+    steps than before if neither the learning rate nor the ceiling of the standard deviations
+    depends on how many there are. After Ctrl-C it writes a checkpoint and ends.
 
     Args:
         recipe: How it is trained.
         out: Folder of the run.
-        seed: Of everything that is drawn.
+        seed: Seed of everything that is drawn.
         backend: Name of the engine.
         start: Policy to begin with: a file, the folder of a run, or one of the zoo.
         progress: Called with how many steps are done, and how many there are.
         tell: Called with a sentence about each event.
         device: ``"cpu"``, ``"cuda"``, or ``"auto"``: the GPU for SAC and TD3 if there is one.
-        threads: Of the backend and of torch. None: as many as there are cores for the backend,
-            whose results do not depend on it, and one for torch, whose last bits do.
-        every: Seconds between checkpoints.
+        threads: Threads of the backend and of torch. None: as many as there are cores for the
+            backend, whose results do not depend on it, and one for torch, whose last bits do.
 
     Returns:
         Where its policies are.
@@ -97,13 +96,12 @@ def train(
     Raises:
         MissingExtra: Stable-Baselines3 is not installed.
         UnknownOption: Something is asked for that does not exist.
-        UnreadableFile: Another training is in the folder, another process is writing to it, or its
-            last checkpoint is damaged.
-        UnwritableFolder: There is no room; the last checkpoint is still whole.
+        UnreadableFile: Another training is in the folder, or another process is writing to it.
+        UnwritableFolder: There is no room, or no permission.
         Diverged: Weights are not finite any more.
     """
     load("stable_baselines3", "stable-baselines3", "train")
-    from scm_world.training import agents
+    from scm_world.training import algorithms
 
     if whole_number("seed", seed, least=0) > LARGEST_SEED:
         raise UnknownOption("seed", seed, (f"any whole number from 0 to {LARGEST_SEED}",))
@@ -111,95 +109,75 @@ def train(
     one_of("backend", backend, backends())
     first = None if start is None else file_of(start)
     given: dict[str, Any] = {"seed": seed, "backend": backend, "threads": count or 1}
-    given["device"] = agents.device_for(recipe, device)
+    given["device"] = algorithms.device_for(recipe, device)
     identity = identity_of(recipe, first, **given)
     folder, say = Path(out), tell or (lambda _: None)
-    with torch_threads(given["threads"]):
-        worlds = agents.make_worlds(recipe, backend=backend, threads=count)
-        try:
-            model = agents.make_learner(recipe, worlds, seed=seed, device=given["device"])
-            if first is not None:
-                agents.begin_with(model, recipe, first)
-            (world,) = worlds.get_attr("world", 0)
-            libraries = {name: version(name) for name in ("torch", "stable-baselines3")}
-            card = {**identity, "versions": {**versions(world.engine), **libraries}}
-            watch = agents.Watch(
-                recipe,
-                worlds,
-                folder,
-                backend=backend,
-                card=card,
-                progress=progress,
-                tell=say,
-                every=every,
-            )
-            with locked(folder):
-                open_folder(folder / "run.json", FORMAT, identity, card, say, recipe.may_grow)
-                say(f"Training {recipe}; on {backend}, seed {seed}, in {folder}")
-                if there := agents.checkpoints(folder):
-                    watch.resume(model, there[-1])
-                    say(f"goes on after {model.num_timesteps:,} steps")
-                elif getattr(model, "learning_starts", 0) >= recipe.steps:
-                    first_step = model.learning_starts
-                    say(f"nothing will be learned: learning starts after {first_step:,} steps")
-                elif recipe.critic_warmup and first is None:
-                    said = "this recipe is for a policy that can act (critic_warmup)"
-                    say(f"{said}: give it with --start; now the weights are random")
-                if recipe.steps > model.num_timesteps:
-                    _learn(model, watch, recipe.steps - model.num_timesteps, folder, say)
-        finally:
-            worlds.close()
+    with (
+        torch_threads(given["threads"]),
+        closing(algorithms.make_worlds(recipe, backend=backend, threads=count)) as worlds,
+    ):
+        model = algorithms.make_learner(recipe, worlds, seed=seed, device=given["device"])
+        if first is not None:
+            begin_with(model, recipe, first)
+        (world,) = worlds.get_attr("world", 0)
+        libraries = {name: version(name) for name in ("torch", "stable-baselines3")}
+        card = {
+            **identity,
+            "recipe": recipe.as_dict(),
+            "versions": {**versions(world.engine), **libraries},
+        }
+        with Study(folder, "training", identity):
+            say(f"Training {recipe}; on {backend}, seed {seed}, in {folder}")
+            algorithms.resume(model, folder, say)
+            begins_late = getattr(model, "learning_starts", 0)
+            if model.num_timesteps == 0 and begins_late >= recipe.steps:
+                say(f"nothing will be learned: learning starts after {begins_late:,} steps")
+            elif model.num_timesteps == 0 and recipe.critic_warmup and first is None:
+                said = "this recipe is for a policy that can act (critic_warmup)"
+                say(f"{said}: give it with --start; now the weights are random")
+            how: Any = {"backend": backend, "card": card, "progress": progress, "tell": say}
+            watch = algorithms.Watch(recipe, folder, **how)
+            if recipe.steps > model.num_timesteps:
+                _learn(model, watch, folder)
     policy, best = folder / "policy.safetensors", folder / "best.safetensors"
     done = int(load_policy(policy).about.card["steps"])  # type: ignore[arg-type] # JSON
     best = best if best.exists() else policy
     return Trained(folder, recipe, seed, done, policy, best, watch.score)
 
 
-def _learn(model: Any, watch: Any, left: int, folder: Path, tell: Tell) -> None:
-    """Learn; the first Ctrl-C ends it after the present round, and the second one immediately."""
+def _learn(model: Any, watch: Any, folder: Path) -> None:
+    """Learn what is left; write curves, checkpoints and the policy."""
     logger: Any = load("stable_baselines3.common.logger", "stable-baselines3", "train")
-    after = f"-{model.num_timesteps}" if model.num_timesteps else ""
-    forget(folder, model.num_timesteps)
+    callbacks: Any = load("stable_baselines3.common.callbacks", "stable-baselines3", "train")
+    recipe, before = watch.recipe, model.num_timesteps
     outputs = [
-        logger.make_output_format("csv", str(folder), after),
+        logger.make_output_format("csv", str(folder), f"-{before}" if before else ""),
         logger.make_output_format("tensorboard", str(made(folder / "tensorboard"))),
     ]
     model.set_logger(logger.Logger(str(folder), outputs))
-    is_main = threading.current_thread() is threading.main_thread()
-    before = signal.getsignal(signal.SIGINT)
-
-    def stop(*_: Any) -> None:
-        watch.stop = True
-        signal.signal(signal.SIGINT, before)
-        tell("stops after this round with a checkpoint; Ctrl-C again stops immediately")
-
+    rounds = -(-recipe.steps // (CHECKPOINTS * recipe.round))
+    place = made(folder / "checkpoints")
+    often = rounds * recipe.round // recipe.worlds  # in steps of all worlds together
+    kept = callbacks.CheckpointCallback(often, str(place), "run")
+    every = 1 if recipe.algo == "ppo" else recipe.worlds  # rounds, or episodes
     try:
-        if is_main:
-            signal.signal(signal.SIGINT, stop)
-        every = 1 if watch.recipe.algo == "ppo" else watch.recipe.worlds  # rounds, or episodes
-        model.learn(left, callback=watch, reset_num_timesteps=False, log_interval=every)
+        how = {"reset_num_timesteps": False, "log_interval": every}
+        model.learn(recipe.steps - before, callback=[watch, kept], **how)
+        model.save(place / f"run_{model.num_timesteps}_steps.zip")
+    except KeyboardInterrupt:
+        model.save(place / f"run_{model.num_timesteps}_steps.zip")
+        watch.keep()
+        raise
+    except OSError as error:
+        if isinstance(error, ScmWorldError):
+            raise
+        raise UnwritableFolder(str(folder), str(error)) from error
     except ValueError:
         if not hasattr(watch, "model") or watch.is_finite:  # it has none before the first reset
             raise
         raise Diverged(model.num_timesteps) from None  # torch found it before a round was over
     finally:
-        if is_main:
-            signal.signal(signal.SIGINT, before)
         model.logger.close()
-
-
-def forget(folder: Path, steps: int) -> None:
-    """Remove from the learning curves of a run what came after a checkpoint: it comes again."""
-    for path in folder.glob("progress*.csv"):
-        whole, _, _ = read_text(path).rpartition("\n")  # the last line may be cut
-        head, *rows = whole.split("\n")
-        names = head.split(",")
-        place = names.index(STEPS) if STEPS in names else 0
-        kept = [row for row in rows if float(row.split(",")[place] or 0.0) <= steps]
-        if kept:
-            write_whole("\n".join((head, *kept, "")), path)
-        else:
-            path.unlink()
 
 
 @contextmanager
@@ -230,80 +208,13 @@ def identity_of(recipe: Recipe, start: Path | None, **more: Any) -> dict[str, An
         except OSError as error:
             advice = "give a policy file to start from"
             raise UnreadableFile(str(start), str(error), advice) from None
-    options = recipe.env.get("task_options")
-    made = EvaluationPlace(recipe.task, {"task_options": options}).made
+    made = make_task(recipe.task, **(recipe.env.get("task_options") or {}))
+    options = recipe.as_dict()
+    if recipe.may_grow:  # the same call with more steps goes on
+        del options["steps"]
     return {
         "fingerprint": fingerprint(made, libraries=False),
-        "recipe": recipe.as_dict(),
+        "recipe": options,
         **more,
         "start": digest,
     }
-
-
-def open_folder(
-    path: Path,
-    form: str,
-    identity: Mapping[str, Any],
-    card: Mapping[str, Any],
-    tell: Tell,
-    may_grow: bool = False,
-) -> None:
-    """Begin in a folder, or resume there.
-
-    Args:
-        path: The file that says what is in the folder.
-        form: Format of that file.
-        identity: What decides what comes out, as plain data.
-        card: The same, and versions.
-        tell: Called with the versions that have changed.
-        may_grow: Whether there may be fewer steps in the folder.
-
-    Raises:
-        UnreadableFile: Something else is in the folder; it says what is different.
-        UnwritableFolder: There is no room, or no permission.
-    """
-    folder = path.parent
-    if path.exists():
-        try:
-            there = json.loads(read_text(path))
-            if not isinstance(there, dict) or there.get("format") != form:
-                raise ValueError(f"it is not of the format {form!r}")
-        except DAMAGED as error:
-            raise UnreadableFile(str(path), str(error), "give another folder") from None
-        before, now = _flat({n: there.get(n) for n in identity}), _flat(identity)
-        if may_grow and before.get("recipe.steps", 0) < now["recipe.steps"]:
-            before["recipe.steps"] = now["recipe.steps"]
-        wrong = [
-            f"{name.removeprefix('recipe.')} is {before.get(name)!r} there, and {now.get(name)!r} "
-            "was asked for"
-            for name in dict.fromkeys((*now, *before))
-            if before.get(name) != now.get(name)
-        ]
-        if wrong:
-            reason = f"it holds other work: {'; '.join(wrong)}"
-            raise UnreadableFile(str(folder), reason, "give another folder, or the same options")
-        for name, one in card.get("versions", {}).items():
-            old = there.get("versions", {}).get(name, one)
-            if old != one:
-                tell(f"{name} was {old} and is {one} now: the last bits may be others")
-    elif folder.exists() and (
-        strangers := sorted(p.name for p in folder.iterdir() if not is_draft(p.name, path.name))
-    ):
-        reason = f"it holds something else: {', '.join(strangers[:5])}"
-        raise UnreadableFile(str(folder), reason, "give an empty folder, or a new one")
-    write_whole(json.dumps({"format": form, **card}, indent=2, allow_nan=False), path)
-
-
-def _flat(data: Any, where: str = "") -> dict[str, Any]:
-    """Return the leaves of plain data by their paths.
-
-    Example:
-        >>> _flat({"seed": 1, "recipe": {"steps": 8}})
-        {'seed': 1, 'recipe.steps': 8}
-    """
-    if not isinstance(data, Mapping) or not data:
-        return {where: data}
-    found: dict[str, Any] = {}
-    for name, value in data.items():
-        found |= _flat(value, f"{where}.{name}" if where else str(name))
-    return found

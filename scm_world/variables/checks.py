@@ -21,6 +21,7 @@ from scm_world.variables.noise import Noise
 from scm_world.variables.spaces import Categories, Space
 from scm_world.variables.subsets import Subset
 
+_REFUSED = np.asarray("")
 _LARGEST = 2.0**53  # up to here every whole number is a float, so JSON keeps it
 
 
@@ -41,11 +42,12 @@ def coerce(variable: Variable, value: Any) -> Value:
     if isinstance(variable.bounds, Categories) and variable.bounds.labels:
         with suppress(KeyError, ValueError, TypeError):  # refused below
             value = variable.bounds.numbers(value)
-    given = np.asarray("")
-    if not np.ma.isMaskedArray(value):  # which hides numbers under its mask
-        with suppress(ValueError, TypeError):  # a ragged list, or an object that refuses
-            given = np.asarray(value)
-    if given.dtype.kind not in "iuf":
+    try:
+        given = np.asarray(value)
+    except (ValueError, TypeError):  # a ragged list, or an object that refuses
+        given = _REFUSED
+    # A masked array hides numbers under its mask.
+    if given.dtype.kind not in "iuf" or isinstance(value, np.ma.MaskedArray):
         raise WrongValue(variable.name, value, _expected(variable))
     if given.shape != variable.shape:
         raise WrongValue(variable.name, value, variable.shape, given.shape)

@@ -9,10 +9,12 @@ them and draws. In a plan each has a time: ``Hard(0.2, at=10)``, ``Shift(0.1, du
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Any, ClassVar, Literal, final
+from typing import Annotated, Any, ClassVar, Literal, Self, final
 
+import numpy as np
 from pydantic import ConfigDict, Field, model_validator
 
+from scm_world._types import Value
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.variables.distributions import Distribution
 from scm_world.variables.kinds import (
@@ -41,6 +43,18 @@ class Hard(TimedIntervention):
 
     def __init__(self, value: Any, **fields: Any) -> None:
         super().__init__(value=value, **fields)
+
+    @classmethod
+    def of(cls, value: Value) -> Self:
+        """Return the intervention for an array that has been checked, without validating it."""
+        numbers = value.ravel().astype(np.float64, copy=False).tolist()
+        plain = tuple(numbers) if value.ndim else numbers[0]
+        act, put = object.__new__(cls), object.__setattr__
+        put(act, "__dict__", {"time": None, "kind": "hard", "value": plain})
+        put(act, "__pydantic_fields_set__", {"value"})
+        put(act, "__pydantic_extra__", None)
+        put(act, "__pydantic_private__", None)
+        return act
 
 
 @final

@@ -99,7 +99,6 @@ def report(
     request: Mapping[str, Any],
     done: Transaction,
     before: StepBase,
-    now: Rows,
     inertia: Parameters,
     reported: Parameters,
     remarks: tuple[str, ...],
@@ -110,12 +109,11 @@ def report(
         request: As it was given, with dotted names.
         done: What became of it.
         before: The world before.
-        now: The values after.
         inertia: Principal moments of bodies whose mass or size changed, before.
         reported: Parameters that were read back.
         remarks: Of the backend.
     """
-    compiled, old, bundles = done.compiled, before.row, done.compiled.bundles
+    compiled, old, now, bundles = done.compiled, before.row, done.row, done.compiled.bundles
     back = now.copy()  # as the backend reports it
     for name, key in compiled.parameter_keys.items():
         if key in reported:

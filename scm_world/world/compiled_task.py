@@ -232,6 +232,7 @@ class CompiledTask(ActionVector):
         )
         self._coordinates: dict[str, Callable[..., Any]] = {}
         self._boxes: dict[Any, tuple[frozenset[str], list[Any]]] = {}
+        self._moves: dict[str, bool] = {}
         self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._constants: dict[Structure, Mapping[ParameterKey, Floats]] = {}
 
@@ -332,6 +333,12 @@ class CompiledTask(ActionVector):
             if not found.isdisjoint(self.set_parents[name]):
                 found.add(name)
         return found
+
+    def moves_bodies(self, name: str) -> bool:
+        """Return whether setting a variable moves a body or changes its size."""
+        if name not in self._moves:
+            self._moves[name] = not self.material.isdisjoint(self.reached((name,)))
+        return self._moves[name]
 
     @cached_property
     def surfaces(self) -> frozenset[str]:
@@ -441,6 +448,7 @@ class StepBase:
         compiled: The task in the structure that there is.
         model: With the interventions of earlier steps.
         row: The values.
+        structure: The compiled structure of the row.
         pending: The interventions at this step so far.
         drawn: How often each variable was drawn at this instant, by nature or by an intervention.
         at_start: Whether an episode is just beginning.
@@ -450,15 +458,11 @@ class StepBase:
     compiled: CompiledTask
     model: SCM
     row: Rows
+    structure: Structure
     pending: PendingInterventions = field(default_factory=dict)
     drawn: Mapping[str, int] = field(default_factory=dict)
     at_start: bool = False
     fresh: frozenset[str] = frozenset()
-
-    @cached_property
-    def structure(self) -> Structure:
-        """What is compiled."""
-        return self.compiled.composition.structure(self.row)
 
     @cached_property
     def overlaps(self) -> tuple[Overlap, ...]:

@@ -28,10 +28,8 @@ from scm_world.models import Difference
 from scm_world.models.scene import SURFACES, Overlap
 from scm_world.variables import (
     SOFT,
-    Distribution,
     Draw,
     Hard,
-    Intervention,
     Mechanism,
     Natural,
     Null,
@@ -84,6 +82,10 @@ def merged(model: SCM, *requests: Mapping[str, Any]) -> dict[str, Any]:
 class Transaction:
     """An intervention that has been checked, and the world after it with one of its draws.
 
+    The steps, in their order: the constructor accepts the request and mutilates the model;
+    ``solve`` computes the values for one noise key; ``compare`` finds what the backend has to
+    change and which bodies overlap; ``held`` and ``kept`` return what remains.
+
     Args:
         structures: Of the task.
         base: The world as physics left it.
@@ -119,8 +121,8 @@ class Transaction:
     ) -> None:
         self.problems = [*found]
         self.request, self.space, self._deciding = request, space, structures.deciding
-        asked = (*base.pending.values(), *request.items())
-        if any(type(act) is Null or name in structures.deciding for name, act in asked):
+        asked = [*base.pending.values(), *request.items()]
+        if any(type(act) is Null or name in self._deciding for name, act in asked):
             base, wrong = restructured(structures, base, request, key)
             request = {name: act for name, act in request.items() if name not in wrong}
             self.problems += wrong.values()
@@ -129,84 +131,79 @@ class Transaction:
         there, by_hand = self.compiled.mechanisms.where, self.compiled.set_by_hand
         self.acts = {t: named for t, named in self.pending.items() if t in there}
         self._states = [t for t in self.acts if t in by_hand]
-        self._targets = self._order = tuple[str, ...]()
-        self._draws, self.changed = list[str](), list[str]()
         self._impossible: set[str] = set()  # parameters without a possible value
+        self._boxes: Any = (), ()  # draws from boxes that follow nothing; see ``boxes``
+        self._draws: list[str] = []
+        self.changed: list[str] = []
+        self._targets: tuple[str, ...] = ()
+        self._order: tuple[str, ...] = ()
         if len(self._states) < len(self.acts):
             self._mutilate({t: named for t, named in self.acts.items() if t not in by_hand})
         self._whatever = frozenset(self._impossible)
 
     def _accepted(self, request: Mapping[str, Any]) -> PendingInterventions:
         """Check names, types and shapes; what is asked of a bundle is asked of its parts."""
-        compiled, model = self.compiled, self.compiled.model
+        base, compiled, model = self.base, self.compiled, self.compiled.model
         accepted: PendingInterventions = {}
         asked: dict[str, str] = {}
         for name, value in request.items():
+            if type(value) is Null or (type(value) is Natural and name in compiled.entity_names):
+                if name not in model:
+                    refuse_time(name, value)
+                continue  # of an entity; see ``restructured``. Who comes back is there.
             try:
-                if type(value) in (Null, Natural):
-                    if name not in model:
-                        refuse_time(name, value)
-                    # A removal is of an entity; see ``restructured``. Who comes back is there.
-                    if type(value) is Null or name in compiled.entity_names:
-                        continue
-                kept, act = self._checked(name, value)
+                try:
+                    act = model.accept(name, value)
+                except OutOfBounds as problem:
+                    # What physics did is possible: a state can always be put back to where it is.
+                    present = base.value(name)
+                    if present is None or not np.array_equal(problem.value, present):
+                        raise
+                    act = Hard(problem.value)
                 targets = model.targets(name)
                 for target in targets:
                     if target in asked:
                         raise ConflictingTargets((asked[target], name), target)
                     asked[target] = name
-                if kept in compiled.bundles:
-                    parts = divided(model.declared(kept), act).items()
-                    accepted |= {model.target(part): (part, own) for part, own in parts}
-                else:
-                    accepted[targets[0]] = (kept, act)
             except InterventionError as problem:
                 reason = dict(compiled.composition.system.refused).get(name)
                 refused = reason is not None and isinstance(problem, UnknownVariable)
                 self.problems.append(NotIntervenable(name, str(reason)) if refused else problem)
+                continue
+            if name in compiled.bundles:
+                parts = divided(model.declared(name), act).items()
+                accepted |= {model.target(part): (part, own) for part, own in parts}
+                continue
+            target = targets[0]
+            accepted[target] = name, act
+            if name != target and type(act) is Hard:
+                # Coordinates that are those of the instant set the quantity to what it was at the
+                # instant: their inverse is rounded, and taking something back leaves no trace.
+                quantity, present = base.value(target), base.value(name)
+                if present is not None and np.array_equal(act.value, np.ravel(present)):
+                    accepted[target] = target, Hard(quantity)
         self.asked = tuple(dict.fromkeys(asked.values()))
         return accepted
 
-    def _checked(self, name: str, value: Any) -> tuple[str, Intervention]:
-        """Check an intervention; return it with the name of what it sets.
-
-        Coordinates that are those of the instant set the quantity to what it was at the instant:
-        their inverse is rounded, and taking something back leaves no trace.
-        """
-        base, model = self.base, self.compiled.model
-        try:
-            act = model.accept(name, value)
-        except OutOfBounds as problem:
-            # What physics did is possible: a state can always be put back to where it is.
-            present = base.value(name)
-            if present is None or not np.array_equal(problem.value, present):
-                raise
-            act = Hard(problem.value)
-        target = model.targets(name)[0]
-        if name != target and type(act) is Hard and name not in self.compiled.bundles:
-            quantity, present = base.value(target), base.value(name)
-            if present is not None and np.array_equal(act.value, np.ravel(present)):
-                return target, Hard(quantity)
-        return name, act
-
     def _mutilate(self, acts: PendingInterventions) -> None:
         """Mutilate the model, and order the descendants of the targets."""
-        compiled = self.compiled
-        held = (*self.base.model.interventions.values(), *[act for _, act in acts.values()])
-        adds = Mechanism in map(type, held)
-        moving = self._moving(acts) if adds else {}
+        compiled, base = self.compiled, self.base.model
+        kinds = {type(act) for _, act in acts.values()}
+        moving = self._moving(acts) if Mechanism in kinds else {}
+        draws = {t: (n, act) for t, (n, act) in acts.items() if isinstance(act, Draw)}
+        if draws:
+            whole = [(t, a.source, a.stream) for t, (n, a) in draws.items() if t == n and not a.of]
+            self._boxes = compiled.boxes(tuple(whole)) if whole else self._boxes
         # Where nothing follows others than before, draws from boxes can wait for their values.
-        draws = [t for t, (_, act) in acts.items() if type(act) is Draw]
-        later = self._boxes[0] if draws and not adds else ()
+        later = () if base.adds_edges or Mechanism in kinds else self._boxes[0]
         kept = dict([acts[t] for t in acts if t not in moving and t not in later])
-        self.model, cycles = self.base.model.without_cycles(kept)
+        self.model, cycles = base.without_cycles(kept)
         self.problems += [*{p.variable: p for p in moving.values()}.values(), *cycles]
-        self._impossible = {*moving, *chain(*(problem.cycle for problem in cycles))}
-        static, out = compiled.static, self._impossible
+        self._impossible = out = {*moving, *chain(*[problem.cycle for problem in cycles])}
+        static = compiled.static
         self._targets = tuple([t for t in acts if t in static and t not in out])
         self._draws = [target for target in draws if target in self._targets]
-        others = [t for t in self._draws if t not in self._boxes[0]]
-        if adds or any(self._source(*acts[t]).parents() for t in others):
+        if self.model.adds_edges:
             structure = self.model.structure
             follow = {*self._targets, *structure.instant_descendants(self._targets)}
             self._order = tuple(n for n in structure.order if n in follow and n in static)
@@ -236,20 +233,6 @@ class Transaction:
                 )
         return found
 
-    def _source(self, name: str, act: Any) -> Distribution:
-        declared = self.compiled.model.declared(whole_of(act, name))
-        return source_of(AppliedIntervention(act, declared))
-
-    @cached_property
-    def _boxes(self) -> Any:
-        """Draws from boxes that follow nothing: their names, and groups of them; see ``boxes``."""
-        wanted = [
-            (name, act.source, act.stream)
-            for name, (asked, act) in self.acts.items()
-            if type(act) is Draw and asked == name and act.of is None
-        ]
-        return self.compiled.boxes(tuple(wanted)) if wanted else ((), ())
-
     # --- solving ------------------------------------------------------------------------------
 
     @np.errstate(all="ignore")  # what is not finite is refused by name
@@ -261,19 +244,20 @@ class Transaction:
         Args:
             key: Where to draw.
         """
-        drawn, groups = self._boxes if self._draws else ((), ())
+        drawn, groups = self._boxes
         self._key, numbers = key, self.base.row.numbers.copy()
         self.row = Rows(self.compiled.mechanisms, numbers, self._targets)
         self._wrong, self._impossible = [*self.problems], {*self._whatever}
         self._whole: dict[str, Value] = {}  # what bundles are to be
-        for names, asked, columns, low, edges in groups:
-            streams = (key.stream(*one, key.attempt) for one in zip(names, asked, strict=True))
-            self.row.numbers[columns] = low + edges * uniforms(key, streams, columns.shape[1])
+        for names, streams, columns, low, edges in groups:
+            asked = zip(names, streams, strict=True)
+            found = uniforms(key, (key.stream(*one, key.attempt) for one in asked), len(low[0]))
+            numbers[columns] = low + edges * found
         self.row.unknown.difference_update(drawn)
         for name in self._order:
             if name not in drawn:
                 self._compute(name)
-        if self._impossible.isdisjoint(self._deciding):
+        if (self._states or self.compiled.carried) and self._impossible.isdisjoint(self._deciding):
             self._set_states()
         if self.space is not None:
             self._check_space(self.space)
@@ -326,21 +310,21 @@ class Transaction:
             self._carry(name)
         if act is None:
             return
-        variable = self.compiled.model.declared(name)
+        variable, row = self.compiled.model.declared(name), self.row
         bounds = variable.bounds
         try:
-            value = self._wish(name, asked, act)
+            value = self._wanted(name, asked, act)
             if same(value, self.base.row[name]):
-                self.row[name] = self.base.row[name]
+                row[name] = self.base.row[name]
                 return
             if bounds is None or self._impossible.isdisjoint(bounds.parents()):
-                check_bounds(variable, value, self.row)
+                check_bounds(variable, value, row)
         except InterventionError as problem:
             if problem.variable not in {p.variable for p in self._wrong}:  # of a bundle's parts
                 self._wrong.append(problem)
             return
         # A quaternion gets norm 1; other values are as exact as they were given.
-        self.row[name] = bounds.nearest(value) if isinstance(bounds, Rotations) else value
+        row[name] = bounds.nearest(value) if isinstance(bounds, Rotations) else value
 
     def _carry(self, name: str) -> None:
         """Move a state with the parents that act on it when set (a block that grows)."""
@@ -357,39 +341,35 @@ class Transaction:
             old = [base.row[parent] for parent in parents]
             self.row[name] = variable.carry.bind()(base.row[name], *old, *new)
 
-    def _wish(self, target: str, name: str, act: Intervention) -> Value:
-        """Return the value that a state is to have."""
+    def _wanted(self, target: str, name: str, act: Any) -> Value:
+        """Return the value that a state is to have: asked of it, its coordinates or its bundle."""
         whole = whole_of(act, name)
         requested: Any = self.compiled.model.declared(whole)
-        if whole == name:
-            value = self._wanted(requested, act)
-            if name == target:
-                return value
-            present = () if type(act) is Draw else self.compiled.coordinates(name, self.row)
-            if np.array_equal(value, present):
-                return self.row[target]
-            return np.asarray(requested.inverse.bind()(value))
         if whole not in self._whole:
-            self._whole[whole] = self._wanted(requested, act)
-        parts = requested.mechanism.split(self._whole[whole])
-        return np.asarray(parts[requested.parts.index(name)])
-
-    def _wanted(self, requested: Variable, act: Any) -> Value:
-        """Return the value that is asked of a state, of other coordinates or of a bundle."""
-        name = requested.name
-        match act:
-            case Hard():
-                return requested.array(act.value)
-            case Mechanism():
-                return self._followed(requested, act)
-            case Draw():
-                source, values = self._source(name, act), self.row
-                return self._key.draw(source, name, requested.shape, values, act.stream)
-        present = self.compiled.coordinates(name, self.row)
-        if isinstance(act, SOFT):
-            by = np.asarray(act.by)
-            present = present + by if isinstance(act, Shift) else present * by
-        return np.asarray(present)
+            match act:
+                case Hard():
+                    wanted = requested.array(act.value)
+                case Mechanism():
+                    wanted = self._followed(requested, act)
+                case Draw():
+                    source = source_of(AppliedIntervention(act, requested))
+                    wanted = self._key.draw(source, whole, requested.shape, self.row, act.stream)
+                case _:
+                    wanted = present = self.compiled.coordinates(name, self.row)
+                    if isinstance(act, SOFT):
+                        by = np.asarray(act.by)
+                        wanted = present + by if isinstance(act, Shift) else present * by
+            self._whole[whole] = np.asarray(wanted)
+        value = self._whole[whole]
+        if whole != name:
+            return np.asarray(requested.mechanism.split(value)[requested.parts.index(name)])
+        if name == target:
+            return value
+        if type(act) is not Draw and np.array_equal(
+            value, self.compiled.coordinates(name, self.row)
+        ):
+            return self.row[target]
+        return np.asarray(requested.inverse.bind()(value))
 
     def _followed(self, requested: Variable, act: Mechanism) -> Value:
         """Compute the value that a state is set to, of parameters and of states as they were."""
@@ -402,8 +382,8 @@ class Transaction:
                 variable=requested.name,
                 value=act,
             )
-        values = Rows(self.row.mechanisms, self.row.numbers.copy())
-        states = slice(0, self.row.mechanisms.state_size)
+        values = self.row.copy()
+        states = slice(0, values.mechanisms.state_size)
         values.numbers[states] = self.base.row.numbers[states]
         given = (np.array(values[p.name]) for p in act.parents)
         found: Any = act.equation.bind()(*given, **noise_of(requested, act, self._key, values))
@@ -523,7 +503,8 @@ class Transaction:
             asked, act = self.acts.get(name, (name, None))
             whole = whole_of(act, asked)
             if type(act) is Draw and asked == name and whole in where:
-                source, shape = self._source(asked, act), compiled.model.declared(whole).shape
+                requested = compiled.model.declared(whole)
+                source, shape = source_of(AppliedIntervention(act, requested)), requested.shape
                 if source.parents():
                     return None
                 streams = (key.stream(whole, act.stream, n) for n in attempts)
@@ -540,7 +521,7 @@ class Transaction:
     @cached_property
     def _fixed(self) -> dict[str, Hard]:
         """The values that came out of draws, as interventions by target."""
-        return {target: Hard(self.row[target].tolist()) for target in self._draws}
+        return {target: Hard.of(self.row[target]) for target in self._draws}
 
     def held(self) -> SCM:
         """Return the model with the interventions that would hold, draws as their values."""
@@ -556,8 +537,7 @@ class Transaction:
             if kind is Hard or lasting or target in actions or target not in self.acts:
                 found[target] = named
             else:
-                value = self._fixed.get(target) or Hard(self.row[target].tolist())
-                found[target] = target, value
+                found[target] = target, self._fixed.get(target) or Hard.of(self.row[target])
         removals = self.request.items()
         return found | {name: (name, act) for name, act in removals if type(act) is Null}
 
@@ -585,10 +565,10 @@ def difference(
             return Difference(structure, scene.parameters, scene.state)
     keys, size = compiled.parameter_keys, compiled.mechanisms.state_size
     parameters = {keys[name]: then[name] for name in changed if name in keys}
-    moves = now.row.numbers[:size] != then.numbers[:size]
-    moved = (moves & compiled.composition.system.layout.can_be_set).any()
-    state = compiled.state_of(then) if moved else None
-    return Difference(None, parameters, state) if parameters or moved else None
+    moves, state = now.row.numbers[:size] != then.numbers[:size], None
+    if moves.any() and (moves & compiled.composition.system.layout.can_be_set).any():
+        state = compiled.state_of(then)
+    return Difference(None, parameters, state) if parameters or state is not None else None
 
 
 def overlaps(
@@ -643,7 +623,8 @@ def feasible(
     """
     draws = [name for name, act in request.items() if type(act) is Draw]
     deciding = structures.deciding.intersection(draws)
-    first, turn, tried, named = 0, 0, "", frozenset[str]()
+    named: frozenset[str] = frozenset()
+    first, turn, tried = 0, 0, ""
     while first < ATTEMPTS:
         asked = dict(request)
         for name in deciding if turn else ():  # the noise of another turn
@@ -655,9 +636,8 @@ def feasible(
             continue
         done, named = drawn, frozenset(drawn.asked)
         # What takes no part in where bodies are is drawn once, and so is what is wrong.
-        reached, material = done.compiled.reached, done.compiled.material
         free = () if done.problems else (name for name in draws if name not in deciding)
-        again = [name for name in free if not material.isdisjoint(reached((name,)))]
+        again = [name for name in free if done.compiled.moves_bodies(name)]
         key = replace(key, kept=frozenset(draws).difference(again)) if draws else key
         end = min(first + CHUNK, ATTEMPTS) if deciding else ATTEMPTS
         attempts = range(first, end if again else first + 1)

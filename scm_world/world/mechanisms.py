@@ -219,7 +219,9 @@ class Rows(Mapping[str, Value]):
         return count.astype(np.int64)
 
     def __setitem__(self, name: str, value: ArrayLike) -> None:
-        self.numbers[self.mechanisms.where[name]] = np.ravel(value)
+        if isinstance(value, np.ndarray) and value.ndim > 1:
+            value = value.ravel()
+        self.numbers[self.mechanisms.where[name]] = value
         self.unknown.discard(name)
 
     def __contains__(self, name: object) -> bool:

@@ -254,11 +254,12 @@ class Simulation:
         else:
             row = beginning(origin, None)
             self.backend.build(origin.scene(row))
+            self.backend.read(origin.state_of(row))
             self._origin, self._origin_row = self.backend.snapshot(), row
             self._started = True
         self._adopt(origin, origin.model, row)
         self._draw_nature()
-        self._forget()
+        self.row.remember()
         if not self._checked:
             check_functions(self.compiled, self.evaluate())
             self._checked = True
@@ -279,6 +280,7 @@ class Simulation:
                 raise Infeasible(compiled.random[0], Draw("A"), reasons)
         if change is not None:
             self.backend.apply(change)
+        self.backend.read(compiled.state_of(row))
         self._adopt(compiled, compiled.model, row, changed)
 
     def noise_key(self, index: int) -> NoiseKey:
@@ -499,8 +501,7 @@ class Simulation:
             InterventionError: The request was refused; the world is bit-identical to before.
             NotReset: There is no episode yet.
         """
-        if not self._started or self._lost:
-            self._require_state()
+        self._require_state()
         problems: list[InterventionError] = []
         flat, before = flatten(request, problems), self._step_base()
         base = self.base or before
@@ -511,9 +512,10 @@ class Simulation:
         region = self.variables_space if space is None else as_region("space", space)
         key = self.noise_key(self.index)
         done = feasible(self.structures, base, before, flat, region, key, problems)
+        pending = done.kept()
         audit = self._commit(done, before, flat, check, at_start=base.at_start)
-        base = StepBase(base.compiled, base.model, base.row, done.kept(), drawn, base.at_start)
-        self._keep_base(base)
+        rest = (base.structure, pending, drawn, base.at_start)
+        self._keep_base(StepBase(base.compiled, base.model, base.row, *rest))
         return audit
 
     def _anew(
@@ -560,7 +562,8 @@ class Simulation:
         return problems
 
     def _step_base(self, *, at_start: bool = False) -> StepBase:
-        return StepBase(self.compiled, self.graph, self.row.copy(), at_start=at_start)
+        row = self.row.copy()
+        return StepBase(self.compiled, self.graph, row, self.structure, at_start=at_start)
 
     @property
     def base(self) -> StepBase | None:
@@ -580,59 +583,53 @@ class Simulation:
         at_start: bool,
     ) -> Audit:
         """Apply what was computed, and read it back; or put everything back and raise."""
-        index, change, backend = self.index, done.change, self.backend
-        compiled, keys = done.compiled, done.compiled.parameter_keys
-
-        def undo() -> None:
-            after = StepBase(compiled, self.graph, done.row)
-            lost = difference(after, before.compiled, before.row, done.changed)
-            if lost is not None:
-                backend.apply(lost)
-
-        with self._all_or_nothing(before, undo):
-            inertia: Parameters = {}
-            wanted = {keys[t] for n in done.asked for t in compiled.model.targets(n) if t in keys}
-            if change is not None:
+        index, row, offset = self.index, self.row, self._offset
+        change, backend, compiled = done.change, self.backend, done.compiled
+        keys, structure = compiled.parameter_keys, before.structure
+        if change is not None and change.structure is not None:
+            structure = change.structure
+        wanted = {keys[t] for n in done.asked for t in compiled.model.targets(n) if t in keys}
+        inertia: Parameters = {}
+        remarks: tuple[str, ...] = ()
+        try:
+            if change is None:
+                reported = backend.parameters(wanted)
+            else:
                 inertia = self._inertia(change)
                 backend.apply(change)
-                wanted.update(change.parameters, inertia)
-            reported, remarks = backend.parameters(wanted), tuple[str, ...]()
-            if change is not None:
-                self._refuse_other(change, reported)
-                set_here = () if change.structure is not None else change.parameters
-                if any(what.endswith("friction") for _, what in set_here):
-                    frictions = {keys[n]: before.row[n] for n in done.changed if n in keys}
-                    remarks = backend.capabilities.remarks(backend, frictions)
+                reported = backend.parameters({*wanted, *change.parameters, *inertia})
+                self._refuse_other(change, reported, done.row)
+                rubs = [k for k in change.parameters if k[1].endswith("friction")]
+                if rubs and change.structure is None:
+                    rubbing = [name for name in done.changed if keys.get(name) in rubs]
+                    old = {keys[name]: before.row[name] for name in rubbing}
+                    remarks = backend.capabilities.remarks(backend, old)
             clock = done.row.numbers[compiled.mechanisms.clock]
-            stays = compiled is before.compiled and clock == index
-            if stays and change is None and not done.changed:
+            if change is None and not done.changed and clock == index and self.compiled is compiled:
                 self._adopt_model(done.held())
                 self.version += 1
             else:
-                structure = change.structure if change is not None else None
-                structure = structure or self.structure
                 self._adopt(compiled, done.held(), done.row, done.changed, structure)
                 self._offset += self.index - index
                 if at_start:
-                    self._forget()
-            now = self.row.copy()
-            audit = Audit(partial(report, request, done, before, now, inertia, reported, remarks))
+                    self.row.remember()
+            audit = Audit(partial(report, request, done, before, inertia, reported, remarks))
             if check is not None:
                 check()
+        except BaseException:
+            after = StepBase(compiled, self.graph, done.row, structure)
+            lost = difference(after, before.compiled, before.row, done.changed)
+            if lost is not None:
+                backend.apply(lost)
+            self._put_back(before, row, offset)
+            raise
         return audit
 
-    @contextmanager
-    def _all_or_nothing(self, before: StepBase, undo: Callable[[], None]) -> Iterator[None]:
-        """Put everything back as it was before, should something fail half way."""
-        row, offset = self.row, self._offset
-        try:
-            yield
-        except BaseException:
-            undo()
-            self._hold(before.compiled, row)
-            self._adopt(before.compiled, before.model, before.row, moved=False)
-            self._offset = offset
-            raise
+    def _put_back(self, before: StepBase, row: Rows, offset: int) -> None:
+        """Be as before, should something fail half way; the backend is back already."""
+        self._hold(before.compiled, row)
+        self._adopt(before.compiled, before.model, before.row, before.compiled.static_names)
+        self._offset = offset
 
     def _inertia(self, change: Difference) -> Parameters:
         """Read the moments of inertia that a change of masses and sizes will change."""
@@ -643,15 +640,16 @@ class Simulation:
         bodies.difference_update(n for n in compiled.composition.bodies if n not in compiled.movers)
         return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
-    def _refuse_other(self, change: Difference, reported: Parameters) -> None:
-        """Refuse what the backend did not take over."""
+    def _refuse_other(self, change: Difference, reported: Parameters, row: Rows) -> None:
+        """Refuse what the backend did not take over; write the state that it reports."""
         values = change.parameters.items()
         wrong = [".".join(key) for key, value in values if not _close(value, reported[key])]
         if change.state is not None:
-            got = change.state.copy()
+            asked, got = change.state.settable(), change.state.copy()
             self.backend.read(got)
-            if not _close(change.state.settable(), got.settable()):
+            if not _close(asked, got.settable()):
                 wrong.append("the state")
+            row.numbers[: row.mechanisms.state_size] = got.vector
         if wrong:
             problem = f"the engine did not take over {', '.join(wrong)}"
             raise EngineFailure(problem, self.backend.name)
@@ -663,10 +661,8 @@ class Simulation:
         row: Rows,
         changed: Iterable[str] | None = None,
         structure: Structure | None = None,
-        *,
-        moved: bool = True,
     ) -> None:
-        """Take over what an intervention decided; the backend has taken over its part.
+        """Take over a model and values; the backend has taken over its part.
 
         Args:
             compiled: The task in the structure that there is now.
@@ -674,7 +670,6 @@ class Simulation:
             row: The values.
             changed: What only interventions decide and differs from the present, if known.
             structure: Of the row, if known.
-            moved: Whether the backend reports where everything is; else the row does.
         """
         last, anew = self.row, compiled is not self.compiled
         changed = last.differing(row) if changed is None else changed
@@ -685,10 +680,8 @@ class Simulation:
         if changed or anew:
             self._adopt_structure(structure or compiled.composition.structure(row))
         self.version += 1
-        if moved:
-            self.backend.read(self.state)
         if anew:
-            self._forget()
+            self.row.remember()
             kept, before = self.row.earlier(), last.earlier()
             for name in kept.keys() & before.keys():
                 kept[name][...] = before[name]
@@ -704,10 +697,6 @@ class Simulation:
         self._held_actions = tuple(name for name in self.compiled.actions if name in held)
         acts = (held[name] for name in self._held_actions)
         self._inputs = tuple(p.name for a in acts if isinstance(a, Mechanism) for p in a.parents)
-
-    def _forget(self) -> None:
-        """Take the present as the step before, where there is none."""
-        self.row.remember()
 
     # --- state ------------------------------------------------------------------------
 
@@ -752,24 +741,27 @@ class Simulation:
         if not self._started:
             self._begin()
         before = self.backend.snapshot() if isinstance(snapshot.engine, bytes) else None
-
-        def undo() -> None:
-            if before is not None:
-                self.backend.restore(before)
-            else:
-                self._lost = "a snapshot was restored in part"
-
+        now, row, offset = self._step_base(), self.row, self._offset
+        is_touched = False
         try:
             engine, present, base = snapshot.opened(self.structures, self.structure)
             engine.opened(self.backend)
             noise = CompiledNoise(snapshot.seed)
-            with self._all_or_nothing(self._step_base(), undo):
-                self.backend.restore(engine)
-                self._adopt(present.compiled, present.model, present.row, moved=False)
-                self.row.numbers[:] = present.row.numbers
-        except (SnapshotMismatch, EngineFailure):
-            raise
-        except Exception as error:
+            is_touched = True
+            self.backend.restore(engine)
+            self._adopt(present.compiled, present.model, present.row)
+            self.row.numbers[:] = present.row.numbers
+        except BaseException as error:
+            if is_touched and before is not None:
+                self.backend.restore(before)
+            elif is_touched:
+                self._lost = "a snapshot was restored in part"
+            if is_touched:
+                self._put_back(now, row, offset)
+            if isinstance(error, SnapshotMismatch | EngineFailure) or not isinstance(
+                error, Exception
+            ):
+                raise
             raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
         self._lost, self._offset = "", snapshot.offset
         self.noise, self.episode = noise, snapshot.episode

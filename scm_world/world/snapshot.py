@@ -112,7 +112,8 @@ def _base(
 ) -> StepBase:
     compiled = structures.compiled(plan)
     row = Rows(compiled.mechanisms, numbers.reshape(compiled.mechanisms.start.shape))
-    return StepBase(compiled, compiled.model.with_interventions(held), row, *rest)
+    structure = compiled.composition.structure(row)
+    return StepBase(compiled, compiled.model.with_interventions(held), row, structure, *rest)
 
 
 class _Pickler(pickle.Pickler):

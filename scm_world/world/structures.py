@@ -229,7 +229,9 @@ def restructured(
     for name in compiled.slices.keys() & present.slices.keys():
         row[name] = base.row[name]
     fresh = frozenset(compiled.slices.keys() - present.slices.keys())
-    return replace(base, compiled=compiled, model=model, row=row, fresh=fresh), wrong
+    structure = compiled.composition.structure(row)
+    changes = {"compiled": compiled, "model": model, "row": row, "structure": structure}
+    return replace(base, **changes, fresh=fresh), wrong
 
 
 def _check_parents(head: SCM, name: str, act: Mechanism) -> None:

@@ -124,7 +124,7 @@ def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_an_agent_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is done is said before and on the way; at the end, where the policy is."""
     pytest.importorskip("stable_baselines3")
-    monkeypatch.setattr("scm_world.training.agents.LINES", 0.0)
+    monkeypatch.setattr("scm_world.training.algorithms.LINES", 0.0)
     folder = tmp_path / "run"
     short = (*SMALL, "--set=episode_length=5")
     found = called("pushing", *short, f"--out={folder}")
@@ -139,4 +139,4 @@ def test_an_agent_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert "Training" not in again.output
     other = called("pushing", *SMALL, f"--out={folder}", "--seed=1")
     assert other.exit_code == 2
-    assert "seed is 0 there, and 1 was asked for" in other.output.replace("\n", " ")
+    assert "another training: seed differ" in other.output.replace("\n", " ")

@@ -77,7 +77,7 @@ def test_the_command_writes_pairs_of_pictures(tmp_path: Path) -> None:
         assert done.exit_code == 0, done.output
     assert "5 pairs of pictures with 3 factors, in 2 files" in done.output
     assert {path.name for path in (tmp_path / "pairs").iterdir()} == {
-        "README.md", "croissant.json", "triplets.json",
+        "README.md", "croissant.json", "study.json",
         *(f"triplets-{i:05d}-of-00002.parquet" for i in range(2)),
     }  # fmt: skip
     for wrong in (["--factor", "tool_blok.*"], ["--format", "npz"], ["--camera", "61"]):

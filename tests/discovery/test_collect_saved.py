@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from scm_world.discovery.data import Dataset, folders, load, save
-from scm_world.errors import UnreadableFile
+from scm_world.discovery.data import Dataset, batches, load, save
+from scm_world.errors import ModelError, UnreadableFile
 
 pytest.importorskip("pyarrow")
 
@@ -25,39 +25,40 @@ def test_saving_keeps_the_order_of_episodes(tmp_path: Path) -> None:
     assert load(save(table, tmp_path, shard=2)) == table
 
 
-def test_another_dataset_is_not_saved_over(tmp_path: Path) -> None:
-    """Of the same shape, with other numbers or other targets: refused, and nothing is lost."""
-    rows = np.arange(4.0)[:, None]
-    mine = Dataset.of(rows, ["a"])
-    others = [Dataset.of(rows + 1.0, ["a"]), Dataset.of(rows, ["a"], targets=[("a",)] * 4)]
-    save(mine, tmp_path / "mine")
-    for other in others:
-        with pytest.raises(UnreadableFile, match="another dataset: content differ"):
-            save(other, tmp_path / "mine")
-    assert load(save(mine, tmp_path / "mine")) == mine
-    save(others[0], tmp_path / "other")
-    foreign = (tmp_path / "other" / "shard-00000.parquet").read_bytes()
-    (tmp_path / "mine" / "shard-00000.parquet").write_bytes(foreign)
-    with pytest.raises(UnreadableFile, match=r"belongs to another dataset.*save the same dataset"):
-        load(tmp_path / "mine")
+def test_nothing_is_saved_over(tmp_path: Path) -> None:
+    """A folder with a dataset, or with anything else, is refused, and nothing is lost."""
+    mine = Dataset.of(np.arange(4.0)[:, None], ["a"])
+    save(mine, tmp_path)
+    before = contents(tmp_path)
+    with pytest.raises(UnreadableFile, match="give a new or an empty folder"):
+        save(mine, tmp_path)
+    assert contents(tmp_path) == before
 
 
-def test_saving_is_complete_at_its_end_only(tmp_path: Path, monkeypatch: Any) -> None:
-    """Interrupted, the folder says so; the same call ends it."""
-    table = Dataset.of(np.arange(4.0)[:, None], ["a"])
-    save(table, tmp_path, shard=2)
-    whole = contents(tmp_path)
-    (tmp_path / "shard-00001.parquet").unlink()
+def test_tables_are_written_and_read_one_by_one(tmp_path: Path) -> None:
+    """In bounded memory; together they are one dataset."""
+    made = (
+        Dataset.of(np.full((10, 2), float(i)), ["a", "b"], episode=np.arange(10) + 10 * i)
+        for i in range(5)
+    )
+    save(made, tmp_path, shard=4)
+    parts = [*batches(tmp_path)]
+    assert [len(part) for part in parts] == [4, 4, 2] * 5
+    assert load(tmp_path) == Dataset.joined(parts)
+    assert load(tmp_path)["a"].tolist() == np.repeat(np.arange(5.0), 10).tolist()
+    others = (Dataset.of([[1.0]], [name]) for name in ("a", "b"))
+    with pytest.raises(ModelError, match="cannot be joined"):
+        save(others, tmp_path / "others")
 
-    def stop(*_: Any) -> None:
+
+def test_saving_is_complete_at_its_end_only(tmp_path: Path) -> None:
+    """Interrupted, the folder is not read."""
+
+    def tables() -> Iterator[Dataset]:
+        yield Dataset.of(np.arange(4.0)[:, None], ["a"])
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patched:
-        patched.setattr(folders.Folder, "write", stop)
-        with pytest.raises(KeyboardInterrupt):
-            save(table, tmp_path, shard=2)
-    assert '"complete": false' in (tmp_path / "dataset.json").read_text()
-    with pytest.raises(UnreadableFile, match="save the same dataset again to go on"):
+    with pytest.raises(KeyboardInterrupt):
+        save(tables(), tmp_path, shard=2)
+    with pytest.raises(UnreadableFile, match=r"dataset\.json.*save the dataset again"):
         load(tmp_path)
-    save(table, tmp_path, shard=2)
-    assert contents(tmp_path) == whole

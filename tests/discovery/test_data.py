@@ -305,11 +305,11 @@ def test_targets_that_are_no_names_of_columns_are_refused(cell: object, message:
 @pytest.mark.parametrize(
     ("cells", "kind"),
     [
-        (np.array(["2020-01-01", "2020-01-02"], "M8[D]"), "dates"),
-        (np.array([1, 2], "m8[s]"), "durations"),
-        (np.array([1.0 + 2.0j, 3.0]), "complex numbers"),
-        (["1", "2"], "text"),
-        ([[1.0], [2.0]], "type list"),
+        (np.array(["2020-01-01", "2020-01-02"], "M8[D]"), "datetime64"),
+        (np.array([1, 2], "m8[s]"), "timedelta"),
+        (np.array([1.0 + 2.0j, 3.0]), "complex"),
+        (["1", "2"], "string"),
+        ([[1.0], [2.0]], "mixed"),
     ],
 )
 def test_a_column_without_real_numbers_is_refused(cells: Any, kind: str) -> None:

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.evaluation import METRICS, Evaluation, evaluate
-from scm_world.evaluation.again import shard_runner_of
 from scm_world.evaluation.episodes import EpisodeRow
+from scm_world.evaluation.pipeline import ShardRunner
+from scm_world.evaluation.preparation import again
+from scm_world.evaluation.setups import Shard
 
 rng = np.random.default_rng(0)
 WEIGHTS = rng.normal(size=(56, 9)).astype(np.float32)
@@ -120,14 +122,15 @@ def by_hand(
 def played_again(found: Evaluation, **options: Any) -> list[str]:
     """Play every episode of an evaluation again; list what is another number."""
     wrong = []
-    with closing(shard_runner_of(found, **options)) as runner:
+    with closing(ShardRunner(again(found, **options))) as runner:
         for place in range(len(found)):
             row = {name: column[place].item() for name, column in found.columns.items()}
-            shard = runner.setup.shard_of(row)
-            again = Evaluation.of({}, [runner.play(shard, shard.first)]).columns
+            where = (row[name] for name in ("agent", "run", "engine", "protocol", "seed"))
+            shard = Shard(*where, row["episode"], row["episode"] + 1)
+            repeated = Evaluation.of({}, runner(shard)).columns
             wrong += [
                 f"{place}: {name}"
                 for name, value in row.items()
-                if value == value and again[name][0] != value  # NaN: was not drawn
+                if value == value and repeated[name][0] != value  # NaN: was not drawn
             ]
     return wrong

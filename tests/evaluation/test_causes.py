@@ -9,9 +9,10 @@ import pytest
 from scm_world._types import Floats
 from scm_world.curricula import resample, together
 from scm_world.errors import UnknownOption
-from scm_world.evaluation import Protocol, WorldPolicy, evaluate
+from scm_world.evaluation import Protocol, evaluate
 from scm_world.evaluation.statistics import Cause, Causes, find_causes
 from scm_world.evaluation.statistics.causes import FEWEST, holm
+from scm_world.policies import WorldPolicy
 
 N = 200
 NOISE = 0.3

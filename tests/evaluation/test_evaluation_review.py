@@ -10,9 +10,10 @@ import pytest
 
 from scm_world.curricula import every
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation import Evaluation, Protocol, WorldPolicy, evaluate, why
-from scm_world.evaluation.again import shard_runner_of
+from scm_world.evaluation import Evaluation, Protocol, evaluate, why
 from scm_world.evaluation.figures import write_figures
+from scm_world.evaluation.preparation import again
+from scm_world.policies import WorldPolicy
 from scm_world.tasks import Pushing
 
 SHORT: dict[str, Any] = {"max_episode_length": 3}
@@ -61,10 +62,10 @@ def test_a_task_of_ones_own_is_another_one(tmp_path: Path) -> None:
     own = tiny(task=Bigger(), out=tmp_path)
     assert own != usual
     with pytest.raises(UnknownOption, match="task="):
-        shard_runner_of(own)
-    shard_runner_of(own, task=Bigger()).close()
+        again(own)
+    again(own, task=Bigger())
     with pytest.raises(UnknownOption, match="class of the task differ"):
-        shard_runner_of(own, task=Pushing())
+        again(own, task=Pushing())
 
 
 def test_a_file_does_not_decide_what_is_called() -> None:
@@ -74,7 +75,7 @@ def test_a_file_does_not_decide_what_is_called() -> None:
     act = {"kind": "mechanism", "function": function, "parents": []}
     env = {**found.about["env"], "start": {"floor_friction": act}}
     with pytest.raises(ModelError, match=r"os:getcwd.*trusted"):
-        shard_runner_of(Evaluation({**found.about, "env": env}, found.columns))
+        again(Evaluation({**found.about, "env": env}, found.columns))
 
 
 class Noisy:

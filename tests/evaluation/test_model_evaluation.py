@@ -16,17 +16,10 @@ from scm_world import ModelTask
 from scm_world.cli import app
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
-from scm_world.evaluation import (
-    Evaluation,
-    Recording,
-    WorldPolicy,
-    evaluate,
-    protocols_of,
-    record,
-    why,
-)
-from scm_world.evaluation.again import shard_runner_of
+from scm_world.evaluation import Evaluation, Recording, evaluate, protocols_of, record, why
 from scm_world.evaluation.figures import write_figures
+from scm_world.evaluation.preparation import again
+from scm_world.policies import WorldPolicy
 from scm_world.tasks.factories import load_factory
 
 FILE = Path(__file__).parents[1] / "env" / "model_tasks.py"
@@ -74,7 +67,7 @@ def test_a_file_is_evaluated_kept_and_checked(tmp_path: Path) -> None:
     assert loaded == found
     assert loaded.about["task"] == task
     with pytest.raises(UnknownOption, match="trusted"):
-        shard_runner_of(loaded, policy=agents)
+        again(loaded, policy=agents)
     assert not played_again(loaded, policy=agents, task=task)
     assert not played_again(found)
     files = write_figures(found, tmp_path / "out")
@@ -82,7 +75,7 @@ def test_a_file_is_evaluated_kept_and_checked(tmp_path: Path) -> None:
     text = file.read_text().replace('mass=".1"', 'mass=".12"')
     file.write_text(text)
     with pytest.raises((UnknownOption, SnapshotMismatch), match=r"model|tasks"):
-        shard_runner_of(loaded, policy=agents, task=task)
+        again(loaded, policy=agents, task=task)
     other = evaluate(agents, "P0", task=task, n=6, out=tmp_path / "out")
     assert other != found.only(protocol="P0")
 

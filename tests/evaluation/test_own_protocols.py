@@ -12,9 +12,9 @@ from scm_world.curricula import every, resample, stages, together
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ModelError, ScmWorldError, UnknownOption
 from scm_world.evaluation import Protocol, evaluate, protocols_of
-from scm_world.evaluation.episodes import EpisodeRunner
-from scm_world.evaluation.players import as_player
+from scm_world.evaluation.episodes import EpisodeRunner, Hook
 from scm_world.evaluation.protocols import ROLES, ROWS, chosen
+from scm_world.policies.agents import as_agent
 from scm_world.tasks import TASKS
 from scm_world.variables import Box, Mechanism, Normal, Subset
 
@@ -37,7 +37,7 @@ def test_one_line_makes_a_protocol() -> None:
     here = EpisodeRunner(ScmWorldEnv(backend="fake"))
     found = {}
     for protocol in mine:
-        here.begin(protocol, seed=0, episode=0)
+        here.try_out(protocol, seed=0)
         found[protocol.name] = here.env.world.values()
     assert 0.045 < found["pattern"][mass] <= 0.1
     assert 0.05 <= found["box"][mass] <= 0.06
@@ -49,22 +49,35 @@ def test_one_line_makes_a_protocol() -> None:
     assert all(Protocol.from_dict(json.loads(json.dumps(p.as_dict()))) == p for p in mine)
 
 
+class Masses(Hook):
+    """Keeps the mass of the block at every instant."""
+
+    def begin(self, env: ScmWorldEnv, observation: Any) -> None:
+        """See the reset."""
+        self.env, self.seen = env, [float(env.world[f"{T}.mass"])]
+
+    def after(self, observation: Any, reward: float, info: Any) -> bool:
+        """See a control step."""
+        self.seen.append(float(self.env.world[f"{T}.mass"]))
+        return False
+
+
 def test_within_the_episode_it_acts_at_its_step() -> None:
     """``P2@3`` changes the mass after three control steps, in every episode, and not before."""
     here = EpisodeRunner(ScmWorldEnv(backend="fake", max_episode_length=6))
     (late,) = chosen("P2@3", protocols_of("pushing"))
     for episode in range(3):
-        masses: list[float] = []
+        masses = Masses()
         row = here.play(
-            as_player("still"),
+            as_agent("still"),
             late,
             seed=0,
             episode=episode,
-            watch=lambda env, masses=masses: masses.append(float(env.world[f"{T}.mass"])),
+            hooks=[masses],
         )
-        assert masses[:3] == [0.02] * 3
-        assert masses[3:] == row.drawn[f"{T}.mass"] * 4
-        assert masses[3] > 0.045
+        assert masses.seen[:3] == [0.02] * 3
+        assert masses.seen[3:] == row.drawn[f"{T}.mass"] * 4
+        assert masses.seen[3] > 0.045
 
 
 def test_names_and_patterns_choose() -> None:
@@ -203,7 +216,7 @@ def test_d11_every_step_of_an_episode_can_be_acted_at() -> None:
     here = EpisodeRunner(ScmWorldEnv(backend="fake", max_episode_length=6))
     often = Protocol("often", act=every(2, resample("floor_friction", "B"), first=2))
     for episode in range(3):
-        here.play(as_player("still"), often, seed=0, episode=episode)
+        here.play(as_agent("still"), often, seed=0, episode=episode)
         assert [step for step, _ in here.env.interventions] == [2, 4]
 
 

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation.players import NAMES, WorldPolicy, as_player, checked, player_from
 from scm_world.policies import Layer, MlpPolicy
+from scm_world.policies.agents import NAMES, WorldPolicy, agent_from, as_agent, checked
 from scm_world.queries import Random
 
 STEPS = 6
@@ -30,9 +30,9 @@ def make(task: str = "Pushing", **options: Any) -> Any:
 
 def played(policy: Any, env: Any, seed: int = 0, episode: int = 0) -> Any:
     """Let a policy act for an episode; the actions, shape (steps, 9)."""
-    player = as_player(policy)
+    player = as_agent(policy)
     observation, _ = env.reset(seed=seed, options={"episode": episode})
-    player.begin(env.unwrapped)
+    player.start(env.unwrapped)
     actions = []
     for _ in range(STEPS):
         actions.append(player.act(observation))
@@ -86,7 +86,7 @@ def test_a_policy_with_a_memory_is_reset() -> None:
             self.steps += 1
             return np.full(9, self.steps / 10)
 
-    player, env = as_player(Counting()), make()
+    player, env = as_agent(Counting()), make()
     first, second = played(player, env), played(player, env)
     np.testing.assert_array_equal(first, second)
     assert first[0, 0] == 0.1
@@ -111,7 +111,7 @@ class Recurrent:
 def test_a_model_remembers_until_the_reset() -> None:
     """The state of a recurrent model is given back to it, and forgotten with the episode."""
     model, env = Recurrent(), make()
-    player = as_player(model)
+    player = as_agent(model)
     first, second = played(player, env), played(player, env)
     np.testing.assert_allclose(first[:, 0], np.arange(1, STEPS + 1) / 10)
     np.testing.assert_array_equal(first, second)
@@ -120,10 +120,10 @@ def test_a_model_remembers_until_the_reset() -> None:
 
 def test_an_object_in_memory_cannot_be_made_again() -> None:
     """The error says that it can be given."""
-    about = as_player(Recurrent()).about
+    about = as_agent(Recurrent()).about
     assert json.loads(json.dumps(about)) == about
     with pytest.raises(UnknownOption, match="policy="):
-        player_from(about)
+        agent_from(about)
 
 
 @pytest.mark.parametrize(
@@ -182,8 +182,8 @@ def test_named_policies_act(name: str, mode: str) -> None:
 @pytest.mark.parametrize("name", [*NAMES])
 def test_named_policies_are_made_again(name: str) -> None:
     """Each of them, from what a results file says."""
-    about = as_player(name).about
-    assert player_from(json.loads(json.dumps(about))).about == about
+    about = as_agent(name).about
+    assert agent_from(json.loads(json.dumps(about))).about == about
 
 
 def test_random_actions_are_noise_of_the_episode() -> None:
@@ -224,7 +224,7 @@ def test_functions_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyP
     name = module(
         tmp_path,
         monkeypatch,
-        "from scm_world.evaluation import WorldPolicy\n"
+        "from scm_world.policies import WorldPolicy\n"
         "def up(seen): return np.full(9, 0.5)\n"
         "@WorldPolicy\n"
         "def high(world): return world.action_high\n"
@@ -233,14 +233,14 @@ def test_functions_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyP
     )
     env = make()
     for function, value in (("up", 0.5), ("high", 1.0), ("Memory", 0.25)):
-        player = as_player(f"{name}:{function}")
+        player = as_agent(f"{name}:{function}")
         np.testing.assert_allclose(played(player, env), value)
         with pytest.raises(ModelError, match="trusted"):
-            player_from(player.about)
-        again = player_from(player.about, trusted=(name,))
+            agent_from(player.about)
+        again = agent_from(player.about, trusted=(name,))
         np.testing.assert_allclose(played(again, env), value)
     with pytest.raises(ModelError, match="no function"):
-        as_player(f"{name}:missing")
+        as_agent(f"{name}:missing")
 
 
 def test_a_function_that_was_given_is_named(
@@ -249,18 +249,18 @@ def test_a_function_that_was_given_is_named(
     """One at the top of a module can be made again, also if it sees the world."""
     name = module(tmp_path, monkeypatch, "def high(world): return world.action_high\n")
     function = importlib.import_module(name).high
-    about = as_player(WorldPolicy(function)).about
+    about = as_agent(WorldPolicy(function)).about
     assert about["kind"] == "function"
-    again = player_from(about, trusted=(name,))
+    again = agent_from(about, trusted=(name,))
     np.testing.assert_allclose(played(again, make()), 1.0)
-    assert as_player(lambda seen: seen).about["kind"] == "object"
+    assert as_agent(lambda seen: seen).about["kind"] == "object"
 
 
 @pytest.mark.parametrize("given", ["randm", 3, None])
 def test_what_is_no_policy_is_refused(given: Any) -> None:
     """The error lists what is one."""
     with pytest.raises(UnknownOption, match="a function of the observation"):
-        as_player(given)
+        as_agent(given)
 
 
 def test_players_can_be_pickled(tmp_path: Path) -> None:
@@ -269,7 +269,7 @@ def test_players_can_be_pickled(tmp_path: Path) -> None:
     policy = mlp(env.observation_space.shape[0])
     given = ["still", "random", "sweep", Random(), policy, np.zeros(9), WorldPolicy(_high)]
     for one in given:
-        player = as_player(one)
+        player = as_agent(one)
         other = pickle.loads(pickle.dumps(player))  # noqa: S301 # our own
         np.testing.assert_array_equal(played(other, env), played(player, env))
         assert other.about == player.about
@@ -306,12 +306,12 @@ def archive(path: Path, member: str) -> Path:
 def test_archives_that_hold_pickles_are_refused(tmp_path: Path) -> None:
     """The error says how to give the model instead."""
     path = archive(tmp_path / "ppo.zip", "_stable_baselines3_version")
-    with pytest.raises(UnreadableFile, match=r"as_player\(PPO.load\(path\)\)"):
-        as_player(path)
+    with pytest.raises(UnreadableFile, match=r"as_agent\(PPO.load\(path\)\)"):
+        as_agent(path)
     with pytest.raises(UnreadableFile, match="no item named"):
-        as_player(archive(tmp_path / "other.zip", "readme"))
+        as_agent(archive(tmp_path / "other.zip", "readme"))
     with pytest.raises(UnreadableFile, match="No such file"):
-        as_player(tmp_path / "missing.zip")
+        as_agent(tmp_path / "missing.zip")
 
 
 def published(path: Path, n: int) -> MlpPolicy:
@@ -337,8 +337,8 @@ def test_published_archives_act(tmp_path: Path) -> None:
     policy = published(path, env.observation_space.shape[0])
     found = played(path, env)
     np.testing.assert_array_equal(found, played(policy, env))
-    about = as_player(path).about
-    np.testing.assert_array_equal(played(player_from(about), env), found)
+    about = as_agent(path).about
+    np.testing.assert_array_equal(played(agent_from(about), env), found)
     path.write_bytes(path.read_bytes() + b" ")
     with pytest.raises(UnreadableFile, match="another file"):
-        player_from(about)
+        agent_from(about)

@@ -23,8 +23,9 @@ from scm_world.errors import (
     UnreadableFile,
     UnwritableFolder,
 )
-from scm_world.evaluation.players import as_player, in_world, player_from
-from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, networks, save_policy
+from scm_world.evaluation import in_world
+from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
+from scm_world.policies.agents import agent_from, as_agent
 from scm_world.policies.cards import KEY, OPTIONS, USUAL, plain
 from scm_world.queries import World
 
@@ -108,10 +109,10 @@ def test_a_memory_lasts_for_an_episode_of_an_evaluation() -> None:
         tensors(56 + 2, 16, 9 + 2), {"task": "pushing", "env": RELATIVE, "memory": 2}
     )
     env = ScmWorldEnv("pushing", max_episode_length=4, **RELATIVE)
-    player, kept = as_player(made), []
+    player, kept = as_agent(made), []
     for _ in range(2):
         observation, _ = env.reset(seed=0)
-        player.begin(env)
+        player.start(env)
         state = None
         for _ in range(4):
             action, state = made.predict(observation, state)
@@ -231,19 +232,9 @@ def test_damaged_and_foreign_files_are_refused(tmp_path: Path, how: str, match: 
     path = trained(tmp_path / "a.safetensors")
     damaged(path, how)
     with pytest.raises(UnreadableFile, match=match) as caught:
-        as_player(path)
+        as_agent(path)
     assert "a.safetensors" in str(caught.value)
     assert "give " in str(caught.value)
-
-
-def test_a_file_that_is_too_large_is_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its size is looked at first."""
-    path = trained(tmp_path / "a.safetensors")
-    monkeypatch.setattr(networks, "LARGEST", 1000)
-    with pytest.raises(UnreadableFile, match="at most 1,000 are read"):
-        load_policy(path)
 
 
 FULL = tensors(56, 16, 9)
@@ -343,7 +334,7 @@ def make(task: str = "Pushing", **options: Any) -> Any:
 def first_action(player: Any, env: Any) -> Any:
     """Let a player begin an episode."""
     observation, _ = env.reset(seed=0)
-    player.begin(env.unwrapped)
+    player.start(env.unwrapped)
     return player.act(observation)
 
 
@@ -351,26 +342,26 @@ def test_a_file_a_folder_and_a_policy_in_memory_act_alike(tmp_path: Path) -> Non
     """The folder of a run stands for its best policy, or its last one if there is no other."""
     env = make()
     path = trained(tmp_path / "run" / "policy.safetensors")
-    found = first_action(as_player(path), env)
-    np.testing.assert_array_equal(first_action(as_player(tmp_path / "run"), env), found)
-    np.testing.assert_array_equal(first_action(as_player(load_policy(path)), env), found)
-    assert as_player(tmp_path / "run").about["name"] == "run"
+    found = first_action(as_agent(path), env)
+    np.testing.assert_array_equal(first_action(as_agent(tmp_path / "run"), env), found)
+    np.testing.assert_array_equal(first_action(as_agent(load_policy(path)), env), found)
+    assert as_agent(tmp_path / "run").about["name"] == "run"
     trained(tmp_path / "run" / "best.safetensors", seed=7)
-    best = first_action(as_player(tmp_path / "run"), env)
+    best = first_action(as_agent(tmp_path / "run"), env)
     assert not np.array_equal(best, found)
     with pytest.raises(UnreadableFile, match=r"neither best\.safetensors nor policy"):
-        as_player(tmp_path)
+        as_agent(tmp_path)
 
 
 def test_a_policy_is_made_again_from_what_results_say(tmp_path: Path) -> None:
     """Unless its file is another one by now."""
     path = trained(tmp_path / "run" / "policy.safetensors")
     for given in (path, path.parent):
-        about = as_player(given).about
-        assert player_from(about).about["sha256"] == about["sha256"]
+        about = as_agent(given).about
+        assert agent_from(about).about["sha256"] == about["sha256"]
     trained(path, seed=1)
     with pytest.raises(UnreadableFile, match="another file"):
-        player_from(about)
+        agent_from(about)
 
 
 @pytest.mark.parametrize(
@@ -380,13 +371,13 @@ def test_a_policy_is_made_again_from_what_results_say(tmp_path: Path) -> None:
 def test_other_environments_are_refused(option: str, value: Any) -> None:
     """The error says which option is another one, and what it was in the training."""
     with pytest.raises(UnknownOption, match=f"{option} .* as in its training"):
-        first_action(as_player(policy(env=RELATIVE)), make(**{option: value}))
+        first_action(as_agent(policy(env=RELATIVE)), make(**{option: value}))
 
 
 def test_other_tasks_are_refused_by_what_they_show() -> None:
     """As many numbers as it observes there must be."""
     with pytest.raises(ActionError, match="observes 56 numbers"):
-        first_action(as_player(policy(env=RELATIVE)), make("Stacking2"))
+        first_action(as_agent(policy(env=RELATIVE)), make("Stacking2"))
 
 
 def test_the_names_are_public() -> None:

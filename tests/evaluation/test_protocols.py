@@ -16,10 +16,10 @@ import pytest
 
 from scm_world.env import ScmWorldEnv
 from scm_world.evaluation import Protocol, protocols_of
-from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner, _drawn
-from scm_world.evaluation.players import as_player
+from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner, Scores
 from scm_world.evaluation.protocols import REACHING as REACHING_ROW
 from scm_world.evaluation.protocols import ROLES, ROWS
+from scm_world.policies.agents import as_agent
 from scm_world.tasks import TASKS
 from scm_world.tasks.trifinger.entities.block_world import overlaps
 
@@ -51,7 +51,7 @@ def begun(
     for episode in range(episodes):
         here.env.reset(seed=seed, options={"episode": episode})
         before = here.env.world.values()
-        here.begin(protocol, seed=seed, episode=episode)
+        here.under(protocol).reset(seed=seed, options={"episode": episode})
         done = {name for _, request in here.env.interventions for name in request}
         yield done, before, here.env.world.values()
 
@@ -61,8 +61,11 @@ def drawn(task: str, name: str, conventions: str, n: int) -> dict[str, list[list
     """Draw all variables of a protocol again and again; lists of numbers by name."""
     here, found = runner(task, conventions), defaultdict[str, list[list[float]]](list)
     for episode in range(n):
-        here.begin(named(task, name), seed=0, episode=episode)
-        for variable, value in _drawn(here.env, 0).items():
+        measured = Scores()
+        measured.begin(
+            here.env, here.under(named(task, name)).reset(seed=0, options={"episode": episode})
+        )
+        for variable, value in measured.drawn.items():
             found[variable].append(value)
     return found
 
@@ -314,7 +317,7 @@ def test_d22_protocols_leave_no_trace(task: str) -> None:
 
     def run(order: Any) -> dict[tuple[str, int], EpisodeRow]:
         env = ScmWorldEnv(task, backend="fake", max_episode_length=2)
-        here, player = EpisodeRunner(env), as_player("still")
+        here, player = EpisodeRunner(env), as_agent("still")
         return {
             (name, episode): here.play(player, named(task, name), seed=1, episode=episode)
             for name in order
@@ -335,7 +338,7 @@ def test_d27_no_two_bodies_are_in_one_place(task: str) -> None:
         if task == "towers" and protocol.name == "P11":
             continue  # hundreds of blocks: the same draws are checked in test_towers
         for episode in range(2):
-            here.begin(protocol, seed=3, episode=episode)
+            here.under(protocol).reset(seed=3, options={"episode": episode})
             assert overlaps(here.env.world.scene(), tolerance=1e-3) == ()  # as is allowed
 
 

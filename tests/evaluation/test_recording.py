@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,8 @@ from scm_world.errors import (
     UnreadableFile,
     UnwritableFolder,
 )
-from scm_world.evaluation.players import as_player
 from scm_world.evaluation.recording import Recorded, Recorder, Recording, record
+from scm_world.policies.agents import as_agent
 from scm_world.tasks import Pushing
 from scm_world.variables import Box, Draw, Mechanism
 
@@ -230,7 +229,7 @@ def test_record_counts_episodes_on() -> None:
     part = record("random", env, 2, seed=5, first=2, do={"tool_block.mass": "A"})
     assert part.episodes == series.episodes[2:]
     assert [episode.number for episode in series] == [0, 1, 2, 3]
-    assert series.policy == as_player("random").about
+    assert series.policy == as_agent("random").about
 
 
 def test_recorded_actions_can_be_played() -> None:
@@ -346,48 +345,26 @@ def test_a_file_has_a_row_for_each_instant(tmp_path: Path) -> None:
     assert path.read_bytes() == recording.save(tmp_path / "again").read_bytes()
 
 
-def rewritten(path: Path, change: Any) -> Path:
-    """Write a file again with another table."""
-    parquet: Any = importlib.import_module("pyarrow.parquet")
-    parquet.write_table(change(parquet.read_table(path)), path)
-    return path
-
-
 def test_damaged_files_are_refused_by_name(tmp_path: Path) -> None:
-    """Cut, changed, incomplete, or made by somebody else."""
-    pyarrow: Any = pytest.importorskip("pyarrow")
-    recording = record("random", make(), 2)
-
-    def file() -> Path:
-        return recording.save(tmp_path / "runs.parquet")
-
-    def with_rewards(table: Any) -> Any:
-        rewards = pyarrow.array([1.0] * table.num_rows)
-        return table.set_column(table.column_names.index("reward"), "reward", rewards)
-
-    def with_header(table: Any) -> Any:
-        header = json.loads(table.schema.metadata[b"scm_world"])
-        header["environment"]["frame_skip"] = 3
-        return table.replace_schema_metadata(
-            {**table.schema.metadata, b"scm_world": json.dumps(header)}
-        )
-
-    changes = {
-        "episode 0": with_rewards,
-        "header is not": with_header,
-        "no recording": lambda table: table.replace_schema_metadata({}),
-        "other columns": lambda table: table.drop_columns(["episode"]),
-        "damaged": lambda table: table.drop_columns(["observation"]),
-        "other episodes": lambda table: table.slice(0, STEPS),
-        "in another order": lambda table: table.slice(1),
-    }
-    for reason, change in changes.items():
-        with pytest.raises(UnreadableFile, match=rf"runs\.parquet.*{reason}"):
-            Recording.load(rewritten(file(), change))
-    for data in (b"", b"text", file().read_bytes()[:-100], file().read_bytes()[100:]):
-        (tmp_path / "runs.parquet").write_bytes(data)
+    """Cut, incomplete, or made by somebody else."""
+    parquet: Any = importlib.import_module("pyarrow.parquet")
+    path = record("random", make(), 2).save(tmp_path / "runs.parquet")
+    whole = path.read_bytes()
+    changes: list[Any] = [
+        lambda table: table.replace_schema_metadata({}),
+        lambda table: table.drop_columns(["episode"]),
+        lambda table: table.drop_columns(["observation"]),
+        lambda table: table.slice(0, STEPS + 1),
+    ]
+    for change in changes:
+        path.write_bytes(whole)
+        parquet.write_table(change(parquet.read_table(path)), path)
+        with pytest.raises(UnreadableFile, match=r"runs\.parquet"):
+            Recording.load(path)
+    for data in (b"", b"text", whole[:-100], whole[100:]):
+        path.write_bytes(data)
         with pytest.raises(UnreadableFile, match=r"runs\.parquet.*Parquet"):
-            Recording.load(tmp_path / "runs.parquet")
+            Recording.load(path)
     with pytest.raises(UnreadableFile, match="No such file"):
         Recording.load(tmp_path / "missing.parquet")
 
@@ -459,8 +436,8 @@ def test_a_teacher_that_is_pushed_off_its_path_says_what_to_do_there(tmp_path: P
         assert not np.array_equal(episode.labels, episode.actions)
         assert np.abs(episode.actions).max() <= 1.0
     env.reset(seed=3, options={"episode": 0})
-    player = as_player("across")
-    player.begin(env.unwrapped)
+    player = as_agent("across")
+    player.start(env.unwrapped)
     for step, played in enumerate(noisy[0].actions):
         said = np.clip(player.act(env.unwrapped.observe()), -1.0, 1.0)
         np.testing.assert_array_equal(noisy[0].labels[step], said.astype(np.float32))

@@ -13,11 +13,10 @@ from evaluation_samples import SHORT, played_again
 from policy_samples import RELATIVE, policy, trained
 
 from scm_world.errors import EvaluationError, UnknownOption
-from scm_world.evaluation import Evaluation, WorldPolicy, evaluate, why
-from scm_world.evaluation.agents import shared_options, task_for
+from scm_world.evaluation import Evaluation, evaluate, why
 from scm_world.evaluation.pipeline import ShardRunner
-from scm_world.evaluation.setups import prepare
-from scm_world.policies import PolicyAbout
+from scm_world.evaluation.preparation import prepare, shared_options, task_for
+from scm_world.policies import Agent, PolicyAbout, WorldPolicy
 
 OTHER = {**RELATIVE, "context": "privileged", "max_episode_length": 16}
 INPUTS = ["context", "observation"]
@@ -137,33 +136,38 @@ def test_options_are_for_agents_that_bring_none() -> None:
         small(two, env={"frame_skip": 3})
 
 
-def said(**about: Any) -> PolicyAbout:
-    """Say what a policy was trained for."""
-    return PolicyAbout(**{"task": "pushing", **about})
+Agents = dict[tuple[str, int], Agent]
+
+
+def said(name: str, **card: Any) -> Agents:
+    """Return an agent with what it was trained for; without it where nothing is said."""
+    made_for = PolicyAbout(**{"task": "pushing", **card}) if card else None
+    return {(name, 0): Agent({"name": name}, lambda env: np.sum, card=made_for)}
 
 
 def test_what_is_shared_must_be_the_same() -> None:
     """Two policies that cannot be in one evaluation are named, with what differs."""
-    two = [("a", said(env={"frame_skip": 3})), ("b", said())]
+    two = said("a", env={"frame_skip": 3}) | said("b", task="pushing")
     with pytest.raises(UnknownOption, match="a with 3; b with 10: evaluate them apart"):
         shared_options(None, two)
-    two = [("a", said(env={"max_episode_length": 100})), ("b", said()), ("c", None)]
+    one = said("a", env={"max_episode_length": 100})
+    two = one | said("b", task="pushing") | said("c")
     with pytest.raises(UnknownOption, match="give max_episode_length in env"):
         shared_options(None, two)
     assert shared_options({"max_episode_length": 50}, two) == {"max_episode_length": 50}
-    assert shared_options(None, two[::2]) == {"max_episode_length": 100}
-    assert shared_options(None, [("c", None)]) == {}
+    assert shared_options(None, one | said("c")) == {"max_episode_length": 100}
+    assert shared_options(None, said("c")) == {}
 
 
 def test_the_task_is_that_of_the_policies() -> None:
     """Unless another one is given; several tasks have to be told apart."""
-    picking, reaching = ("a", said(task="picking")), ("b", said(task="reaching"))
-    assert task_for(None, [picking, ("c", None)]) == "picking"
+    picking, reaching = said("a", task="picking"), said("b", task="reaching")
+    assert task_for(None, picking | said("c")) == "picking"
     with pytest.warns(UserWarning, match="trained for the task 'picking', and acts in 'general'"):
-        assert task_for("general", [picking]) == "general"
-    assert task_for(None, [("c", None)]) == "pushing"
+        assert task_for("general", picking) == "general"
+    assert task_for(None, said("c")) == "pushing"
     with pytest.raises(UnknownOption, match="'picking', 'reaching'"):
-        task_for(None, [picking, reaching])
+        task_for(None, picking | reaching)
 
 
 @pytest.mark.filterwarnings("ignore:.*was trained for the task")

@@ -15,9 +15,9 @@ from benchmarks.baselines.publish import command_of, publish
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation import evaluate, in_world
-from scm_world.evaluation.players import as_player, player_from
 from scm_world.policies import file_of, load_policy, save_policy
 from scm_world.policies import zoo as zoo_module
+from scm_world.policies.agents import agent_from, as_agent
 from scm_world.policies.cards import FORM
 from scm_world.policies.zoo import best_known, card, zoo
 from scm_world.queries import World
@@ -64,9 +64,9 @@ def published(folder: Path, tmp_path: Path) -> str:
 
 def test_a_published_policy_acts_by_its_name(published: str) -> None:
     """Wherever a policy is named; results name it, and it is made again from them."""
-    about = as_player(published).about
+    about = as_agent(published).about
     assert (about["kind"], about["name"]) == ("zoo", "zoo:small")
-    assert player_from(about).about == about
+    assert agent_from(about).about == about
     found = evaluate(published, "P0", n=2, backend="fake", env={"max_episode_length": 5})
     assert found.agents == ("small",)
     assert not played_again(found)
@@ -74,7 +74,7 @@ def test_a_published_policy_acts_by_its_name(published: str) -> None:
         trained(zoo_module.FOLDER / "other.safetensors", seed=1).read_bytes()
     )
     with pytest.raises(UnreadableFile, match="another file"):
-        player_from(about)
+        agent_from(about)
 
 
 def test_the_card_says_how_it_was_made_and_how_well_it_does(published: str, tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_every_policy_of_the_package_is_small_and_has_a_card() -> None:
 def test_names_that_are_not_there_are_refused(published: str) -> None:
     """The error lists those that are."""
     with pytest.raises(UnknownOption, match="did you mean 'zoo:small'"):
-        as_player("zoo:smal")
+        as_agent("zoo:smal")
     with pytest.raises(UnknownOption, match="name in the zoo"):
         publish(Path("any"), "../out", [])
 
@@ -216,11 +216,11 @@ def test_the_command_line_lists_the_zoo(published: str, capsys: pytest.CaptureFi
 
 def test_a_policy_of_the_zoo_acts_in_a_world_as_in_an_environment() -> None:
     """Its episode is that of the environment that it was trained in, bit for bit."""
-    player = as_player("zoo:pushing")
-    assert player.made_for is not None
-    env = ScmWorldEnv("pushing", **player.made_for.unusual(FORM))
+    player = as_agent("zoo:pushing")
+    assert player.card is not None
+    env = ScmWorldEnv("pushing", **player.card.unusual(FORM))
     observation, _ = env.reset(seed=3)
-    player.begin(env)
+    player.start(env)
     with World("pushing") as world:
         policy = in_world("zoo:pushing", world)
         for seed in (5, 3):  # it begins anew in every episode

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import pickle
 import threading
 from pathlib import Path
@@ -192,9 +191,9 @@ def test_windows_may_meet_and_lie_in_one_another(
 def test_but_for_an_absence(world: World) -> None:
     """What would have been, had the block been there."""
     episode = world.rollout(steps=2, do={"tool_block": Null()})
-    (found,) = but_for(episode, lambda e: len(e.names))
-    assert found.causes == ("tool_block",)
-    assert found.mattered
+    found = but_for(episode, lambda e: len(e.names))
+    assert found.causes.tolist() == [("tool_block",)]
+    assert found.mattered.all()
 
 
 def test_policies_act_and_episodes_travel(world: World) -> None:
@@ -253,13 +252,6 @@ def test_contacts_of_the_invisible_are(world: World) -> None:
         lab.do({FLOOR: Hard(0.3, when=Contact("tool_block", "robot"))})
 
 
-def test_the_books_cannot_be_written_in(world: World) -> None:
-    """What is handed out is a copy."""
-    lab = Laboratory(world, outcomes=["reward"], steps=2)
-    lab.see(2)["reward"][:] = 777.0
-    assert not (lab.records[0].samples["reward"] == 777.0).any()
-
-
 def test_plans_may_be_made_of_anything_that_is_a_plan() -> None:
     """Names of spaces, tuples of timed parts, plans themselves."""
     plan = do({FLOOR: "A", "action": (Hard([0.1] * 9, at=1), Hard([0.2] * 9, at=3))})
@@ -277,10 +269,6 @@ def test_plans_may_be_made_of_anything_that_is_a_plan() -> None:
         lambda w: w.rollout(
             steps=2, do={FLOOR: Hard(1, when=Reaches("reward", above=0.0, component=9))}
         ),
-        lambda w: Laboratory(w, steps=1).run(["a"]),  # type: ignore[list-item] # that is the point
-        lambda w: Laboratory(w, steps=1).run([{FLOOR: 0.3, "n": 2.7}]),
-        lambda w: Laboratory(w, steps=1).run([{FLOOR: 0.3, "n": math.inf}]),
-        lambda w: Laboratory(w, steps=1).run([{None: 1.0}]),  # type: ignore[dict-item] # the point
         lambda w: compare(1, 2),  # type: ignore[arg-type] # that is the point
         lambda w: identify(nx.DiGraph([("a", "b"), ("b", "a")]), "a", "b"),
         lambda w: identify(nx.Graph([("a", "b")]), "a", "b"),

@@ -136,7 +136,7 @@ def test_by_feedback_a_block_is_turned_less_where_no_grip_can_make_the_whole_tur
     (everything,) = chosen("P10", protocols_of("pick_and_place"))
     fills = []
     for episode in range(9):
-        runner.begin(everything, seed=0, episode=episode)
+        runner.under(everything).reset(seed=0, options={"episode": episode})
         sight = Sight(env.world)
         goal, move = sight.body("goal_block"), Choice(sight).move()
         if move is not None:  # fingers have no room between a wall and a block close to it
@@ -155,7 +155,8 @@ def test_by_feedback_blocks_do_not_slip_out_of_fingers_before_a_wall() -> None:
     (everything,) = chosen("P10", protocols_of("pick_and_place"))
     fills = []
     for episode in (7, 14, 20, 51, 66):  # 0.13 of the goals were filled then, on average
-        policy, _ = Feedback(), runner.begin(everything, seed=21, episode=episode)
+        policy = Feedback()
+        runner.under(everything).reset(seed=21, options={"episode": episode})
         over = False
         while not over:
             action = np.clip(env.as_action(policy(env.world)), -1.0, 1.0)

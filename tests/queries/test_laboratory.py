@@ -1,9 +1,7 @@
-"""Facts about laboratories: permissions, budgets, logs, protocols."""
+"""Facts about laboratories: permissions and budgets."""
 
 from __future__ import annotations
 
-import csv
-import io
 from typing import Any
 
 import numpy as np
@@ -13,7 +11,6 @@ from scm_world.errors import (
     Forbidden,
     InterventionError,
     UnknownOption,
-    UnknownVariable,
 )
 from scm_world.queries import Laboratory, Outcome, World
 from scm_world.variables import Hard, Mechanism, Reaches
@@ -33,7 +30,6 @@ def test_experiments_are_of_new_units() -> None:
     seen, done = mine.see(3), mine.do({"floor_friction": 0.3}, n=4)
     assert (seen.numbers, done.numbers) == ((0, 1, 2), (3, 4, 5, 6))
     assert (mine.spent, mine.remaining) == (7, 3)
-    assert [record.kind for record in mine.records] == ["see", "do"]
     assert done["floor_friction"].tolist() == [0.3] * 4
 
 
@@ -43,8 +39,6 @@ def test_the_budget_is_never_exceeded() -> None:
     mine.see(3)
     with pytest.raises(Forbidden, match="run 3 more episodes; allowed: 2 episodes"):
         mine.do({"floor_friction": 0.3}, n=3)
-    with pytest.raises(Forbidden):
-        mine.run([{"floor_friction": 0.3}] * 3)
     assert mine.spent == 3
     mine.counterfactual(1, {"floor_friction": 0.3})
     mine.do({"floor_friction": 0.3})
@@ -104,38 +98,6 @@ def test_a_refused_intervention_costs_nothing() -> None:
     assert mine.spent == 0
 
 
-def test_a_protocol_is_a_table() -> None:
-    """Settings in, a data set out, as a CSV file has them."""
-    text = "floor_friction,gravity[0],gravity[1],gravity[2],n\n0.3,,,,2\n,0,0,-5,1\n,,,,2\n"
-    mine = lab(budget=5)
-    found = mine.run(csv.DictReader(io.StringIO(text)))
-    assert [len(samples.numbers) for samples in found] == [2, 1, 2]
-    assert found[0]["floor_friction"].tolist() == [0.3, 0.3]
-    assert found[1].targets == ("gravity",)
-    assert found[2].targets == ()
-    assert mine.remaining == 0
-
-
-@pytest.mark.parametrize(
-    ("rows", "error"),
-    [
-        ([{"nobody": 1.0}], UnknownVariable),
-        ([{"floor_friction": "much"}], UnknownOption),
-        ([{"gravity[2]": -5.0}], UnknownOption),
-        ([{"floor_friction": 0.3, "n": 0}], UnknownOption),
-        ([{"gravity[7]": -5.0}], UnknownOption),
-        ("missing.csv", UnknownOption),
-    ],
-    ids=repr,
-)
-def test_a_table_that_is_none_is_refused(rows: Any, error: type[Exception]) -> None:
-    """Before anything is done."""
-    mine = lab()
-    with pytest.raises(error):
-        mine.run(rows)
-    assert mine.spent == 0
-
-
 def test_what_cannot_be_is_seen_beforehand() -> None:
     """A time after the end, and arguments of another kind, cost nothing."""
     mine = lab(budget=5)
@@ -151,10 +113,3 @@ def test_what_cannot_be_is_seen_beforehand() -> None:
     for options in ({"visible": 3}, {"allow": 3}, {"step": 3}, {"outcomes": [np.sum]}):
         with pytest.raises(UnknownOption):
             lab(**options)
-
-
-def test_records_are_not_changed_from_outside() -> None:
-    """What is given out is a copy."""
-    mine = lab()
-    mine.see(2)["floor_friction"][:] = 9.0
-    assert 9.0 not in mine.records[0].samples["floor_friction"]

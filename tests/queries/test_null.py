@@ -68,9 +68,10 @@ def test_an_episode_without_it_is_exact(backend: str) -> None:
     assert other.counterfactual({}, at=9) == other
     assert len(other[f"{GONE}.cartesian_position"]) == 5
     apart = compare(episode, other, ["tool_block_1.cartesian_position"])
-    largest = max((found.largest for found in apart.variables.values()), default=0.0)
+    largest = apart.variables.largest.max() if len(apart.variables) else 0.0
     assert largest < {"mujoco": 1e-12, "bullet": 1e-4}[backend]
-    assert (6, ("floor", GONE), 0) in apart.contacts
+    contacts = [tuple(contact) for contact in apart.contacts.itertuples(index=False)]
+    assert (6, ("floor", GONE), "a") in contacts
     late = world.rollout(steps=12, do={GONE: Null(at=5)})
     np.testing.assert_array_equal(late.vectors[-1], other.vectors[-1])
 

@@ -27,6 +27,7 @@ from scm_world import (
     graph,
     verify,
 )
+from scm_world.discovery.data import Design, collect
 from scm_world.errors import (
     InterventionError,
     ModelError,
@@ -34,8 +35,8 @@ from scm_world.errors import (
     SnapshotMismatch,
     UnknownOption,
 )
-from scm_world.evaluation import as_player
 from scm_world.graph import from_json, to_json
+from scm_world.policies import as_agent
 from scm_world.queries import (
     Effect,
     Episode,
@@ -324,9 +325,9 @@ def test_categories_have_no_mean_in_effects() -> None:
     assert found.mean == pytest.approx(-0.7, abs=0.1)
     one = model.rollout(seed=0, do={"t": 0})
     others = (one.counterfactual({"c": label}) for label in (3, 7, 9))
-    apart = [compare(one, other).variables.get("c") for other in others]
-    assert sorted(0.0 if each is None else each.largest for each in apart) == [0.0, 1.0, 1.0]
-    moved = {consequences(model, {"t": 1}, seed=k).variables["c"].difference for k in range(9)}
+    apart = [compare(one, other).variables.largest.get("c", 0.0) for other in others]
+    assert sorted(apart) == [0.0, 1.0, 1.0]
+    moved = {consequences(model, {"t": 1}, seed=k).variables.difference["c"] for k in range(9)}
     assert moved == {0.0, 1.0}
 
 
@@ -416,8 +417,8 @@ def test_a_number_that_is_not_finite_names_its_outcome() -> None:
         pair().sample(2, outcomes=[odd])
 
 
-def test_a_lagged_model_has_as_many_steps_as_is_usual() -> None:
-    """Effects and samples need no number of steps; None is refused with what to say."""
+def test_a_lagged_model_needs_a_number_of_steps() -> None:
+    """Every question asks for it in the same words."""
     model = SCM(
         [
             Derived(
@@ -428,10 +429,15 @@ def test_a_lagged_model_has_as_many_steps_as_is_usual() -> None:
             )
         ]
     )
-    found = model.effect("z", do={"z": Hard(1.0, at=24)}, n=30)
-    assert found.mean == model.effect("z", do={"z": Hard(1.0, at=24)}, n=30, steps=25).mean
-    with pytest.raises(ModelError, match="say how many steps"):
-        model.effect("z", do={"z": 1.0}, n=3, steps=None)
+    for ask in (
+        model.rollout,
+        lambda: model.sample(3),
+        lambda: model.effect("z", do={"z": 1.0}, n=3),
+        lambda: model.effect("z", do={"z": 1.0}, n=3, steps=None),
+        lambda: World(model).effect("z", do={"z": 1.0}, n=3),
+    ):
+        with pytest.raises(ModelError, match="say how many steps"):
+            ask()
 
 
 def test_an_intervention_counts_from_the_beginning() -> None:
@@ -624,7 +630,7 @@ def test_an_episode_of_equations_is_no_policy(tmp_path: Path) -> None:
     saved = save_episode(SCM([RATE]).rollout(), tmp_path / "episode")
     for policy in (episode, saved):
         with pytest.raises(UnknownOption, match="an array of actions"):
-            as_player(policy)
+            as_agent(policy)
 
 
 def test_the_world_is_one_of_a_step_function() -> None:
@@ -655,3 +661,13 @@ def test_equations_are_a_world() -> None:
         assert (world.noise.seed, world.episode) == (3, 1)
         with pytest.raises(SnapshotMismatch):
             world.restore(SCM([]))
+
+
+def test_equations_of_a_world_are_verified_identified_collected_and_discovered() -> None:
+    """As those of their model are."""
+    world = World(pair())
+    assert world.verify(probes=10).outcome == "confirmed"
+    assert world.identify("x", "y").backdoor == ()
+    design = Design("single", ("x",), Box(0.0, 1.0))
+    assert collect(world, design, 4)["y"].shape == (4,)
+    assert discover(world, probes=8).score.shd == 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import multiprocessing
 import pickle
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,14 +12,14 @@ import pytest
 
 from scm_world.backends.mujoco.batch import MujocoBatch
 from scm_world.discovery.data import Design
-from scm_world.discovery.data.collect import source_of
+from scm_world.discovery.data.worlds import WorldRows
 from scm_world.errors import EngineFailure, OutOfBounds, UnknownVariable
 from scm_world.queries import Outcome, World
 from scm_world.queries import twins as parallel
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.samples import Setting
 from scm_world.queries.twins import Twins, is_known, run_together, twins_of
-from scm_world.variables import Contact, Hard, Mechanism, Null, Reaches
+from scm_world.variables import Contact, Hard, Null, Reaches
 
 BULLET = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="Bullet is not installed"
@@ -254,32 +253,9 @@ def test_a_failure_of_the_engine_ends_one_unit(monkeypatch: pytest.MonkeyPatch) 
     assert all(same_values(again[name], expected[name]) for name in expected)
 
 
-@BULLET
-def test_processes_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On an engine that steps one world at a time: branches, refusals, and structures."""
-    monkeypatch.setattr(parallel, "PAYS", 1)
-    monkeypatch.setattr(parallel, "GOES_ON", 1)
-    world = World("pushing", backend="bullet")
-    episode = world.rollout("random", steps=12)
-    others = set(multiprocessing.active_children())
-    dos: list[dict[str, Any]] = [{"tool_block": Null(at=8)}, {"tool_block.mass": 0.04}, {}]
-    for at in (0, 5):
-        one, two = (episode.worlds(dos, at=at, record=["reward"], workers=w) for w in (1, 2))
-        assert len(set(multiprocessing.active_children()) - others) == 2
-        for first, second in zip(one, two, strict=True):
-            assert_same(first, second)
-        assert two[1].counterfactual({"floor_friction": 0.3}, at=9) == one[1].counterfactual(
-            {"floor_friction": 0.3}, at=9
-        )
-    with pytest.raises(OutOfBounds, match=r"tool_block\.mass"):
-        episode.worlds([*dos, {"tool_block.mass": -1.0}, {"nothing": 1}], workers=2)
-    halved = {"floor_friction": Mechanism(lambda mass: 5 * mass, ("tool_block.mass",))}
-    assert len(episode.worlds([halved, {}], workers=2)) == 2  # it cannot be sent
-
-
 def test_a_source_elsewhere_has_one_thread() -> None:
     """Workers share the cores; here a source has all of them."""
     world = World("pushing", backend="fake")
-    source: Any = source_of(world, Design("single", ("tool_block.mass",)), 4, seed=0)
+    source: Any = WorldRows(world, Design("single", ("tool_block.mass",)), Setting())
     assert source._setting.workers is None
     assert pickle.loads(pickle.dumps(source))._setting.workers == 1  # noqa: S301 # our own

@@ -9,7 +9,7 @@ import pytest
 from scm_world._fingerprint import differing
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.evaluation import evaluate, protocols_of
-from scm_world.evaluation.again import shard_runner_of
+from scm_world.evaluation.preparation import again
 from scm_world.tasks import TASKS, Reaching, Task, TriFingerTask, register, tasks
 from scm_world.training.loop import identity_of
 from scm_world.training.recipe import Recipe, recipe
@@ -40,10 +40,10 @@ def test_what_is_registered_is_known_by_its_name(registry: dict[str, type[Task]]
     assert [protocol.name for protocol in protocols_of("mine")] == ["P0"]
     found = evaluate("still", task="mine", n=1, backend="fake", env={"max_episode_length": 2})
     assert "class of the task" in found.about["fingerprint"]
-    shard_runner_of(found).close()
+    again(found)
     registry["mine"] = type("Changed", (Mine,), {})
     with pytest.raises(UnknownOption, match="class of the task differ"):
-        shard_runner_of(found)
+        again(found)
 
 
 def test_a_recipe_takes_it(registry: dict[str, type[Task]]) -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import signal
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +29,15 @@ from scm_world.errors import (
 )
 from scm_world.evaluation import evaluate
 from scm_world.policies import load_policy, save_policy
+from scm_world.runs.study import settings_in
+from scm_world.training.export import begin_with
 from scm_world.training.loop import train
 from scm_world.training.recipe import Recipe, recipe
 from scm_world.training.settings import Rate
 
 sb3 = pytest.importorskip("stable_baselines3")
 
-from scm_world.training import agents  # noqa: E402 # needs the library
+from scm_world.training import algorithms  # noqa: E402 # needs the library
 
 SMALL: dict[str, Any] = {
     "worlds": 4,
@@ -67,10 +71,6 @@ RECIPES: dict[str, Recipe] = {
 }
 
 
-class Killed(BaseException):
-    """The power is gone."""
-
-
 def run(name: str | Recipe, out: Path, steps: Any = None, **options: Any) -> Any:
     """Train a little."""
     given = {"out": out, "backend": "fake", "threads": 1, "seed": 3, **options}
@@ -78,19 +78,24 @@ def run(name: str | Recipe, out: Path, steps: Any = None, **options: Any) -> Any
     return train(how.but(steps=steps), **given)
 
 
-def killed(name: str, out: Path, patch: pytest.MonkeyPatch, after: int) -> None:
-    """Train until so many checkpoints are written."""
-    write, count = agents.write_checkpoint, iter(range(1, 10_000))
+def killed(name: str, out: Path, at: int) -> None:
+    """Train until so many steps are done, in a process that is killed then."""
+    text = RECIPES[name].to_json()
+    program = f"""
+import json, os
+from scm_world.training.loop import train
+from scm_world.training.recipe import Recipe
+die = lambda done, _: done >= {at} and os.kill(os.getpid(), 9)
+made = Recipe.from_dict(json.loads({text!r}))
+train(made, out={str(out)!r}, backend="fake", threads=1, seed=3, progress=die)
+"""
+    done = subprocess.run([sys.executable, "-c", program], check=False)  # noqa: S603 # ours
+    assert done.returncode == -9
 
-    def fatal(*given: Any) -> None:
-        write(*given)
-        if next(count) == after:
-            raise Killed
 
-    with patch.context() as inner:
-        inner.setattr(agents, "write_checkpoint", fatal)
-        with pytest.raises(Killed):
-            run(name, out, every=0.0)
+def checkpoints(folder: Path) -> list[int]:
+    """List the steps of the checkpoints of a run."""
+    return sorted(int(path.stem.split("_")[1]) for path in folder.glob("checkpoints/run_*.zip"))
 
 
 def weights(path: Path) -> dict[str, Any]:
@@ -99,57 +104,24 @@ def weights(path: Path) -> dict[str, Any]:
     return found
 
 
-def steps_of(folder: Path) -> list[int]:
-    """List the control steps of the learning curves of a run."""
-    found: list[int] = []
-    for path in sorted(folder.glob("progress*.csv"), key=lambda path: (len(path.name), path.name)):
-        head, *rows = path.read_text().splitlines()
-        place = head.split(",").index("time/total_timesteps")
-        found += [int(row.split(",")[place]) for row in rows]
-    return found
+@pytest.mark.parametrize("name", ["ppo", "hindsight"])
+def test_what_was_killed_goes_on_from_the_last_checkpoint(name: str, tmp_path: Path) -> None:
+    """With the weights of the checkpoint, to the end; the best score so far is known."""
+    out, said = tmp_path / "run", list[str]()
+    killed(name, out, 160)
+    last = checkpoints(out)[-1]
+    assert last <= 160
+    found = run(name, out, tell=said.append)
+    assert f"goes on after {last:,} steps" in said
+    assert found.steps == RECIPES[name].steps
+    assert checkpoints(out)[-1] == RECIPES[name].steps
+    scores = [json.loads(path.read_text())["mean"] for path in out.glob("evaluations/*.json")]
+    assert found.score == max(scores)
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_an_interruption_leaves_no_trace(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What is learned in pieces is, bit for bit, what is learned at once."""
-    whole, pieces = tmp_path / "whole", tmp_path / "pieces"
-    one = run(name, whole)
-    for after in (2, 2, 1):
-        killed(name, pieces, monkeypatch, after)
-    other = run(name, pieces)
-    assert (one.steps, one.score) == (other.steps, other.score)
-    for file in ("policy.safetensors", "best.safetensors"):
-        mine, yours = weights(whole / file), weights(pieces / file)
-        assert mine.keys() == yours.keys()
-        for key, array in mine.items():
-            np.testing.assert_array_equal(array, yours[key], err_msg=key)
-    assert len(agents.checkpoints(pieces)) == 2
-    curves = [steps_of(folder) for folder in (whole, pieces)]
-    assert curves[0] == curves[1] == sorted({*curves[1]})  # no step is there twice
-
-
-def test_kill_minus_nine_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process that was killed on MuJoCo is gone on with in another one, bit for bit."""
-    program = """
-import os, sys
-from pathlib import Path
-from scm_world.curricula import Curriculum, resample, stages, together
-from scm_world.training.loop import train
-from scm_world.training.recipe import recipe
-made = recipe("pushing", worlds=3, steps=96, n_steps=8, batch_size=8, episode_length=11,
-    curriculum=Curriculum(together(resample("tool_block.mass", "A"), stages({}, {}, up=0.5))),
-    network={"hidden": [8]}, trials={"protocols": []})
-die = (lambda done, _: done >= int(sys.argv[2]) and os.kill(os.getpid(), 9))
-train(made, out=Path(sys.argv[1]), every=0.0, threads=1, progress=die)
-"""
-    words = [sys.executable, "-c", program, str(tmp_path / "pieces"), "48"]
-    assert subprocess.run(words, check=False).returncode == -9  # noqa: S603 # our own program
-    for folder in ("pieces", "whole"):
-        monkeypatch.setattr(sys, "argv", ["-c", str(tmp_path / folder), "1000"])
-        exec(program, {})  # noqa: S102 # our own program
-    one, other = (weights(tmp_path / name / "policy.safetensors") for name in ("whole", "pieces"))
+def test_the_same_seed_learns_the_same(tmp_path: Path) -> None:
+    """Bit for bit, on a CPU."""
+    one, other = (weights(run("ppo", tmp_path / name).policy) for name in ("one", "other"))
     for key, array in one.items():
         np.testing.assert_array_equal(array, other[key], err_msg=key)
 
@@ -160,9 +132,9 @@ def test_the_policy_file_acts_as_the_model(name: str, scaled: bool, tmp_path: Pa
     """On observations of every size; scales of observations are in its weights."""
     made = RECIPES[name].but(**{"network.scaled": scaled, "trials.protocols": []})
     path = run(made, tmp_path / "run").policy
-    worlds = agents.make_worlds(made, backend="fake")
-    model = agents.make_learner(made, worlds, seed=0)
-    agents.begin_with(model, made, path)
+    worlds = algorithms.make_worlds(made, backend="fake")
+    model = algorithms.make_learner(made, worlds, seed=0)
+    begin_with(model, made, path)
     worlds.close()
     rng, space = np.random.default_rng(0), model.observation_space
 
@@ -185,8 +157,8 @@ def test_the_policy_file_acts_as_the_model(name: str, scaled: bool, tmp_path: Pa
 def test_an_evaluation_has_no_episode_of_a_training() -> None:
     """The goals of P5 by seed 0 are none that the worlds of a training by seed 0 begin with."""
     made = recipe("reaching", worlds=2, n_steps=8, batch_size=8, trials={"protocols": []})
-    worlds = agents.make_worlds(made, backend="fake")
-    agents.make_learner(made, worlds, seed=0)
+    worlds = algorithms.make_worlds(made, backend="fake")
+    algorithms.make_learner(made, worlds, seed=0)
     assert made.env["observe"][-1] == "goal_300.cartesian_position"
     met = worlds.reset()[0, -3:]
     worlds.close()
@@ -199,7 +171,7 @@ def test_an_evaluation_has_no_episode_of_a_training() -> None:
 
 def test_worlds_begin_at_different_steps_of_their_episodes() -> None:
     """World i of n began i / n of an episode later than the first one."""
-    worlds = agents.make_worlds(RECIPES["sac"], backend="fake")
+    worlds = algorithms.make_worlds(RECIPES["sac"], backend="fake")
     worlds.seed(0)
     worlds.reset()
     ends: list[list[int]] = [[] for _ in range(4)]
@@ -225,12 +197,13 @@ def test_a_run_is_whole(tmp_path: Path) -> None:
         "evaluations",
         "policy.safetensors",
         "progress.csv",
-        "run.json",
+        "study.json",
         "tensorboard",
     }
-    about = json.loads((folder / "run.json").read_text())
+    about: Any = load_policy(found.policy).about.card
     assert about["versions"]["stable-baselines3"]
     assert Recipe.from_dict(about["recipe"]) == found.recipe
+    assert settings_in(folder, "training")["seed"] == 3
     names = sorted(path.name for path in (folder / "evaluations").iterdir())
     assert names == ["128.json", "256.json"]
     head = (folder / "progress.csv").read_text().partition("\n")[0].split(",")
@@ -251,10 +224,10 @@ def test_one_training_is_not_another(tmp_path: Path) -> None:
     one, two = (weights(tmp_path / name / "policy.safetensors") for name in ("one", "two"))
     assert not np.array_equal(one["layers.0.weight"], two["layers.0.weight"])
     for options, said in (
-        ({"seed": 4}, "seed is 3 there, and 4"),
-        ({"backend": "mujoco"}, "'fake' there, and 'mujoco'"),
-        ({"name": RECIPES["ppo"].but(**{"rate.initial": 0.25})}, "rate.initial is .* 0.25 was"),
-        ({"start": tmp_path / "two" / "policy.safetensors"}, "start is None there"),
+        ({"seed": 4}, "training: seed differ"),
+        ({"backend": "mujoco"}, "backend differ"),
+        ({"name": RECIPES["ppo"].but(**{"rate.initial": 0.25})}, r"recipe\.rate\.initial differ"),
+        ({"start": tmp_path / "two" / "policy.safetensors"}, "start differ"),
     ):
         with pytest.raises(UnreadableFile, match=said):
             run(**{"name": "ppo", "out": tmp_path / "one", **options})
@@ -262,25 +235,21 @@ def test_one_training_is_not_another(tmp_path: Path) -> None:
     (tmp_path / "strange" / "thesis.tex").write_text("")
     with pytest.raises(UnreadableFile, match="thesis"):
         run("ppo", tmp_path / "strange")
-    (tmp_path / "strange" / "run.json").write_text("{")
-    with pytest.raises(UnreadableFile, match=r"run\.json"):
+    (tmp_path / "strange" / "study.json").write_text("{")
+    with pytest.raises(UnreadableFile, match=r"study\.json"):
         run("ppo", tmp_path / "strange")
 
 
 def test_a_training_becomes_longer(tmp_path: Path) -> None:
-    """It is, bit for bit, the long one; not where the learning rate knows the length."""
-    run("ppo", tmp_path / "once"), run("ppo", tmp_path / "longer", steps=128)
+    """It goes on; not where the learning rate knows the length."""
+    run("ppo", tmp_path / "longer", steps=128)
     found = run("ppo", tmp_path / "longer")
     assert found.steps == 256
-    one, other = (weights(tmp_path / name / "policy.safetensors") for name in ("once", "longer"))
-    for key, array in one.items():
-        np.testing.assert_array_equal(array, other[key])
-    with pytest.raises(UnreadableFile, match="steps is 256 there, and 128"):
-        run("ppo", tmp_path / "longer", steps=128)
+    assert run("ppo", tmp_path / "longer", steps=128).steps == 256
     for name, value in {"rate.schedule": "linear", "network.log_std_end": -3.0}.items():
         line = RECIPES["ppo"].but(**{name: value, "steps": 64})
         run(line, tmp_path / name)
-        with pytest.raises(UnreadableFile, match="steps is 64 there, and 128"):
+        with pytest.raises(UnreadableFile, match=r"recipe\.steps differ"):
             run(line, tmp_path / name, steps=128)
 
 
@@ -298,18 +267,6 @@ def test_bodies_that_come_and_go_cannot_all_be_observed(tmp_path: Path) -> None:
     privileged = recipe("reaching", **SMALL, steps=64, **everything)
     with pytest.raises(InterventionError, match="leave it out of a curriculum"):
         run(privileged, tmp_path / "run")
-
-
-def test_other_versions_are_told(tmp_path: Path) -> None:
-    """They may have other last bits."""
-    run("ppo", tmp_path / "run")
-    about = tmp_path / "run" / "run.json"
-    data = json.loads(about.read_text())
-    data["versions"]["numpy"] = "1.0"
-    about.write_text(json.dumps(data))
-    said: list[str] = []
-    run("ppo", tmp_path / "run", tell=said.append)
-    assert said[0].startswith("numpy was 1.0 and is")
 
 
 def test_the_value_is_learned_alone_at_first(tmp_path: Path) -> None:
@@ -339,7 +296,7 @@ def test_training_begins_with_a_policy(name: str, tmp_path: Path) -> None:
     found = run(made, tmp_path / "second", start=given).policy
     for key, array in weights(given).items():
         np.testing.assert_allclose(weights(found)[key], array, atol=1e-6)
-    with pytest.raises(UnreadableFile, match="start is"):
+    with pytest.raises(UnreadableFile, match="start differ"):
         run(made, tmp_path / "second")
     bare = {k: v for k, v in weights(given).items() if k.startswith("layers")}
     start = save_policy(tmp_path / "bare.safetensors", bare, load_policy(given).about)
@@ -358,7 +315,7 @@ def test_beginnings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         with pytest.raises(UnreadableFile, match=said):
             run(made, out, start=first.policy)
         assert not out.exists()
-    for start in (tmp_path / "nothing", tmp_path / "first" / "run.json"):
+    for start in (tmp_path / "nothing", tmp_path / "first" / "study.json"):
         with pytest.raises(UnreadableFile, match=start.name):
             run("ppo", out, start=start)
         assert not out.exists()
@@ -367,25 +324,21 @@ def test_beginnings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     assert run("ppo", out, start=first.folder).steps == 256
 
 
-def test_damaged_checkpoints_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cut, another byte, something else; without it the one before is taken."""
-    folder = tmp_path / "run"
-    killed("ppo", folder, monkeypatch, 3)
-    last = agents.checkpoints(folder)[-1]
-    whole = last.read_bytes()
-    middle = len(whole) // 2
-    other = bytes(byte ^ 255 for byte in whole[middle : middle + 256])
-    flipped = whole[:middle] + other + whole[middle + 256 :]
-    for data in (whole[:-9], flipped, b"", b"short"):
+def test_damaged_checkpoints_are_left_out(tmp_path: Path) -> None:
+    """A file that was cut, or is something else: the one before is taken, and nothing is run."""
+    folder, said = tmp_path / "run", list[str]()
+    run("ppo", folder, steps=128)
+    last = folder / "checkpoints" / f"run_{checkpoints(folder)[-1]}_steps.zip"
+    for data in (last.read_bytes()[:-9], b"", b"short"):
         last.write_bytes(data)
-        with pytest.raises(UnreadableFile, match="remove this file"):
-            run("ppo", folder)
-    last.unlink()
-    assert run("ppo", folder).steps == 256
+        said.clear()
+        run("ppo", folder, steps=128, tell=said.append)
+        assert any(f"{last} is damaged" in line for line in said)
+        assert f"goes on after {checkpoints(folder)[-2]:,} steps" in said
 
 
-def test_reading_a_checkpoint_runs_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pickle that would call something is refused."""
+def test_reading_a_checkpoint_runs_no_code(tmp_path: Path) -> None:
+    """A pickle that would call something is not read."""
     import torch
 
     class Trap:
@@ -393,34 +346,36 @@ def test_reading_a_checkpoint_runs_no_code(tmp_path: Path, monkeypatch: pytest.M
             return (Path.touch, (tmp_path / "sprung",))
 
     folder = tmp_path / "run"
-    killed("ppo", folder, monkeypatch, 1)
-    torch.save({"parameters": Trap()}, agents.checkpoints(folder)[-1])
-    with pytest.raises(UnreadableFile):
-        run("ppo", folder)
+    run("ppo", folder, steps=128)
+    last = folder / "checkpoints" / f"run_{checkpoints(folder)[-1]}_steps.zip"
+    stream = io.BytesIO()
+    torch.save({"parameters": Trap()}, stream)
+    with zipfile.ZipFile(last, "w") as file:
+        file.writestr("data", "{}")
+        file.writestr("policy.pth", stream.getvalue())
+    assert run("ppo", folder).steps == 256
     assert not (tmp_path / "sprung").exists()
 
 
-def test_a_full_disk_ends_the_training_with_the_last_checkpoint_whole(
+def test_a_full_disk_ends_the_training_with_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The error says what is wrong, and the same call goes on."""
     folder = tmp_path / "run"
-    killed("ppo", folder, monkeypatch, 2)
 
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("scm_world.runs.files.os.fsync", full)
+        patch.setattr(sb3.PPO, "save", full)
         with pytest.raises(UnwritableFolder, match="No space left"):
-            run("ppo", folder, every=0.0)
+            run("ppo", folder)
     assert run("ppo", folder).steps == 256
 
 
 def test_ctrl_c_writes_a_checkpoint(tmp_path: Path) -> None:
-    """The present round is finished first; the same call goes on."""
+    """The same call goes on."""
     said: list[str] = []
-    before = signal.getsignal(signal.SIGINT)
 
     def interrupt(done: int, _: int) -> None:
         if done == 96:
@@ -428,9 +383,7 @@ def test_ctrl_c_writes_a_checkpoint(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         run("ppo", tmp_path / "run", tell=said.append, progress=interrupt)
-    assert signal.getsignal(signal.SIGINT) is before
-    assert any("Ctrl-C again stops immediately" in line for line in said)
-    assert agents.checkpoints(tmp_path / "run")[-1].stem == "96"
+    assert checkpoints(tmp_path / "run")[-1] == 96
     run("ppo", tmp_path / "run", tell=said.append)
     assert "goes on after 96 steps" in said
 
@@ -498,13 +451,13 @@ def test_what_cannot_be_trained_is_refused(
 
 def test_learning_rates() -> None:
     """Constant, falling in a line, and following the divergence between bounds."""
-    assert agents.rate_of(Rate(initial=0.5)) == 0.5
-    line: Any = agents.rate_of(Rate(initial=1.0, schedule="linear", final=0.5))
+    assert algorithms.rate_of(Rate(initial=0.5)) == 0.5
+    line: Any = algorithms.rate_of(Rate(initial=1.0, schedule="linear", final=0.5))
     assert [line(left) for left in (1.0, 0.5, 0.0, -0.1)] == [1.0, 0.75, 0.5, 0.5]
     kept = Rate(initial=0.1, schedule="adaptive", target_kl=0.01, lowest=0.05, highest=0.12)
     now, found = kept.initial, []
     for divergence in (0.01, 0.001, 0.03, 0.03, 0.03):
-        now = agents.adapted(kept, now, divergence)
+        now = algorithms.adapted(kept, now, divergence)
         found.append(round(now, 4))
     assert found == [0.1, 0.12, 0.08, 0.0533, 0.05]
 
@@ -512,15 +465,15 @@ def test_learning_rates() -> None:
 def test_scales_follow_the_quantities() -> None:
     """A position of the block has that of positions; what has none, and goals, are left alone."""
     for name, goals in (("sac", False), ("hindsight", True)):
-        worlds = agents.make_worlds(RECIPES[name].but(**{"env.observe": None}), backend="fake")
-        found, (layout,) = agents.scales_of(worlds, {}), worlds.get_attr("layout", 0)
+        worlds = algorithms.make_worlds(RECIPES[name].but(**{"env.observe": None}), backend="fake")
+        found, (layout,) = algorithms.scales_of(worlds, {}), worlds.get_attr("layout", 0)
         first = 20 if goals else 0  # achieved and desired goal
         where = np.arange(len(found))[first:][layout["tool_block.cartesian_position"]]
-        assert set(found[where]) == {agents.SCALES["cartesian_position"]}
+        assert set(found[where]) == {algorithms.SCALES["cartesian_position"]}
         assert set(found[:first]) <= {1.0}
         worlds.close()
     with pytest.raises(UnknownOption, match="normalize_observations"):
-        agents.scales_of(None, {"normalize_observations": False})
+        algorithms.scales_of(None, {"normalize_observations": False})
 
 
 def test_the_best_policy_is_best_by_the_metric_that_was_asked_for(tmp_path: Path) -> None:

@@ -216,6 +216,13 @@ class Realization:
         """Which shapes touch with coefficients of their own, shape (ngeom, ngeom)."""
         return Couplings(self._compiled).dynamic
 
+    @cached_property
+    def _frictions(self) -> dict[str, int]:
+        """The numbers of the shapes whose own friction may not count, by the names of elements."""
+        names = fields.element_names(self._compiled)["geom"]
+        shapes = {name: n for n, name in enumerate(names) if self._dynamic[n].any()}
+        return shapes | {f"geom:{name}": n for name, n in shapes.items()}
+
     def remarks(self, before: Parameters) -> tuple[str, ...]:
         """List with which shapes a friction that was changed has no effect.
 
@@ -223,17 +230,16 @@ class Realization:
             MuJoCo, *Computation, Contact*: of two shapes the one with the higher priority decides,
             and with equal priorities the larger of each of their coefficients.
         """
-        mj, names = self.model, fields.element_names(self._compiled)["geom"]
-        found = []
+        mj, found = self.model, []
         for (element, attribute), old in before.items():
-            name = element.removeprefix("geom:")
-            if attribute not in fields.FRICTIONS or name not in names:
+            if attribute not in fields.FRICTIONS or element not in self._frictions:
                 continue
-            geom, column = names.index(name), fields.FRICTIONS.index(attribute)
+            geom, column = self._frictions[element], fields.FRICTIONS.index(attribute)
             rank, theirs = mj.geom_priority, mj.geom_friction[:, column]
             larger = (rank == rank[geom]) & (theirs >= max(float(old), theirs[geom]))
             others = np.flatnonzero(self._dynamic[geom] & ((rank > rank[geom]) | larger))
             if len(others):
+                names = fields.element_names(self._compiled)["geom"]
                 shown = [f"{names[i]} ({theirs[i]:g})" for i in others[:4].tolist()]
                 more = f" and {len(others) - 4} more" if len(others) > 4 else ""
                 found.append(

@@ -4,10 +4,9 @@ from scm_world.discovery.data.collect import collect
 from scm_world.discovery.data.croissant import as_huggingface
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
 from scm_world.discovery.data.designs import DESIGNS, Design
-from scm_world.discovery.data.folders import load, save
+from scm_world.discovery.data.files import batches, load, save
 from scm_world.discovery.data.pictures import Pictures
 from scm_world.discovery.data.recorded import default_causes, default_outcomes
-from scm_world.discovery.data.sources import DataSource, SourceRows
 from scm_world.discovery.data.sweeps import Levels, Swept, sweep
 from scm_world.discovery.data.triplets import triplets
 from scm_world.discovery.data.truth import GroundTruth
@@ -29,14 +28,12 @@ __all__ = [
     "Arrays",
     "CausalLearn",
     "Column",
-    "DataSource",
     "Dataset",
     "Design",
     "GroundTruth",
     "Levels",
     "Pictures",
     "Regime",
-    "SourceRows",
     "Swept",
     "UnwritableFolder",
     "as_causal_learn",
@@ -46,6 +43,7 @@ __all__ = [
     "as_huggingface",
     "as_numpy",
     "as_tigramite",
+    "batches",
     "collect",
     "default_causes",
     "default_outcomes",

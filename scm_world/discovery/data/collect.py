@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping
-from contextlib import nullcontext
-from dataclasses import replace
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypedDict, Unpack
 
 from scm_world._arguments import typed, whole_number
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.data.designs import Design
-from scm_world.discovery.data.folders import SHARD, Folder, Head, refusals, together
-from scm_world.discovery.data.pictures import Pictures
-from scm_world.discovery.data.sources import DataSource, ModelSource, SourceRows, Tell
-from scm_world.discovery.data.worlds import Experiments, WorldSource
-from scm_world.errors import InterventionError, UnknownOption
+from scm_world.discovery.data.files import (
+    COUNT,
+    KIND,
+    count_in,
+    decoded,
+    encoded,
+    settings_of,
+    shard_name,
+    together,
+    write_count,
+)
+from scm_world.discovery.data.pictures import ENDINGS, Pictures
+from scm_world.discovery.data.worlds import LaboratoryRows, ModelRows, WorldRows
+from scm_world.errors import Forbidden, InterventionError, UnknownOption
 from scm_world.graph import SCM
-from scm_world.output.remote import Location
+from scm_world.queries.equations import Equations, System
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
-from scm_world.queries.twins import asked
-from scm_world.work.executors import Executor, Serial, opened
-from scm_world.world import Simulation
+from scm_world.runs.files import Location, removed, write_whole
+from scm_world.runs.pool import Pool, pool_of
+from scm_world.runs.study import Study
 
 ENOUGH = 20
 """After so many episodes the share of refused ones is checked."""
@@ -45,40 +50,41 @@ class Circumstances(TypedDict, total=False):
 
 @typed
 def collect(
-    source: SCM | Simulation | Laboratory | DataSource,
+    source: SCM | System | Laboratory,
     design: Design,
     n: int,
     *,
     seed: int = 0,
     out: Location | str | None = None,
-    shard: int = SHARD,
+    shard: int | None = None,
     progress: Progress | None = None,
     workers: int | None = None,
-    engine: Executor | str | None = None,
+    engine: Pool | str | None = None,
     **circumstances: Unpack[Circumstances],
 ) -> Dataset:
     """Collect episodes under a design, as a table with regimes.
 
-    What is in an episode depends on the seed and on its number only: not on how many there are, on
+    The rows of an episode depend on the seed and on its number only: not on how many there are, on
     the shards, or on the workers. An interrupted call resumes when it is repeated, and the
     files are then the same, byte for byte. A larger ``n`` adds episodes.
 
     Args:
         source: A model (one row per episode, or one per control step if ``steps`` are given), a
             ``World``, or a ``Laboratory`` (through its ``see`` and ``do`` only).
-        design: What is done in which episode.
-        n: How many episodes.
-        seed: Of the noise; for a laboratory only of what the design draws by lot.
+        design: The interventions of each episode.
+        n: Number of episodes.
+        seed: Seed of the noise; for a laboratory only of the random choices of the design.
         out: A folder, or a URL: new, empty, or one in which this collection was begun. Its files
-            are Parquet, which needs the extra ``data``.
-        shard: How many episodes are in one of its files.
-        progress: Called with how many episodes are done, and how many there will be: after each
-            episode in this process, after each shard of others.
+            are Parquet.
+        shard: How many episodes are in one of its files, and run by a worker in one piece; 100 of a
+            world, 10,000 of a model if None.
+        progress: Called with how many episodes are done, and how many there will be, after each
+            shard.
         workers: How many shards are made at the same time. None is one, in this process; with an
             engine it is as many as there are cores.
-        engine: What makes them: ``"serial"``, ``"process"``, ``"ray"``, or an executor; see
-            ``engine_of``. A laboratory, which keeps a log, has the first one only.
-        circumstances: ``steps`` of an episode, 25 in a world. Of a world also ``policy`` and
+        engine: What makes them: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster,
+            or a ``Pool``. A laboratory, which keeps a budget, has the first one only.
+        circumstances: ``steps`` of an episode, 25 in a world. For a world also ``policy`` and
             ``nature`` (see ``Setting``), ``causes`` (patterns of parameters), ``outcomes`` (names
             or ``Outcome``), ``every_step``: a row for each control step, with the action,
             ``pictures`` to write beside the rows, in files of their own in ``out``, and
@@ -104,128 +110,103 @@ def collect(
         >>> [table.regimes[i].targets for i in table.regime]
         [(), ('tool_block.mass',), (), ('floor_friction',)]
     """
-    count = whole_number("n", n, least=1)
-    size = whole_number("shard", shard, least=1)
+    source = source.model if isinstance(source, Equations) else source
+    count, given = whole_number("n", n, least=1), dict[str, Any](circumstances)
     whole_number("seed", seed, least=0)
-    made = source_of(source, design, count, seed=seed, **circumstances)
-    about = json.loads(json.dumps(made.about))
-    if out is None and "pictures" in about:
-        raise UnknownOption("out", None, ("a folder, since there are pictures",))
-    folder = None
-    if out is None:
-        size = count if made.at_once else size
-    elif isinstance(source, Laboratory):
-        allowed = ("None with a laboratory: give it a log, and save the dataset",)
-        raise UnknownOption("out", str(out), allowed)
-    head = Head(about, made.columns, count, size, made.edges)
-    if out is not None:
-        folder = Folder(out, head, design.modules)
-    with opened(engine, workers) as executor:
-        if isinstance(source, Laboratory) and not isinstance(executor, Serial):
-            allowed = ("'serial' with one worker: a laboratory keeps its log in one process",)
-            raise UnknownOption("engine of work", executor.engine, allowed)
-        with nullcontext() if folder is None else folder.opened():
-            parts = _gathered(made, head, folder, executor, progress)
-            if folder is not None:
-                folder.note(refusals(parts), complete=True)
-    return together(head, parts)
-
-
-def source_of(
-    source: SCM | Simulation | Laboratory | DataSource,
-    design: Design,
-    n: int,
-    *,
-    seed: int,
-    **given: Unpack[Circumstances],
-) -> DataSource:
-    """Turn what can be collected from into something that has episodes.
-
-    Raises:
-        UnknownOption: It is none of the kinds, or is given arguments that it does not take.
-    """
-    match source:
-        case SCM():
-            _refuse_others(given, ("steps",), "a model")
-            return ModelSource(source, design, seed=seed, steps=given.get("steps"))
-        case Laboratory():
-            _refuse_others(given, (), "a laboratory, which has its own")
-            return Experiments(source, design, n, seed=seed)
-        case Simulation():
-            setting = Setting(
-                policy=given.get("policy", "random"),
-                nature=given.get("nature"),
-                steps=whole_number("steps", given.get("steps", STEPS), least=1),
-                seed=seed,
-            )
-            return WorldSource(
-                *asked(source),
-                design,
-                causes=given.get("causes"),
-                outcomes=given.get("outcomes"),
-                every_step=given.get("every_step", False),
-                setting=setting,
-                pictures=given.get("pictures"),
-                contacts=given.get("contacts", False),
-            )
-    if not hasattr(source, "part"):
-        raise UnknownOption("source", source, ("an SCM", "a World", "a Laboratory", "a Source"))
-    _refuse_others(given, (), "a source, which has its own")
-    return source
-
-
-def _refuse_others(given: Mapping[str, Any], allowed: tuple[str, ...], of: str) -> None:
+    kinds: dict[Any, Any] = {SCM: ("model", ("steps",)), Laboratory: ("laboratory", ())}
+    world = "world", tuple(Circumstances.__annotations__)
+    kind, allowed = next((kinds[one] for one in kinds if isinstance(source, one)), world)
     for name in given:
         if name not in allowed:
-            raise UnknownOption(f"circumstance of {of}", name, allowed or ("nothing",))
+            choices = allowed or ("nothing: it has its own",)
+            raise UnknownOption(f"circumstance of a {kind}", name, choices)
+    if isinstance(source, Laboratory):
+        if out is not None:
+            choices = ("None with a laboratory: save the dataset",)
+            raise UnknownOption("out", str(out), choices)
+        if engine not in (None, "serial") or workers not in (None, 1):
+            choices = ("'serial' with one worker: a laboratory keeps its budget in one process",)
+            raise UnknownOption("engine of work", engine or workers, choices)
+        left = source.remaining
+        if left is not None and count > left:
+            raise Forbidden(f"run {count} more episodes", [f"{left} episodes"])
+        made: Any = LaboratoryRows(source, design, seed)
+    elif isinstance(source, SCM):
+        made = ModelRows(source, design, seed, given.get("steps"))
+    else:
+        steps = whole_number("steps", given.pop("steps", STEPS), least=1)
+        policy, nature = given.pop("policy", "random"), given.pop("nature", None)
+        made = WorldRows(source, design, Setting(policy, nature, steps, seed), **given)
+    return collected(
+        made,
+        count,
+        out=out,
+        shard=shard,
+        progress=progress,
+        workers=workers,
+        engine=engine,
+        trusted=design.modules,
+    )
 
 
-def _gathered(
-    source: DataSource,
-    head: Head,
-    folder: Folder | None,
-    executor: Executor,
+def collected(
+    source: ModelRows | WorldRows | LaboratoryRows,
+    count: int,
+    *,
+    out: Location | str | None,
+    shard: int | None,
     progress: Progress | None,
-) -> list[SourceRows]:
-    """Read or make all parts."""
-    ranges, serial, done = head.ranges(), isinstance(executor, Serial), 0
+    workers: int | None,
+    engine: Pool | str | None,
+    trusted: Sequence[str] = (),
+    at_end: bool = False,
+) -> Dataset:
+    """Read or make the rows of episodes; see ``collect``.
 
-    def tell(more: int) -> None:
-        nonlocal done
-        done += more
-        if progress is not None and more:
-            progress(done, head.n)
-
-    parts: dict[int, SourceRows] = {}
-    for index, numbers in enumerate(ranges):
-        part = None if folder is None else folder.read(index, numbers)
-        if part is not None:
-            parts[index] = part
-            tell(len(numbers))
-    missing = [index for index in range(len(ranges)) if index not in parts]
-    executor.check("source of episodes with several workers", source)
-    make = partial(partial, made_of, source, tell if serial else None)
-    refused = [pair for part in parts.values() for pair in part.refused]
-    made = sum(len(ranges[index]) for index in parts)
-    for place, found in executor.run(make, [ranges[index] for index in missing]):
-        index = missing[place]
-        parts[index] = part = replace(found, table=replace(found.table, about=head.about))
-        refused += part.refused
-        made += len(ranges[index])
-        is_known = made >= ENOUGH and (made == head.n or not source.uneven)
-        if is_known and 2 * len(refused) > made:
-            number, why = refused[-1]
-            said = f"{len(refused)} of {made} episodes were refused; number {number} because"
-            raise InterventionError(f"{said}: {why}", variable="")
+    Functions of the ``trusted`` modules serve as mechanisms. With ``at_end`` the share of refused
+    episodes counts only when all are done.
+    """
+    size = source.shard if shard is None else whole_number("shard", shard, least=1)
+    taken: Any = source.about.get("pictures")
+    if out is None and taken is not None:
+        raise UnknownOption("out", None, ("a folder, since there are pictures",))
+    starts = range(0, count, size)
+    cells = {shard_name(i): range(at, min(at + size, count)) for i, at in enumerate(starts)}
+    end = ENDINGS[taken["format"]] if taken else ""
+    seen = {name: f"pictures-{i:05d}.{end}" for i, name in enumerate(cells) if taken}
+    settings = settings_of(source.about, source.columns, size)
+    parts = dict[str, Dataset]()
+    done = lost = 0
+    with Study(out, KIND, settings) as study, pool_of(engine, workers) as pool:
+        folder = study.folder
         if folder is not None:
-            folder.write(index, ranges[index], part)
-            parts[index] = replace(part, pictures=b"")
-        if not serial:
-            tell(len(ranges[index]))
-    return [parts[index] for index in range(len(ranges))]
-
-
-def made_of(source: DataSource, tell: Tell | None, numbers: range) -> SourceRows:
-    """Make the rows of a shard, in any process; ``tell`` is None in other ones."""
-    part = source.part(numbers, tell or (lambda more: None))
-    return replace(part, table=replace(part.table, about={}))  # it is the same in all of them
+            there = count_in(folder)["episodes"] if (folder / COUNT).exists() else 0
+            if there > count:
+                allowed = (f"{there} or more: {folder} has so many already",)
+                raise UnknownOption("number of episodes", count, allowed)
+            if there < count and there % size:  # the last file was not full
+                removed(folder / shard_name(there // size))
+            for name in seen:  # a process can be killed between the two
+                if not (folder / seen[name]).exists():
+                    removed(folder / name)
+            write_count(folder, count, len(cells))
+        for name, (part, pictures) in study.map(
+            cells,
+            source.rows,
+            read=lambda data: (decoded(data, source.columns, trusted), b""),
+            write=lambda made: encoded(made[0]),
+            pool=pool,
+        ):
+            parts[name] = part
+            if pictures and folder is not None:
+                write_whole(folder / seen[name], pictures)
+            done += len(cells[name])
+            refused = part.about.get("refused", {})
+            lost += len(refused)
+            if refused and 2 * lost > done >= ENOUGH and (done == count or not at_end):
+                number, why = [*refused.items()][-1]
+                said = f"{lost} of {done} episodes were refused; number {number} because"
+                raise InterventionError(f"{said}: {why}", variable="")
+            if progress is not None:
+                progress(done, count)
+    return together(settings, [parts[name] for name in cells])

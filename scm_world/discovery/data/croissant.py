@@ -9,8 +9,7 @@ from typing import Any
 
 from scm_world._arguments import typed
 from scm_world.errors import UnreadableFile
-from scm_world.output.durable import write_durably
-from scm_world.output.remote import Location, located
+from scm_world.runs.files import Location, located, write_whole
 
 KINDS = {"triplets": "pairs", "shard": "rows", "pictures": "pictures"}
 """How the names of files begin, and what a part of the dataset is called that has them."""
@@ -92,8 +91,8 @@ def as_huggingface(folder: Location | str, **about: Any) -> Location:
     head["conformsTo"] = "http://mlcommons.org/croissant/1.1"
     croissant = {**head, **about, "distribution": distribution, "recordSet": records}
     lines = ["---", *card, *configs, "---", "", f"# {about['name']}", "", about["description"], ""]
-    write_durably(place / "README.md", "\n".join(lines).encode())
-    write_durably(place / "croissant.json", (json.dumps(croissant, indent=1) + "\n").encode())
+    write_whole(place / "README.md", "\n".join(lines))
+    write_whole(place / "croissant.json", json.dumps(croissant, indent=1) + "\n")
     return place
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, final
@@ -21,11 +20,13 @@ from scm_world.variables import SOFT, Mechanism
 if TYPE_CHECKING:
     from scm_world.discovery.data.truth import GroundTruth
 
+NUMBERS = ("episode", "step", "regime")
+TARGETS = "intervention_targets"
+RESERVED = (*NUMBERS, TARGETS)
+"""The columns of frames and files beside those of the data."""
+
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-
-SEEN = Plan()
-"""The plan of a regime in which nothing is done."""
 
 
 @final
@@ -36,16 +37,15 @@ class Column:
     Attributes:
         name: ``"tool_block.mass"``, or ``"gravity[2]"`` for a number of a vector; ``@-1`` at the
             end means one control step before the row.
-        variable: Which variable it belongs to, without component and lag.
-        component: Which number of it; None for a scalar.
-        unit: Of the variable.
-        kind: Of the variable: ``"exogenous"``, ``"derived"``, ``"measured"``, ``"action"``; or
-            ``"unknown"``, in a table from elsewhere.
-        role: Of the variable: ``"parameter"``, ``"state"``, ``"readout"``, ``"action"``, or
-            ``"unknown"``.
+        variable: Name of its variable, without component and lag.
+        component: Which number of the variable it is; None for a scalar.
+        unit: Unit of the variable.
+        kind: ``"exogenous"``, ``"derived"``, ``"measured"`` or ``"action"``; ``"unknown"`` in a
+            table from elsewhere.
+        role: ``"parameter"``, ``"state"``, ``"readout"``, ``"action"`` or ``"unknown"``.
         dtype: ``"real"``, ``"integer"`` or ``"categorical"``.
         lag: How many control steps before the row it was measured.
-        how: What was taken of an episode: ``"final"``, ``"mean"``, …; ``"value"`` of an instant.
+        how: The summary of an episode: ``"final"``, ``"mean"``, …; ``"value"`` of an instant.
     """
 
     name: str
@@ -62,14 +62,14 @@ class Column:
 @final
 @dataclass(frozen=True)
 class Regime:
-    """What was done in some rows.
+    """The interventions in some rows.
 
     Attributes:
-        plan: The interventions; empty where nothing was done.
+        plan: The interventions; empty in observational rows.
         targets: Variables whose own mechanism was replaced, sorted.
     """
 
-    plan: Plan = SEEN
+    plan: Plan = field(default_factory=Plan)
     targets: tuple[str, ...] = ()
 
     @property
@@ -82,7 +82,7 @@ class Regime:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Write it as plain data."""
+        """Return it as plain data."""
         return {"plan": self.plan.as_dict(), "targets": list(self.targets)}
 
     @classmethod
@@ -103,10 +103,11 @@ class Dataset:
 
     Attributes:
         values: Shape (n, p).
-        columns: What stands in each column.
-        regimes: What was done; rows refer to them by number.
-        regime: Of each row, shape (n,).
-        episode: Of each row, shape (n,). Rows of one episode stand together, in time.
+        columns: The meaning of each column.
+        regimes: The interventions; rows refer to them by number.
+        regime: Number of the regime of each row, shape (n,).
+        episode: Number of the episode of each row, shape (n,). Rows of one episode stand together,
+            in time.
         step: Control step of each row, shape (n,); 0 where a row is a whole episode.
         about: Where the rows come from: system, seed, backend, versions and so on; plain data.
 
@@ -136,22 +137,18 @@ class Dataset:
             problems.append(
                 f"values have shape {self.values.shape}, of {len(self.columns)} columns"
             )
-        rows = {what: getattr(self, what).shape for what in ("regime", "episode", "step")}
-        problems += [
-            f"{what} has shape {shape}, not ({n},)" for what, shape in rows.items() if shape != (n,)
-        ]
+        for what in ("regime", "episode", "step"):
+            shape = getattr(self, what).shape
+            if shape != (n,):
+                problems.append(f"{what} has shape {shape}, not ({n},)")
         if not np.isfinite(self.values).all():
             row, column = np.argwhere(~np.isfinite(self.values))[0]
             problems.append(f"row {row} of {self.columns[column].name!r} is not finite")
         if len({column.name for column in self.columns}) != len(self.columns):
             problems.append("two columns have one name")
-        if (
-            n > 0
-            and not problems
-            and not 0 <= self.regime.min() <= self.regime.max() < len(self.regimes)
-        ):
-            problems.append(f"a row refers to a regime that is not among {len(self.regimes)}")
-        if not problems:
+        if n > 0 and not problems:
+            if not 0 <= self.regime.min() <= self.regime.max() < len(self.regimes):
+                problems.append(f"a row refers to a regime that is not among {len(self.regimes)}")
             problems += _disorder(self.episode, self.step)
         if problems:
             raise ModelError(problems)
@@ -167,19 +164,20 @@ class Dataset:
         step: Any = None,
         **about: Any,
     ) -> Dataset:
-        """Make a table of numbers from elsewhere.
+        """Build a table of numbers from elsewhere.
 
         Args:
             values: Shape (n, p); of a data frame, or of columns by name, those with these names.
-            names: Of the p columns; scalars all.
-            targets: For each row the columns that were intervened on; nowhere if None.
-            episode: Of each row; each row is its own if None.
-            step: Of each row; 0 if None.
-            about: Where it comes from.
+            names: Names of the p columns, which are scalars.
+            targets: The columns that were intervened on in each row; nowhere if None.
+            episode: Episode of each row; each row is an episode if None.
+            step: Control step of each row; 0 if None.
+            about: Where the rows come from.
 
         Raises:
-            ModelError: A column has no numbers, a name is no text, or shapes do not fit together.
-            UnknownVariable: A target, or a name in a data frame, is no column.
+            ModelError: A column has no numbers, a name is not a text, or shapes do not fit
+                together.
+            UnknownVariable: A target, or a name in a data frame, is not a column.
         """
         table = numbers(values, names)
         n = len(table)
@@ -208,39 +206,32 @@ class Dataset:
     def stacked(
         cls, columns: tuple[Column, ...], rows: Sequence[Row], about: dict[str, Any]
     ) -> Dataset:
-        """Put rows below one another; regimes are numbered as they occur."""
+        """Build a table of rows; regimes are numbered as they occur."""
         regimes: dict[Regime, int] = {}
         numbers = [(e, s, regimes.setdefault(regime, len(regimes))) for e, s, regime, _ in rows]
         episode, step, regime = np.array(numbers, dtype=np.int64).reshape(-1, 3).T.copy()
         values = np.array([row for *_, row in rows], dtype=np.float64).reshape(-1, len(columns))
         return cls(values, columns, tuple(regimes), regime, episode, step, about)
 
-    # --- looking ------------------------------------------------------------------------------
+    # --- reading ------------------------------------------------------------------------------
 
     def __len__(self) -> int:
         return len(self.values)
 
-    @typed
     def __getitem__(self, name: str) -> Floats:
-        """Give a column, shape (n,), or all columns of a vector, shape (n, k)."""
-        if name in self.names:
-            return self.values[:, self.names.index(name)]
-        where = [i for i, column in enumerate(self.columns) if column.variable == name]
-        if not where:
-            raise UnknownVariable(name, (*self.names, *self.variables))
-        return self.values[:, where]
+        """Return a column, shape (n,), or all columns of a vector, shape (n, k)."""
+        where = self._places([name])
+        return self.values[:, where[0] if name in self.names else where]
 
     def __eq__(self, other: object) -> bool:
-        """Tell whether two tables hold the same, bit for bit."""
+        """Return whether two tables hold the same, bit for bit."""
         return (
             isinstance(other, Dataset)
             and self.columns == other.columns
             and self.about == other.about
             and self.values.tobytes() == other.values.tobytes()
-            and all(
-                np.array_equal(getattr(self, what), getattr(other, what))
-                for what in ("episode", "step")
-            )
+            and np.array_equal(self.episode, other.episode)
+            and np.array_equal(self.step, other.step)
             and [self.regimes[i] for i in self.regime] == [other.regimes[i] for i in other.regime]
         )
 
@@ -252,29 +243,27 @@ class Dataset:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Of the columns."""
+        """Names of the columns."""
         return tuple(column.name for column in self.columns)
-
-    @cached_property
-    def variables(self) -> tuple[str, ...]:
-        """That the columns belong to, in their order; with ``@-1`` for an earlier instant."""
-        return tuple(dict.fromkeys(map(block, self.columns)))
 
     @cached_property
     def blocks(self) -> dict[str, Ints]:
         """Numbers of the columns of each variable."""
-        found: dict[str, list[int]] = {name: [] for name in self.variables}
+        found: dict[str, list[int]] = {}
         for i, column in enumerate(self.columns):
-            found[block(column)].append(i)
+            found.setdefault(block(column), []).append(i)
         return {name: np.array(where, dtype=np.int64) for name, where in found.items()}
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """The variables of the columns, in their order; with ``@-1`` for an earlier instant."""
+        return tuple(self.blocks)
 
     @cached_property
     def targeted(self) -> Bools:
         """Which numbers were set from outside, shape (n, p)."""
-        kinds = np.array(
-            [[block(c) in r.targets for c in self.columns] for r in self.regimes], dtype=bool
-        ).reshape(len(self.regimes), len(self.columns))
-        return kinds[self.regime]
+        names = [block(column) for column in self.columns]
+        return self._by_row([[name in r.targets for name in names] for r in self.regimes])
 
     @cached_property
     def soft(self) -> Bools:
@@ -283,10 +272,12 @@ class Dataset:
         These are shifted or scaled, or have another noise; all others were set, drawn, or follow
         other causes.
         """
-        kinds = np.array(
-            [[c.variable in r.softly for c in self.columns] for r in self.regimes], dtype=bool
-        ).reshape(len(self.regimes), len(self.columns))
-        return kinds[self.regime] & self.targeted
+        kinds = [[c.variable in r for c in self.columns] for r in (r.softly for r in self.regimes)]
+        return self._by_row(kinds) & self.targeted
+
+    def _by_row(self, kinds: list[list[bool]]) -> Bools:
+        """Return for each row, shape (n, p), the marks of its regime."""
+        return np.array(kinds, dtype=bool).reshape(len(kinds), len(self.columns))[self.regime]
 
     @property
     def targets(self) -> tuple[tuple[str, ...], ...]:
@@ -295,11 +286,11 @@ class Dataset:
 
     @cached_property
     def target_names(self) -> tuple[tuple[str, ...], ...]:
-        """Names of the columns set in each regime, then of the variables that are in no column."""
+        """Names of the columns set in each regime, then of the variables that have no column."""
         return tuple(
             (
                 *(column.name for column in self.columns if block(column) in regime.targets),
-                *(name for name in regime.targets if name not in self.variables),
+                *(name for name in regime.targets if name not in self.blocks),
             )
             for regime in self.regimes
         )
@@ -311,17 +302,24 @@ class Dataset:
 
     @cached_property
     def hidden_targets(self) -> Bools:
-        """The rows in which a variable that is in no column was set, shape (n,)."""
-        there = set(self.variables)
-        return np.array([not there.issuperset(r.targets) for r in self.regimes], bool)[self.regime]
+        """The rows in which a variable that has no column was set, shape (n,)."""
+        hidden = [not self.blocks.keys() >= {*r.targets} for r in self.regimes]
+        return np.array(hidden, dtype=bool)[self.regime]
+
+    @property
+    def is_temporal(self) -> bool:
+        """Whether an episode has several rows."""
+        return bool(len(self)) and len(np.unique(self.episode)) < len(self)
+
+    # --- the true graph -----------------------------------------------------------------------
 
     @cached_property
     def truth(self) -> GroundTruth | None:
         """The true graph over exactly these variables; None where it is not known.
 
-        What is not in the table is hidden: it confounds, and effects through it are direct ones.
-        Of rows that are episodes of a world, it is the graph from what they begin with to what they
-        end with. Of a table with ``lagged`` columns it is the graph among these.
+        Variables without a column are hidden: they confound, and effects through them are direct
+        ones. Where rows are episodes of a world, it is the graph from their beginning to their end.
+        Of a table with ``lagged`` columns it is the graph among these.
         """
         from scm_world.discovery.data.truth import truth_of
 
@@ -331,10 +329,10 @@ class Dataset:
         """Leave out of ``truth`` the edges whose condition held in none of the rows.
 
         Edges by contact stay where their bodies touched, directly or through others, in a control
-        step that led to a row; edges of what is set where a row can be one in which it was.
+        step that led to a row; edges of initialisation where a row can be a first one.
 
         Raises:
-            ModelError: The graph is not known, or the table does not say what touched.
+            ModelError: The graph is not known, or the table was collected without contacts.
         """
         from scm_world.discovery.data.truth import acting_edges
 
@@ -346,17 +344,17 @@ class Dataset:
         """In which share of the control steps behind the rows each pair of bodies touched.
 
         Raises:
-            ModelError: The table does not say what touched: it was collected without contacts.
+            ModelError: The table was collected without contacts.
         """
-        from scm_world.discovery.data.truth import steps_of
+        from scm_world.discovery.data.truth import touches
 
-        steps = [touch for part in steps_of(self) for touch in part.values()]
+        steps = [touch for part in touches(self) for touch in part]
         counts = Counter(pair for touch in steps for pair in touch)
         return {pair: counts[pair] / len(steps) for pair in sorted(counts)}
 
     @typed
     def adjacency(self, lag: int = 0) -> Bools:
-        """Give the true edges of a lag between columns, shape (p, p): row causes column.
+        """Return the true edges of a lag between columns, shape (p, p): row causes column.
 
         Raises:
             ModelError: The graph is not known.
@@ -366,12 +364,12 @@ class Dataset:
 
     @typed
     def weights(self, lag: int = 0) -> Floats:
-        """Give the weights of true edges between columns, shape (p, p): row causes column.
+        """Return the weights of true edges between columns, shape (p, p): row causes column.
 
         Zero where there is no edge (an edge can have weight zero, too: see ``adjacency``), NaN
         where a mechanism on the way is not linear. Vectors of one size act number by number.
-        What is hidden between the two counts; what is hidden and acts on both does not, so that
-        a regression gives another number for a confounded pair.
+        Hidden variables between the two count; those that act on both do not, so that a regression
+        gives another number for a confounded pair.
 
         Raises:
             ModelError: The graph is not known.
@@ -392,25 +390,10 @@ class Dataset:
             raise ModelError(["the table does not know its graph: it was not collected here"])
         return self.truth
 
-    @typed
-    def hide(self, names: Iterable[str]) -> Dataset:
-        """Leave out columns or variables; ``truth`` then has them as hidden causes.
-
-        Raises:
-            UnknownVariable: There is none of this name.
-        """
-        gone = {column.name for column in self.select(names).columns}
-        return self.select(name for name in self.names if name not in gone)
-
-    @property
-    def is_temporal(self) -> bool:
-        """Whether an episode has several rows."""
-        return bool(len(self)) and len(np.unique(self.episode)) < len(self)
-
     # --- other tables -------------------------------------------------------------------------
 
     def rows(self, chosen: Any) -> Dataset:
-        """Take some rows: a mask, numbers or a slice.
+        """Return some rows: a mask, numbers or a slice.
 
         Raises:
             UnknownOption: It is none of these, or too long.
@@ -420,17 +403,13 @@ class Dataset:
         except IndexError:
             allowed = (f"a mask of {len(self)} rows", "whole numbers of rows", "a slice")
             raise UnknownOption("rows", chosen, allowed) from None
-        return replace(
-            self,
-            values=self.values[taken],
-            regime=self.regime[taken],
-            episode=self.episode[taken],
-            step=self.step[taken],
-        )
+        parts = {
+            name: getattr(self, name)[taken] for name in ("values", "regime", "episode", "step")
+        }
+        return replace(self, **parts)
 
-    @typed
-    def select(self, names: Iterable[str]) -> Dataset:
-        """Take some columns or variables, in the order given."""
+    def _places(self, names: Iterable[str]) -> list[int]:
+        """Return the numbers of the columns of some names, of columns or of variables."""
         where: list[int] = []
         for name in names:
             if name in self.names:
@@ -439,23 +418,43 @@ class Dataset:
                 where += self.blocks[name].tolist()
             else:
                 raise UnknownVariable(name, (*self.names, *self.variables))
-        return replace(
-            self, values=self.values[:, where], columns=tuple(self.columns[i] for i in where)
-        )
+        return where
+
+    @typed
+    def select(self, names: Iterable[str]) -> Dataset:
+        """Return some columns or variables, in the order given; the others are hidden then.
+
+        Raises:
+            UnknownVariable: There is none of this name.
+        """
+        return self._of_columns(self._places(names))
+
+    @typed
+    def hide(self, names: Iterable[str]) -> Dataset:
+        """Leave out columns or variables; ``truth`` then has them as hidden causes.
+
+        Raises:
+            UnknownVariable: There is none of this name.
+        """
+        gone = {*self._places(names)}
+        return self._of_columns([i for i in range(len(self.columns)) if i not in gone])
+
+    def _of_columns(self, where: Sequence[int]) -> Dataset:
+        columns = tuple(self.columns[i] for i in where)
+        return replace(self, values=self.values[:, [*where]], columns=columns)
 
     @property
     def observational(self) -> Dataset:
-        """The rows in which nothing was done, to columns or to variables that are in none."""
+        """The rows without an intervention, on a column or on a variable that has none."""
         return self.rows(~self.intervened)
 
     @typed
     def first(self, episodes: int) -> Dataset:
-        """Take the rows of the first episodes, in their order."""
-        kept = np.unique(self.episode)[:episodes]
-        return self.rows(np.isin(self.episode, kept))
+        """Return the rows of the first episodes, in their order."""
+        return self.rows(np.isin(self.episode, np.unique(self.episode)[:episodes]))
 
     def standardised(self) -> Dataset:
-        """Give every column mean 0 and variance 1 over all rows; constant ones become 0."""
+        """Scale every column to mean 0 and variance 1 over all rows; constant ones become 0."""
         # In units of their own size, a power of two, so that no square overflows or vanishes.
         largest = np.abs(self.values).max(axis=0, initial=0.0)
         scaled = np.ldexp(self.values, -np.frexp(largest)[1])
@@ -469,8 +468,8 @@ class Dataset:
         """Put earlier control steps beside each row, as further columns ``name@-1``.
 
         Rows without enough past are left out; nothing is carried from one episode to the next.
-        What was set at an earlier step is a target at that step: ``x@-1``. The graph of the table
-        is that among its columns, all of them at lag 0.
+        A variable that was set at an earlier step is a target at that step: ``x@-1``. The graph of
+        the table is that among its columns, all of them at lag 0.
 
         Raises:
             ModelError: It has such columns already.
@@ -482,44 +481,35 @@ class Dataset:
         """
         whole_number("lags", lags, least=0)
         if any(column.lag for column in self.columns):
-            raise ModelError(
-                ["the table has earlier control steps already: take lagged(2) at once"]
-            )
-        rows = np.arange(len(self))
+            said = "the table has earlier control steps already: take lagged(2) at once"
+            raise ModelError([said])
+        back = range(lags + 1)
+        rows = np.arange(lags, len(self))
         whole = rows[
-            (rows >= lags)
-            & (self.episode[rows - lags] == self.episode[rows])
+            (self.episode[rows - lags] == self.episode[rows])
             & (self.step[rows] - self.step[rows - lags] == lags)
         ]
-        earlier = [
+        earlier = (
             replace(column, name=f"{column.name}@-{lag}", lag=lag)
-            for lag in range(1, lags + 1)
+            for lag in back[1:]
             for column in self.columns
-        ]
-        parts = [self.values[whole - lag] for lag in range(lags + 1)]
+        )
+        regimes: dict[Regime, int] = {}
         kinds, number = np.unique(
-            np.stack([self.regime[whole - lag] for lag in range(lags + 1)]),
-            axis=1,
-            return_inverse=True,
+            np.stack([self.regime[whole - lag] for lag in back]), axis=1, return_inverse=True
         )
-        names = (
-            {
-                f"{name}@-{lag}" if lag else name
-                for lag, k in enumerate(kind)
-                for name in self.regimes[k].targets
-            }
-            for kind in kinds.T.tolist()
-        )
-        regimes = (
-            replace(self.regimes[now], targets=tuple(sorted(targets)))
-            for now, targets in zip(kinds[0].tolist(), names, strict=True)
-        )
+        at = []
+        for kind in kinds.T.tolist():
+            done = zip(back, (self.regimes[k].targets for k in kind), strict=True)
+            targets = {f"{n}@-{lag}" if lag else n for lag, names in done for n in names}
+            made = replace(self.regimes[kind[0]], targets=tuple(sorted(targets)))
+            at.append(regimes.setdefault(made, len(regimes)))
         return replace(
             self.rows(whole),
-            values=np.concatenate(parts, axis=1),
+            values=np.concatenate([self.values[whole - lag] for lag in back], axis=1),
             columns=(*self.columns, *earlier),
             regimes=tuple(regimes),
-            regime=number.reshape(-1).astype(np.int64),
+            regime=np.array(at, dtype=np.int64)[number.reshape(-1)],
             about={**self.about, "lags": lags},
         )
 
@@ -539,91 +529,73 @@ class Dataset:
             if part.columns != first.columns or part.about != first.about:
                 raise ModelError(["tables with other columns or from elsewhere cannot be joined"])
         regimes: dict[Regime, int] = {}
-        numbers: list[Ints] = []
+        kinds: list[Ints] = []
         for part in parts:
             at = [regimes.setdefault(regime, len(regimes)) for regime in part.regimes]
-            numbers.append(np.array(at, dtype=np.int64)[part.regime])
+            kinds.append(np.array(at, dtype=np.int64)[part.regime])
         return replace(
             first,
-            values=np.concatenate([part.values for part in parts]),
             regimes=tuple(regimes),
-            regime=np.concatenate(numbers),
+            regime=np.concatenate(kinds),
+            values=np.concatenate([part.values for part in parts]),
             episode=np.concatenate([part.episode for part in parts]),
             step=np.concatenate([part.step for part in parts]),
         )
 
 
-KINDS = {
-    "M": ("dates", "give numbers, such as seconds since the first one"),
-    "m": ("durations", "give numbers, such as .dt.total_seconds()"),
-    "U": ("text", "give numbers, such as a code for each category, or pandas.to_numeric"),
-    "c": ("complex numbers", "give the real and the imaginary part as two columns"),
-}
-"""Of dtypes that are no real numbers: their name, and what to do."""
-
-
 def numbers(values: Any, names: Sequence[str]) -> Floats:
-    """Read columns of real numbers, shape (n, p).
+    """Return columns of real numbers, shape (n, p).
 
     Args:
         values: Shape (n, p), or a data frame or mapping that has columns of these names.
-        names: Of the columns.
+        names: Names of the columns.
 
     Raises:
-        ModelError: A column holds something else than numbers, a name is no text or occurs twice,
-            or there is another number of columns.
+        ModelError: A column holds something else than numbers, a name is not a text or occurs
+            twice, or there is another number of columns.
         UnknownVariable: The frame has no such column.
     """
+    import pandas
+
     if not isinstance(names, Iterable):
         raise UnknownOption("names", names, ("a list of the names of the columns",))
-    labels = tuple(names)
+    labels = [*names]
     advice = "names of columns are text: frame.rename(columns=str), and in the targets, too"
-    wrong = [
-        f"a column is named {name!r}; {advice}" for name in labels if not isinstance(name, str)
-    ]
-    columns: list[Any]
-    if isinstance(values, Mapping) or hasattr(values, "columns"):
-        there = list(values if isinstance(values, Mapping) else values.columns)
-        twice = sorted({name for name in map(str, there) if there.count(name) > 1} & {*labels})
-        wrong += [f"two columns are named {name!r}" for name in twice]
-        if wrong:
-            raise ModelError(wrong)
-        for name in labels:
-            if name not in there:
-                raise UnknownVariable(name, map(str, there))
-        columns = [np.asarray(values[name]) for name in labels]
-    else:
-        table = values if isinstance(values, np.ndarray) else np.array(values, dtype=object)
-        if table.ndim != 2 or table.shape[1] != len(labels):
-            wrong.append(f"values have shape {table.shape}, of {len(labels)} columns")
-        if wrong:
-            raise ModelError(wrong)
-        columns = [*table.T]
-    made = []
-    for name, column in zip(labels, columns, strict=True):
-        array = column
-        if array.dtype.kind == "O":  # numbers of Python are numbers
-            with suppress(ValueError):
-                array = np.array(column.tolist())
-        if array.ndim != 1 or array.dtype.kind not in "biuf":
-            first = type(next(iter(np.atleast_1d(array).tolist()), None)).__name__
-            other = f"values of type {first}", "give one number in each row"
-            what, advice = KINDS.get(array.dtype.kind, other)
-            wrong.append(f"the column {name!r} holds {what}, not real numbers: {advice}")
-        made.append(array)
+    wrong = [f"a column is named {n!r}; {advice}" for n in labels if not isinstance(n, str)]
     if wrong:
         raise ModelError(wrong)
-    if len({len(array) for array in made}) > 1:
-        raise ModelError([f"the columns have {[len(array) for array in made]} rows"])
-    return np.stack(made, axis=1).astype(np.float64) if made else np.empty((len(values), 0))
+    try:
+        named = isinstance(values, pandas.DataFrame | Mapping)
+        frame = pandas.DataFrame(values, columns=None if named else labels)
+    except (TypeError, ValueError) as error:
+        raise ModelError(
+            [f"the values are not a table of {len(labels)} columns: {error}"]
+        ) from None
+    for name in labels:
+        if name not in frame:
+            raise UnknownVariable(name, map(str, frame))
+    frame = frame[labels].infer_objects()
+    if not frame.columns.is_unique:
+        raise ModelError([f"two of the columns {', '.join(map(str, frame))} have one name"])
+    for name in labels:
+        kind = pandas.api.types.infer_dtype(frame[name])
+        if kind not in ("floating", "integer", "boolean", "mixed-integer-float", "empty"):
+            advice = "give one real number in each row, such as seconds or a code"
+            wrong.append(f"the column {name!r} holds {kind}, not real numbers: {advice}")
+    if wrong:
+        raise ModelError(wrong)
+    return frame.to_numpy(dtype=np.float64, na_value=np.nan)
+
+
+def check_names(columns: Iterable[Column]) -> None:
+    """Refuse columns that are named like the further ones of frames and files."""
+    taken = [column.name for column in columns if column.name in RESERVED]
+    if taken:
+        raise ModelError([f"a column cannot be named {name!r} in a file" for name in taken])
 
 
 def whole_numbers(name: str, values: Any) -> Ints:
-    """Read the whole numbers of a column, shape (n,).
-
-    Raises:
-        ModelError: It holds something else.
-    """
+    """Return the whole numbers of a column, shape (n,), or raise a ``ModelError``."""
     found = np.asarray(values)
     whole = found.dtype.kind in "iu"
     if found.dtype.kind == "f":
@@ -634,7 +606,7 @@ def whole_numbers(name: str, values: Any) -> Ints:
 
 
 def _disorder(episode: Ints, step: Ints) -> list[str]:
-    """Say where rows of one episode do not stand together, with rising steps.
+    """Name the first row that does not stand with its episode, at a later step.
 
     Example:
         >>> _disorder(np.array([4, 4, 7]), np.array([0, 1, 0]))
@@ -642,20 +614,19 @@ def _disorder(episode: Ints, step: Ints) -> list[str]:
         >>> _disorder(np.array([4, 4, 7]), np.array([1, 0, 0]))[0]
         'the rows of episode 4 do not stand together in time: sort the rows by episode and step'
     """
-    starts = np.flatnonzero(np.diff(episode, prepend=episode[:1] - 1))
-    _, begun = np.unique(episode[starts], return_index=True)
-    again = np.delete(starts, begun)
+    begins = np.flatnonzero(np.diff(episode, prepend=episode[:1] - 1))
+    _, first = np.unique(episode[begins], return_index=True)
     back = np.flatnonzero((np.diff(episode) == 0) & (np.diff(step) <= 0)) + 1
-    if not again.size and not back.size:
+    wrong = [*np.delete(begins, first), *back]
+    if not wrong:
         return []
-    pairs, times = np.unique(np.stack([episode, step]), axis=1, return_counts=True)
-    if times.max() > 1:
-        number, instant = pairs[:, times.argmax()]
+    row = min(wrong)
+    number, instant = episode[row], step[row]
+    if ((episode[:row] == number) & (step[:row] == instant)).any():
         return [
             f"two rows are step {instant} of episode {number}: if two tables have the same episode "
             "numbers, give one of them others; if not, give each row of an episode its own step"
         ]
-    number = episode[min([*again, *back])]
     return [
         f"the rows of episode {number} do not stand together in time: sort the rows by episode "
         "and step"
@@ -663,27 +634,8 @@ def _disorder(episode: Ints, step: Ints) -> list[str]:
 
 
 def block(column: Column) -> str:
-    """Name the variable of a column, with ``@-1`` for an earlier instant."""
+    """Return the name of the variable of a column, with ``@-1`` for an earlier instant."""
     return f"{column.variable}@-{column.lag}" if column.lag else column.variable
-
-
-def columns_of(variable: Any, how: str = "value") -> tuple[Column, ...]:
-    """List the columns that the numbers of a ``Variable`` fill."""
-    size = int(np.prod(variable.shape))
-    scalar = variable.shape == ()
-    return tuple(
-        Column(
-            variable.name if scalar else f"{variable.name}[{i}]",
-            variable.name,
-            None if scalar else i,
-            variable.unit,
-            variable.kind,
-            str(variable.role),
-            variable.dtype,
-            how=how,
-        )
-        for i in range(size)
-    )
 
 
 Level = Literal["variable", "component"]

@@ -1,13 +1,16 @@
-"""What is written down of the episodes of a world: which columns, and how they are read."""
+"""The columns of a table: which variables of a system it has, and under which names."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from typing import Any
+
+import numpy as np
 
 from scm_world._arguments import typed
-from scm_world.discovery.data.dataset import Column, columns_of
+from scm_world.discovery.data.dataset import Column
 from scm_world.errors import UnknownOption, UnknownVariable
 from scm_world.graph import SCM
 from scm_world.queries.equations import Equations, System
@@ -19,7 +22,7 @@ from scm_world.variables.reserved import ACTUATOR_NOISE, PRESET, SENSOR_NOISE
 from scm_world.world import Simulation
 
 NO_CAUSES = ("camera_*", "light_*", "*color", SENSOR_NOISE, ACTUATOR_NOISE, PRESET)
-"""What looks, or disturbs the measurement, but moves nothing; patterns of names."""
+"""Patterns of parameters that move nothing: looks, and disturbances of the measurement."""
 
 
 @typed
@@ -27,7 +30,7 @@ def default_causes(world: System | SCM) -> tuple[str, ...]:
     """List the parameters that an experiment varies, if nothing else is asked for.
 
     They are exogenous and real, can be set, have a space A, and are physical: no cameras, lights,
-    noises or settings of the engine, and nothing that decides which bodies there are. The
+    noises or settings of the backend, and nothing that decides which bodies there are. The
     colors of the blocks that can be moved are among them: they cause nothing.
 
     Example:
@@ -57,13 +60,9 @@ def default_causes(world: System | SCM) -> tuple[str, ...]:
 def default_outcomes(world: System, *, every_step: bool = False) -> tuple[Outcome, ...]:
     """List what is measured, if nothing else is asked for.
 
-    Of the robot's tasks these are the blocks that move, and success; of any other world all
-    states, and what counts in it; of equations all variables but actions.
-
-    Args:
-        world: That is measured.
-        every_step: Whether it is measured at every instant; then the joints are listed, too, since
-            the robot is what moves the blocks.
+    For the robot's tasks these are the blocks that move, and success, with ``every_step`` also the
+    joints, since the robot moves the blocks; for any other world all states, reward and success;
+    for equations all variables but actions.
     """
     if isinstance(world, Equations):
         return tuple(map(Outcome, usual_outcomes(world)))
@@ -96,17 +95,13 @@ def settable(world: System | SCM, patterns: Iterable[str]) -> tuple[str, ...]:
     return tuple(name for name in names if _is_like(name, given))
 
 
-# --- columns ----------------------------------------------------------------------------------
-
-
-def labelled(columns: Iterable[Column], label: str) -> tuple[Column, ...]:
-    """Put a word before the names of columns and of the variable they belong to."""
-    lead = f"{label} " if label else ""
-    return tuple(replace(c, name=lead + c.name, variable=lead + c.variable) for c in columns)
+def is_state(model: SCM, name: str) -> bool:
+    """Return whether a variable, or what it gives the coordinates of, is moved by physics."""
+    return model.declared(model.target(name)).role == "state"
 
 
 def first_name(model: SCM, name: str) -> str:
-    """Name the beginning of a variable: of a state it is not what its end is.
+    """Return the name of the beginning of a variable; that of a state differs from its end.
 
     Example:
         >>> from scm_world.queries import World
@@ -117,52 +112,53 @@ def first_name(model: SCM, name: str) -> str:
     return f"first {name}" if is_state(model, name) else name
 
 
-def is_state(model: SCM, name: str) -> bool:
-    """Tell whether a variable, or what it gives the coordinates of, is moved by physics."""
-    return model.declared(model.target(name)).role == "state"
-
-
 def reached(
     model: SCM, names: Iterable[str], columns: Iterable[Column], *, first: bool = False
 ) -> tuple[str, ...]:
-    """Name the variables that interventions set.
+    """Return the names of the variables that interventions set.
 
-    With coordinates the quantity is set, too. It is named where it has a column; otherwise the
-    coordinates stand for it.
+    Coordinates that are set are a target, and so is the quantity that they describe, if it has a
+    column.
 
     Args:
-        model: Of the system.
+        model: The causal model of the system.
         names: The targets of the interventions.
-        columns: Of a row.
+        columns: The columns of a row.
         first: Whether a row has the beginning of a state under a name of its own.
     """
-
-    def named(name: str) -> str:
-        return first_name(model, name) if first else name
-
     given, shown = tuple(names), {column.variable for column in columns}
-    whole = (target for name in given for target in model.targets(name) if named(target) in shown)
-    return tuple(named(name) for name in sorted({*given, *whole}))
+    named = {n: first_name(model, n) if first else n for g in given for n in (g, *model.targets(g))}
+    whole = (target for name in given for target in model.targets(name) if named[target] in shown)
+    return tuple(named[name] for name in sorted({*given, *whole}))
+
+
+def columns_of(variable: Any, how: str = "value", label: str = "") -> tuple[Column, ...]:
+    """Return the columns of a variable, with a word before their names if one is given."""
+    name = f"{label} {variable.name}" if label else variable.name
+    about = variable.unit, variable.kind, str(variable.role), variable.dtype
+    if variable.shape == ():
+        return (Column(name, name, None, *about, how=how),)
+    numbers = range(int(np.prod(variable.shape)))
+    return tuple(Column(f"{name}[{i}]", name, i, *about, how=how) for i in numbers)
 
 
 def columns_of_outcome(variable: Variable, outcome: Outcome) -> tuple[Column, ...]:
-    """List the columns of an outcome; its final value has the plain name of the variable.
+    """Return the columns of an outcome; its final value has the plain name of the variable.
+
+    Raises:
+        UnknownOption: There is no such component.
 
     Example:
         >>> from scm_world.variables import Measured
         >>> speed = Measured(name="speed", unit="m/s", shape=(3,))
         >>> [c.name for c in columns_of_outcome(speed, Outcome("speed", "mean", 1))]
         ['mean speed[1]']
-
-    Raises:
-        UnknownOption: There is no such component.
     """
-    whole = columns_of(variable, outcome.how)
-    if outcome.component is not None and not 0 <= outcome.component < len(whole):
-        allowed = (f"0 to {len(whole) - 1}",)
-        raise UnknownOption(f"component of {outcome.name}", outcome.component, allowed)
-    chosen = whole if outcome.component is None else (whole[outcome.component],)
-    if outcome.how == "mean":
-        chosen = tuple(replace(c, dtype="real") for c in chosen)
-    plain = Outcome(outcome.name, outcome.how)
-    return labelled(chosen, column(plain).removesuffix(outcome.name).strip())
+    label = column(Outcome(outcome.name, outcome.how)).removesuffix(outcome.name).strip()
+    found = columns_of(variable, outcome.how, label)
+    if outcome.component is not None:
+        if not 0 <= outcome.component < len(found):
+            allowed = (f"0 to {len(found) - 1}",)
+            raise UnknownOption(f"component of {outcome.name}", outcome.component, allowed)
+        found = (found[outcome.component],)
+    return tuple(replace(c, dtype="real") for c in found) if outcome.how == "mean" else found

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import copy
-import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._arguments import typed, whole_number
-from scm_world._fingerprint import changes, fingerprint
+from scm_world._fingerprint import fingerprint
 from scm_world.discovery.data.pictures import ENDINGS, Pictures, Row
-from scm_world.errors import UnknownOption, UnreadableFile
-from scm_world.output.durable import made, write_durably
-from scm_world.output.remote import Location, located
+from scm_world.errors import UnknownOption
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
+from scm_world.runs.files import Location, located
+from scm_world.runs.pool import Pool, pool_of
+from scm_world.runs.study import Study
 from scm_world.variables import Draw, Noise
-from scm_world.work.executors import Executor, opened
 from scm_world.world import Simulation
-
-FORMAT = "scm_world/triplets/2"
-HEAD = "triplets.json"
 
 
 @typed
@@ -41,7 +38,7 @@ def triplets(
     shard: int = 1000,
     format: str = "parquet",  # noqa: A002 # as other libraries call it
     workers: int | None = None,
-    engine: Executor | str | None = None,
+    engine: Pool | str | None = None,
     progress: Progress | None = None,
 ) -> Location:
     """Write pictures x of a scene and x̃ of its counterfactual, with factors z and z̃ and targets.
@@ -57,19 +54,19 @@ def triplets(
     Args:
         world: That is drawn; it is not changed.
         factors: Names of variables with a space A.
-        n: How many pairs.
+        n: Number of pairs.
         out: A folder, or a URL: new, empty, or one of the same call.
         cameras: Names of cameras, of the robot or of the model; None is the usual one. Each has two
             columns.
         size: Height and width of a picture [pixels].
-        targets: How many factors are drawn again in each pair, by lot.
+        targets: How many factors are drawn again in each pair, chosen at random.
         steps: Control steps after which the pictures are taken.
-        seed: Of the noise.
+        seed: Seed of the noise.
         shard: How many pairs are in a file.
-        format: Of the files: ``"parquet"``, as ``datasets.load_dataset("parquet", …)`` of Hugging
-            Face reads it, or ``"webdataset"``, tar files.
+        format: ``"parquet"``, as ``datasets.load_dataset("parquet", …)`` of Hugging Face reads it,
+            or ``"webdataset"``, tar files.
         workers: Processes; None is one. The files do not depend on it.
-        engine: See ``engine_of``.
+        engine: See ``collect``.
         progress: Called with (finished, planned) pairs after each file.
 
     Returns:
@@ -96,13 +93,15 @@ def triplets(
     if many > len(names):
         raise UnknownOption("targets", targets, (f"1 to {len(names)}, the number of factors",))
     taken = Pictures(tuple(cameras), size, format=format)
-    maker = _Pairs(world, names, taken, many, whole_number("steps", steps, least=0), seed)
     count, each = whole_number("n", n, least=1), whole_number("shard", shard, least=1)
+    after = whole_number("steps", steps, least=0)
+    pairs = _Pairs(copy.deepcopy(world), names, taken, many, after, seed)
+    pairs(range(1))  # what cannot be done is refused before there is anything
     about = {
         "task": world.task.name,
         "backend": world.backend.name,
         "fingerprint": fingerprint(world),
-        "given": maker.given,
+        "given": getattr(world, "plan", Plan()).as_dict()["do"],
         "factors": list(names),
         **asdict(taken),
         "targets": many,
@@ -112,82 +111,55 @@ def triplets(
         "shard": each,
         "versions": versions(world.engine),
     }
-    starts = range(0, count, each)
+    starts, end = range(0, count, each), ENDINGS[format]
     files = {
-        f"triplets-{place:05d}-of-{len(starts):05d}.{ENDINGS[format]}": range(
-            start, min(start + each, count)
-        )
-        for place, start in enumerate(starts)
+        f"triplets-{i:05d}-of-{len(starts):05d}.{end}": range(start, min(start + each, count))
+        for i, start in enumerate(starts)
     }
-    folder, said = located(out), {"format": FORMAT, **json.loads(json.dumps(about))}
-    if (folder / HEAD).exists():
-        other = changes(json.loads((folder / HEAD).read_text()), said)
-        if other:
-            advice = "give the same system, arguments and versions, or another folder"
-            reason = f"it is of another call: {', '.join(other)} differ"
-            raise UnreadableFile(str(folder / HEAD), reason, advice)
-    elif folder.exists() and any(True for _ in folder.iterdir()):
-        raise UnreadableFile(str(folder), "it is not empty", "give a new folder")
-    else:
-        maker()(range(1))  # what cannot be done is refused before there is anything
-        made(folder)
-        write_durably(folder / HEAD, (json.dumps(said, indent=1) + "\n").encode())
-    missing = [name for name in files if not (folder / name).exists()]
-    done = count - sum(len(files[name]) for name in missing)
-    with opened(engine, 1 if workers is None and engine is None else workers) as executor:
-        executor.check("world of pictures", world)
-        for place, data in executor.run(maker, [files[name] for name in missing]):
-            write_durably(folder / missing[place], data)
-            done += len(files[missing[place]])
+    done = 0
+    with Study(out, "triplets", about) as study, pool_of(engine, workers) as pool:
+        for name, _ in study.map(files, pairs, read=bytes, write=bytes, pool=pool):
+            done += len(files[name])
             if progress is not None:
                 progress(done, count)
-    return folder
+    return located(out)
 
 
 @final
 @dataclass(frozen=True)
 class _Pairs:
-    """Makes files of pairs; called in each worker, it gives what does so."""
+    """Makes files of pairs, in a world of its own."""
 
-    world: Simulation
+    world: Any
     factors: tuple[str, ...]
     taken: Pictures
     targets: int
     steps: int
     seed: int
 
-    def __call__(self) -> Callable[[range], bytes]:
-        """Give the function from numbers of pairs to a file."""
-        twin = copy.deepcopy(self.world)
+    def __call__(self, numbers: range) -> bytes:
+        """Return the file of some pairs."""
+        rows = [self._pair(number) for number in numbers]
+        return self.taken.encoded(rows, [f"{number:08d}" for number in numbers])
 
-        def file(numbers: range) -> bytes:
-            rows = [self._pair(twin, number) for number in numbers]
-            return self.taken.encoded(rows, [f"{number:08d}" for number in numbers])
-
-        return file
-
-    @property
-    def given(self) -> Any:
-        """What the world was given, as plain data."""
-        plan = getattr(self.world, "plan", None)
-        return {} if plan is None else plan.as_dict()["do"]
-
-    def _pair(self, world: Any, number: int) -> Row:
+    def _pair(self, number: int) -> Row:
+        world = self.world
         order = Noise(self.seed).uniforms("targets of pairs", n=len(self.factors), episode=number)
         targets = [self.factors[i] for i in sorted(np.argsort(order[0])[: self.targets].tolist())]
         follow = getattr(world, "plan", ())
         drawn = {name: Draw("A") for name in self.factors if name not in follow}
         row: Row = {"pair": number, "targets": targets}
         world.reset(seed=self.seed, episode=number, do=drawn)
-        self._look(world, "", row)
+        self._look("", row)
         if self.steps:
             world.reset(seed=self.seed, episode=number, do=drawn)
         world.do({name: Draw("A") for name in targets})
-        self._look(world, "_counterfactual", row)
+        self._look("_counterfactual", row)
         return row
 
-    def _look(self, world: Any, which: str, row: Row) -> None:
-        """Take the pictures, and write down the factors at the beginning."""
+    def _look(self, which: str, row: Row) -> None:
+        """Add the factors at the beginning, and the pictures."""
+        world = self.world
         now = world.evaluate(self.factors)
         for name in self.factors:
             row[f"z{which}.{name}"] = np.ravel(now[name]).astype(float).tolist()

@@ -40,15 +40,15 @@ class GroundTruth:
     """A true graph: directed edges, and pairs that hidden variables confound (an ADMG).
 
     Attributes:
-        name: Of the problem.
-        names: Of its variables, in order.
+        name: Name of the problem.
+        names: Its variables, in order.
         edges: Cause, effect and lag [control steps].
         confounded: Pairs with a hidden common cause.
-        weights: Of edges whose mechanisms are linear: by how much the effect moves with the cause
-            while all else in the table is held. Of a confounded pair too, where no regression of
+        weights: How much an effect moves with its cause while all else in the table is held, for
+            edges whose mechanisms are linear; also for a confounded pair, where no regression of
             these rows would give it.
         unscored: Pairs that are not scored, in either direction and with any lag.
-        about: What else a reader of the results should know.
+        about: Further properties of the problem, for readers of results.
         when: The edges that do not always hold, by condition: ``"contact"`` while bodies touch,
             ``"set"`` at the start of an episode and at the instant of an intervention.
         unseen: Edges whose effect a verification never saw; they are not scored.
@@ -81,41 +81,17 @@ class GroundTruth:
         never = set(verification.never_fired)
         return replace(self, unseen=tuple(edge for edge in self.edges if edge in never))
 
-    def for_rows(self, table: Dataset) -> GroundTruth:
-        """Leave out the edges whose condition held in no row of a table; see ``Dataset.acting``.
-
-        Raises:
-            ModelError: The table has other variables, or does not say what touched.
-        """
-        acting = table.acting().truth
-        if acting is None or set(acting.names) != set(self.names):
-            raise ModelError([f"the table has other variables than the graph of {self.name!r}"])
-        edges, pairs = set(acting.edges), set(acting.confounded)
-        kept = {k: tuple(e for e in found if e in edges) for k, found in self.when.items()}
-        return replace(
-            self,
-            edges=tuple(edge for edge in self.edges if edge in edges),
-            confounded=tuple(pair for pair in self.confounded if pair in pairs),
-            weights={edge: weight for edge, weight in self.weights.items() if edge in edges},
-            when={condition: found for condition, found in kept.items() if found},
-            unseen=tuple(edge for edge in self.unseen if edge in edges),
-        )
-
     def adjacency(self, lag: int = 0) -> NDArray[np.bool_]:
-        """Give the edges of a lag, shape (p, p): row causes column."""
-        at = {name: i for i, name in enumerate(self.names)}
-        found = np.zeros((len(at), len(at)), dtype=bool)
-        for cause, effect, steps in self.edges:
-            if steps == lag:
-                found[at[cause], at[effect]] = True
-        return found
+        """Return the edges of a lag, shape (p, p): row causes column."""
+        edges, _ = self._matrices()
+        return edges[lag] if lag < len(edges) else np.zeros_like(edges[0])
 
     def mag(self, lags: int | None = None) -> Marks:
-        """Give the maximal ancestral graph: edge marks, without circles.
+        """Return the maximal ancestral graph: edge marks, without circles.
 
         Args:
             lags: How many control steps before the present are observed; the longest lag of the
-                graph if None. All that was before is hidden.
+                graph if None. All earlier ones are hidden.
 
         Returns:
             Shape (lags + 1, p, p): at [lag, i, j] the mark at i, so many steps before j; see
@@ -127,7 +103,7 @@ class GroundTruth:
         return last_slice(*self._window(lags))
 
     def pag(self, lags: int | None = None) -> Marks:
-        """Give the partial ancestral graph: the marks that can be learned without interventions.
+        """Return the partial ancestral graph: the marks that can be learned without interventions.
 
         The order of control steps is taken for known. Arguments and result are those of ``mag``.
 
@@ -161,7 +137,7 @@ class GroundTruth:
 
 
 def truth_of_model(model: SCM) -> dict[str, Any]:
-    """Write the graph of a model as plain data: edges with weights, and what has noise."""
+    """Return the graph of a model as plain data: edges with weights, and variables with noise."""
     edges = []
     for variable in model.variables:
         mechanism = variable.mechanism if isinstance(variable, Derived) else None
@@ -189,13 +165,13 @@ def truth_of_model(model: SCM) -> dict[str, Any]:
 def truth_of_steps(
     model: SCM, names: Iterable[str], bundles: Mapping[str, Any], terms: Mapping[str, Any] = {}
 ) -> dict[str, Any]:
-    """Write the graph of one control step of a world, over some of its variables.
+    """Return the graph of one control step of a world, over some of its variables.
 
     Args:
-        model: Of the world.
-        names: What is in a row.
+        model: The causal model of the world.
+        names: The variables of a row.
         bundles: The parts of each bundle.
-        terms: Of ``contact_terms``, where contacts are recorded.
+        terms: The ``contact_terms`` of the world, where contacts are recorded.
     """
     known = set(names)
     whole = {part: n for n, parts in bundles.items() if n in known for part in parts}
@@ -213,7 +189,7 @@ def truth_of_steps(
 
 
 def _renamed(terms: Mapping[str, Any], names: Iterable[tuple[str, str]]) -> dict[str, Any]:
-    """Write the terms of contacts for the names in a table."""
+    """Return the terms of contacts for the names in a table."""
     of: dict[str, set[str]] = {}
     for old, new in names if terms else ():
         of.setdefault(new, set()).update(terms["of"][old])
@@ -229,20 +205,20 @@ def truth_of_episodes(
     labels: Mapping[Outcome, str],
     terms: Mapping[str, Any] = {},
 ) -> dict[str, Any]:
-    """Write the graph of whole episodes: what they begin with, and what they end with.
+    """Return the graph of whole episodes, from their beginning to their outcomes.
 
-    Outcomes are effects of what episodes begin with. Among one another they are not scored.
+    Outcomes are effects of the causes. Among one another they are not scored.
 
     Args:
-        model: Of the world.
-        nature: What varies at the beginning.
-        causes: What is in a row of the beginning.
-        outcomes: What is in a row besides.
+        model: The causal model of the world.
+        nature: The interventions of the context distribution.
+        causes: Variables that have a column for their beginning.
+        outcomes: Summaries of an episode that have a column.
         labels: Name of each outcome in the table.
-        terms: Of ``contact_terms``, where contacts are recorded.
+        terms: The ``contact_terms`` of the world, where contacts are recorded.
 
     Raises:
-        ModelError: Nature does something later than at the beginning.
+        ModelError: The context changes later than at the beginning.
     """
     names = [outcome.name for outcome in outcomes]
     graph, apart = (nature_graph(model, nature, names, contact=each) for each in (True, False))
@@ -269,7 +245,7 @@ def truth_of_episodes(
 
 
 def projected(graph: nx.DiGraph, kept: Collection[str]) -> list[tuple[str, str]]:
-    """Leave out nodes that follow from others without noise: their causes act in their place."""
+    """Return the edges among some nodes; the others follow from them without noise."""
     found = set()
     for cause in kept:
         ahead = [cause] if cause in graph else []
@@ -291,8 +267,8 @@ def observed_part(name: str, written: Mapping[str, Any], names: Sequence[str]) -
     across control steps, a variable with itself among them.
 
     Args:
-        name: Of the system.
-        written: The graph, as one of the functions above wrote it.
+        name: Name of the system.
+        written: The graph, as one of the functions above returns it.
         names: The variables of the table.
 
     Source:
@@ -347,7 +323,7 @@ def observed_part(name: str, written: Mapping[str, Any], names: Sequence[str]) -
 
 
 def truth_of(table: Dataset) -> GroundTruth | None:
-    """Project the graph that a table carries on its columns; None where it carries none."""
+    """Return the graph that a table carries, projected on its columns; None without one."""
     written, system = table.about.get("truth"), str(table.about.get("system", "table"))
     if written is None:
         return None
@@ -359,9 +335,9 @@ def truth_of(table: Dataset) -> GroundTruth | None:
 
 
 def _unrolled(truth: GroundTruth, lags: int) -> dict[str, Any]:
-    """Write a graph through time as one of an instant, over columns of several control steps.
+    """Return a graph through time as one of an instant, over columns of several control steps.
 
-    What was before the first of them is hidden, and confounds.
+    Everything before the first of them is hidden, and confounds.
     """
 
     def at(name: str, lag: int) -> str:
@@ -394,14 +370,14 @@ Touch = frozenset[tuple[str, str]]
 """Pairs of bodies that touch."""
 
 
-def steps_of(table: Dataset) -> Iterator[dict[int, Touch]]:
-    """Give what touched in the control steps that lie behind the rows of each episode.
+def touches(table: Dataset) -> Iterator[list[Touch]]:
+    """Yield which bodies touched in the control steps behind the rows of each episode.
 
-    Behind a row lies the control step that led to it; behind one of ``lagged`` columns that
-    many, and behind one that is an episode all.
+    Behind a row is the control step that led to it; behind one of ``lagged`` columns that many, and
+    behind one that is an episode all.
 
     Raises:
-        ModelError: The table does not say.
+        ModelError: The table was collected without contacts.
     """
     record = table.about.get("touching")
     if record is None:
@@ -413,36 +389,31 @@ def steps_of(table: Dataset) -> Iterator[dict[int, Touch]]:
         steps = [frozenset(pairs[i] for i in which) for n, which in given["runs"] for _ in range(n)]
         rows = table.step[table.episode == episode].tolist()
         behind = {i for row in rows for i in range(max(row - lags, 0), row)}
-        yield {i: steps[i] for i in (range(len(steps)) if record["whole"] else sorted(behind))}
+        yield steps if record["whole"] else [steps[i] for i in sorted(behind)]
 
 
 def acting_edges(table: Dataset) -> list[list[Any]]:
-    """List the edges whose condition held in a row at least, as they are written.
+    """Return the edges, as plain data, whose condition held in a row at least.
 
     Raises:
-        ModelError: The table carries no graph, or does not say what touched.
+        ModelError: The table carries no graph, or was collected without contacts.
     """
     written = table.about.get("truth")
     if written is None:
         raise ModelError(["the table does not know its graph: it was not collected here"])
-    places = {"contact": list[int](), "set": list[int]()}
-    for place, (*_, when) in enumerate(written["edges"]):
-        if when in places:
-            places[when].append(place)
-    missing = set(places["contact"])
-    if missing:
-        parts = [*steps_of(table)]
-        whole = table.about["touching"]["whole"]
-        seen = (
-            {frozenset[tuple[str, str]]().union(*part.values()) for part in parts}
-            if whole
-            else {touch for part in parts for touch in part.values()}
-        )
+    edges, missing = written["edges"], set[int]()
+    by_contact = {i for i, (*_, when) in enumerate(edges) if when == "contact"}
+    if by_contact:
+        seen = set[Touch]()
+        for steps in touches(table):
+            whole = table.about["touching"]["whole"]
+            seen.update([frozenset[tuple[str, str]]().union(*steps)] if whole else steps)
         for touch in sorted(seen, key=sorted):
             acts = holds(written["contact"], touch)
-            missing -= {i for i in missing if acts(*written["edges"][i][:2])}
+            by_contact -= {i for i in by_contact if acts(*edges[i][:2])}
+        missing |= by_contact
     first = int(table.step.min(initial=1)) - table.about.get("lags", 0)
     later = any(len(regime.plan.at_start()) < len(regime.plan) for regime in table.regimes)
     if first > 0 and not later:  # nothing is set in these rows
-        missing |= set(places["set"])
-    return [edge for i, edge in enumerate(written["edges"]) if i not in missing]
+        missing |= {i for i, (*_, when) in enumerate(edges) if when == "set"}
+    return [edge for i, edge in enumerate(edges) if i not in missing]

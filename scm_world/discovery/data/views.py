@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Container, Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,15 +13,17 @@ import numpy as np
 from scm_world._arguments import load, typed
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import (
+    NUMBERS,
+    TARGETS,
     Bools,
     Column,
     Dataset,
     Ints,
     Regime,
+    check_names,
     numbers,
     whole_numbers,
 )
-from scm_world.discovery.data.shards import NUMBERS, TARGETS, check_names
 from scm_world.errors import ModelError, UnknownOption
 
 KEY = "scm_world"
@@ -29,17 +31,17 @@ KEY = "scm_world"
 
 @typed
 def as_gies(dataset: Dataset) -> tuple[list[Floats], list[list[int]]]:
-    """Give a dataset the way ``gies.fit_bic(data, I)`` takes it.
+    """Return a dataset as ``gies.fit_bic(data, I)`` takes it.
 
     GIES takes every column that is not a target for one with its own mechanism. So rows in which a
-    variable was set that is in no column are left out.
+    variable was set that has no column are left out.
 
     Returns:
         For each set of targets its rows, shape (n_k, p), and the numbers of the columns that were
         intervened on, in the order in which they first occur. Of a vector all columns are.
 
     Raises:
-        ModelError: In every row a variable was set that is in no column.
+        ModelError: In every row a variable was set that has no column.
 
     Example:
         >>> table = Dataset.of([[0.0], [1.0], [2.0]], ["x"], targets=[(), ("x",), ()])
@@ -48,9 +50,7 @@ def as_gies(dataset: Dataset) -> tuple[list[Floats], list[list[int]]]:
         ([[[0.0], [2.0]], [[1.0]]], [[], [0]])
     """
     if len(dataset) and dataset.hidden_targets.all():
-        raise ModelError(
-            ["in every row a variable was set that is in no column: GIES needs others"]
-        )
+        raise ModelError(["in every row a variable was set that has no column: GIES needs others"])
     known = dataset.rows(~dataset.hidden_targets)
     kind = _target_sets(known)
     groups = [np.flatnonzero(kind == number) for number in range(kind.max(initial=-1) + 1)]
@@ -58,11 +58,9 @@ def as_gies(dataset: Dataset) -> tuple[list[Floats], list[list[int]]]:
     return [known.values[rows] for rows in groups], targets
 
 
-def _target_sets(dataset: Dataset, *, observational_first: bool = False) -> Ints:
+def _target_sets(dataset: Dataset, first: Sequence[tuple[str, ...]] = ()) -> Ints:
     """Number the sets of targets of the rows, hidden ones among them, in order; shape (n,)."""
-    names, number = dataset.target_names, dict[tuple[str, ...], int]()
-    if observational_first:
-        number[()] = 0
+    names, number = dataset.target_names, {targets: i for i, targets in enumerate(first)}
     kinds = (number.setdefault(names[kind], len(number)) for kind in dataset.regime.tolist())
     return np.fromiter(kinds, np.int64, len(dataset))
 
@@ -72,12 +70,12 @@ class Arrays(NamedTuple):
 
     Attributes:
         values: Shape (n, p).
-        targeted: What was intervened on, shape (n, p).
-        soft: What of it still follows its causes, shape (n, p).
+        targeted: The numbers that were intervened on, shape (n, p).
+        soft: Those of them that still follow their causes, shape (n, p).
         regime: Number of the regime of each row, shape (n,).
         adjacency: The true edges of lag 0, row causes column, shape (p, p); None if not known.
-        observational: Rows in which nothing was done, shape (n,). In a row without ``targeted``
-            numbers a variable that is in no column may have been set.
+        observational: Rows without an intervention, shape (n,). In a row without ``targeted``
+            numbers a variable that has no column may have been set.
     """
 
     values: Floats
@@ -90,37 +88,32 @@ class Arrays(NamedTuple):
 
 @typed
 def as_numpy(dataset: Dataset) -> Arrays:
-    """Give a dataset as copies of its arrays.
+    """Return a dataset as copies of its arrays.
 
     Example:
         >>> table = Dataset.of([[0.0], [1.0]], ["x"], targets=[(), ("x",)])
         >>> as_numpy(table).targeted.ravel().tolist(), as_numpy(table).adjacency
         ([False, True], None)
     """
-    return Arrays(
-        values=dataset.values.copy(),
-        targeted=dataset.targeted.copy(),
-        soft=dataset.soft.copy(),
-        regime=dataset.regime.copy(),
-        adjacency=None if dataset.truth is None else dataset.adjacency(),
-        observational=~dataset.intervened,
-    )
+    masks = dataset.values.copy(), dataset.targeted.copy(), dataset.soft.copy()
+    adjacency = None if dataset.truth is None else dataset.adjacency()
+    return Arrays(*masks, dataset.regime.copy(), adjacency, ~dataset.intervened)
 
 
 @typed
 def as_dcdi(dataset: Dataset, folder: Path | str, number: int = 1) -> Path:
-    """Write a dataset the way DCDI reads it: ``--data-path folder --i-dataset number``.
+    """Write a dataset as DCDI reads it: ``--data-path folder --i-dataset number``.
 
-    Rows in which nothing was done are regime 0, and ``data<number>.npy``. Each other set of targets
-    is a regime; variables that are in no column are among its targets, though its mask cannot name
-    them: such regimes are for ``--intervention-knowledge unknown``, or for
-    ``regimes_to_ignore`` of its loader. Its perfect interventions are hard: a dataset with soft
-    ones is for ``--intervention-type imperfect``, which the file ``soft<number>.csv`` tells.
+    Observational rows are regime 0, and ``data<number>.npy``. Each other set of targets is a
+    regime; variables that have no column are among its targets, though its mask cannot name them:
+    such regimes are for ``--intervention-knowledge unknown``, or for ``regimes_to_ignore`` of its
+    loader. Its perfect interventions are hard: a dataset with soft ones is for
+    ``--intervention-type imperfect``; ``soft<number>.csv`` has which they are.
 
     Args:
         dataset: Rows that are episodes, of a known graph without lags.
         folder: It is made if need be; files of the same number are replaced.
-        number: Of the dataset in the folder.
+        number: Number of the dataset in the folder.
 
     Returns:
         The folder.
@@ -141,9 +134,69 @@ def as_dcdi(dataset: Dataset, folder: Path | str, number: int = 1) -> Path:
     for name, table in (("intervention", dataset.targeted), ("soft", dataset.soft)):
         lines = (",".join(map(str, np.flatnonzero(row).tolist())) for row in table)
         (target / f"{name}{number}.csv").write_text("\n".join(lines) + "\n")
-    regimes = _target_sets(dataset, observational_first=True).tolist()
-    (target / f"regime{number}.csv").write_text("\n".join(map(str, regimes)) + "\n")
+    np.savetxt(target / f"regime{number}.csv", _target_sets(dataset, [()]), "%d")
     return target
+
+
+@typed
+def as_tigramite(dataset: Dataset) -> Any:
+    """Return time series as a ``tigramite.data_processing.DataFrame``.
+
+    Each episode is a data set of its own (``analysis_mode="multiple"``), so that nothing is carried
+    from one to the next. Categories and whole numbers are marked as discrete.
+
+    Raises:
+        MissingExtra: tigramite is not installed.
+        ModelError: An episode has one row only, or misses a control step.
+    """
+    if not dataset.is_temporal:
+        raise ModelError(
+            ["every episode is one row, which is not a series: collect with every_step=True"]
+        )
+    processing = load("tigramite.data_processing", "tigramite", "learn")
+    starts = np.flatnonzero(np.diff(dataset.episode, prepend=dataset.episode[0] - 1))
+    pieces = np.split(np.arange(len(dataset)), starts[1:])
+    gaps = [p[0] for p in pieces if np.any(np.diff(dataset.step[p]) != 1)]
+    if gaps:
+        raise ModelError([f"episode {dataset.episode[gaps[0]]} misses a control step"])
+    discrete = np.array([column.dtype != "real" for column in dataset.columns])
+    kinds = {i: np.tile(discrete, (len(p), 1)).astype(int) for i, p in enumerate(pieces)}
+    return processing.DataFrame(
+        {i: dataset.values[p] for i, p in enumerate(pieces)},
+        data_type=kinds,
+        var_names=list(dataset.names),
+        analysis_mode="multiple",
+    )
+
+
+class CausalLearn(NamedTuple):
+    """The arguments of functions of causal-learn.
+
+    Attributes:
+        data: Shape (n, p).
+        node_names: Names of the p columns.
+        c_indx: For ``cdnod``: number of the set of targets of each row, shape (n, 1). Variables
+            that have no column are among the targets: CD-NOD looks for what changes itself.
+    """
+
+    data: Floats
+    node_names: list[str]
+    c_indx: Ints
+
+
+@typed
+def as_causal_learn(dataset: Dataset) -> CausalLearn:
+    """Return a dataset as causal-learn takes it: ``pc(data)``, ``cdnod(data, c_indx)``.
+
+    It has all rows; ``pc`` and others without regimes take those of ``dataset.observational``.
+
+    Example:
+        >>> table = Dataset.of([[0.0], [1.0], [2.0]], ["x"], targets=[(), ("x",), ()])
+        >>> as_causal_learn(table).c_indx.ravel().tolist()
+        [0, 1, 0]
+    """
+    index = _target_sets(dataset).reshape(-1, 1)
+    return CausalLearn(dataset.values.copy(), list(dataset.names), index)
 
 
 # --- pandas -----------------------------------------------------------------------------------
@@ -151,44 +204,42 @@ def as_dcdi(dataset: Dataset, folder: Path | str, number: int = 1) -> Path:
 
 @typed
 def as_frame(dataset: Dataset) -> Any:
-    """Give a dataset as a ``pandas.DataFrame``.
+    """Return a dataset as a ``pandas.DataFrame``.
 
     Returns:
         The columns ``episode``, ``step``, ``regime`` and ``intervention_targets``, then those of
-        the dataset. The targets of a row are a tuple of names of columns, None where nothing was
-        done, as proposed in https://github.com/pgmpy/pgmpy/issues/2117. A variable that was set and
-        is in no column is named after them. All the rest is in ``frame.attrs``, so that
-        ``from_frame`` gives the same dataset.
+        the dataset. The targets of a row are a tuple of names of columns, None in an observational
+        one, as proposed in https://github.com/pgmpy/pgmpy/issues/2117. A variable that was set and
+        has no column is named after them. All the rest is in ``frame.attrs``, so that
+        ``from_frame`` returns the same dataset.
 
     Raises:
-        ModelError: A column has the name of one of the four, or something is no plain data.
+        ModelError: A column has the name of one of the four, or ``about`` is not plain data.
     """
     import pandas
 
     check_names(dataset.columns)
-    rows = {name: getattr(dataset, name).copy() for name in NUMBERS}
     data = pandas.DataFrame(dataset.values.copy(), columns=list(dataset.names))
     names = dataset.target_names
     targets = [names[kind] or None for kind in dataset.regime.tolist()]
-    column = pandas.Series(targets, dtype=object, name=TARGETS)
-    frame = pandas.concat([pandas.DataFrame(rows), column, data], axis=1)
+    data.insert(0, TARGETS, pandas.Series(targets, dtype=object))
+    for name in reversed(NUMBERS):
+        data.insert(0, name, getattr(dataset, name).copy())
     about = {
         "columns": [asdict(column) for column in dataset.columns],
         "regimes": [regime.as_dict() for regime in dataset.regimes],
         "about": dataset.about,
     }
     try:
-        frame.attrs[KEY] = json.dumps(about)  # one text: pandas copies it at every step
+        data.attrs[KEY] = json.dumps(about)  # one text: pandas copies it at every step
     except TypeError as error:
-        raise ModelError(
-            [f"what the dataset says about itself is no plain data: {error}"]
-        ) from None
-    return frame
+        raise ModelError([f"the dataset's 'about' is not plain data: {error}"]) from None
+    return data
 
 
 @typed
 def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
-    """Read a frame that ``as_frame`` wrote, or any with a column ``intervention_targets``.
+    """Read a frame that ``as_frame`` returned, or any with a column ``intervention_targets``.
 
     Args:
         frame: Rows of whole instants and columns may have been taken away, columns reordered. In a
@@ -197,10 +248,10 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
         trusted: Packages whose functions may be mechanisms of its plans.
 
     Raises:
-        UnknownOption: It is no ``pandas.DataFrame``.
+        UnknownOption: It is not a ``pandas.DataFrame``.
         ModelError: It has no column ``intervention_targets``, or other columns than numbers; a
-            target is no column any more; or rows of an episode do not stand together.
-        UnknownVariable: The frame has no ``attrs``, and a target is no column.
+            target is not a column any more; or rows of an episode do not stand together.
+        UnknownVariable: The frame has no ``attrs``, and a target is not a column.
     """
     if not hasattr(frame, "columns") or not hasattr(frame, "attrs"):
         raise UnknownOption("frame", type(frame).__name__, ("a pandas.DataFrame",))
@@ -219,21 +270,9 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
     about = json.loads(frame.attrs[KEY])
     columns = {column["name"]: Column(**column) for column in about["columns"]}
     hidden = {name for regime in about["regimes"] for name in regime["targets"]}
-    _check_targets(names, {*columns, *hidden}, {name for cell in given for name in cell})
-    return Dataset(
-        values=values,
-        columns=tuple(columns.get(name, Column(name, name)) for name in names),
-        regimes=tuple(Regime.from_dict(regime, trusted=trusted) for regime in about["regimes"]),
-        about=about["about"],
-        **{name: whole_numbers(name, frame[name]) for name in NUMBERS},
-    )
-
-
-def _check_targets(names: list[Any], known: Container[str], targets: set[str]) -> None:
-    """Refuse columns that were renamed while the targets were not, or the other way round."""
+    known, targets = {*columns, *hidden}, {name for cell in given for name in cell}
     new = [name for name in names if name not in known]
-    lost = sorted(targets - set(names)) if new else sorted(t for t in targets if t not in known)
-    if lost or targets & set(new):
+    if targets & {*new} or targets - ({*names} if new else known):
         raise ModelError(
             [
                 f"the columns were renamed or added to ({', '.join(map(str, new)) or 'no new ones'}"
@@ -241,6 +280,13 @@ def _check_targets(names: list[Any], known: Container[str], targets: set[str]) -
                 f"`del frame.attrs[{KEY!r}]`, or neither"
             ]
         )
+    return Dataset(
+        values=values,
+        columns=tuple(columns.get(name, Column(name, name)) for name in names),
+        regimes=tuple(Regime.from_dict(regime, trusted=trusted) for regime in about["regimes"]),
+        about=about["about"],
+        **{name: whole_numbers(name, frame[name]) for name in NUMBERS},
+    )
 
 
 def _names_in(cell: Any) -> tuple[str, ...]:
@@ -255,71 +301,3 @@ def _names_in(cell: Any) -> tuple[str, ...]:
     if isinstance(cell, Iterable):
         return tuple(map(str, cell))
     raise ModelError([f"{TARGETS} has {cell!r}: it can be None, names with ';', or a tuple"])
-
-
-# --- tigramite --------------------------------------------------------------------------------
-
-
-@typed
-def as_tigramite(dataset: Dataset) -> Any:
-    """Give time series as a ``tigramite.data_processing.DataFrame``.
-
-    Each episode is a data set of its own (``analysis_mode="multiple"``), so that nothing is carried
-    from one to the next. Categories and whole numbers are marked as discrete.
-
-    Raises:
-        MissingExtra: tigramite is not installed.
-        ModelError: An episode has one row only, or misses a control step.
-    """
-    if not dataset.is_temporal:
-        raise ModelError(
-            ["every episode is one row, which is no time series: collect with every_step=True"]
-        )
-    processing = load("tigramite.data_processing", "tigramite", "learn")
-    starts = np.flatnonzero(np.diff(dataset.episode, prepend=dataset.episode[0] - 1))
-    pieces = np.split(np.arange(len(dataset)), starts[1:])
-    gaps = [p[0] for p in pieces if np.any(np.diff(dataset.step[p]) != 1)]
-    if gaps:
-        raise ModelError([f"episode {dataset.episode[gaps[0]]} misses a control step"])
-    discrete = np.array([column.dtype != "real" for column in dataset.columns])
-    kinds = {i: np.tile(discrete, (len(p), 1)).astype(int) for i, p in enumerate(pieces)}
-    return processing.DataFrame(
-        {i: dataset.values[p] for i, p in enumerate(pieces)},
-        data_type=kinds,
-        var_names=list(dataset.names),
-        analysis_mode="multiple",
-    )
-
-
-# --- causal-learn -----------------------------------------------------------------------------
-
-
-class CausalLearn(NamedTuple):
-    """What functions of causal-learn take.
-
-    Attributes:
-        data: Shape (n, p).
-        node_names: Of the p columns.
-        c_indx: For ``cdnod``: number of the set of targets of each row, shape (n, 1). Variables
-            that are in no column are among the targets: CD-NOD looks for what changes itself.
-    """
-
-    data: Floats
-    node_names: list[str]
-    c_indx: Ints
-
-
-@typed
-def as_causal_learn(dataset: Dataset) -> CausalLearn:
-    """Give a dataset the way causal-learn takes it: ``pc(data)``, ``cdnod(data, c_indx)``.
-
-    It has all rows; ``pc`` and others that know of no regimes take those of
-    ``dataset.observational``.
-
-    Example:
-        >>> table = Dataset.of([[0.0], [1.0], [2.0]], ["x"], targets=[(), ("x",), ()])
-        >>> as_causal_learn(table).c_indx.ravel().tolist()
-        [0, 1, 0]
-    """
-    index = _target_sets(dataset).reshape(-1, 1)
-    return CausalLearn(dataset.values.copy(), list(dataset.names), index)

@@ -1,8 +1,13 @@
-"""Rows read off the episodes of a world, of equations, or through a laboratory."""
+"""Rows of episodes of a world, of equations, of a causal model, or of a laboratory.
+
+Each class has the ``columns`` of a row; ``about``, plain data that decide all rows; ``shard``, how
+many episodes a file has by default; and ``rows``, which runs some episodes. It returns their table
+and the file of their pictures. Rows of episode i depend on the seed and on i only. The ``about`` of
+the table has which episodes were ``"refused"``, and why, and which bodies were ``"touching"``.
+"""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import groupby
@@ -10,42 +15,35 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import typed
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
-from scm_world.discovery.data.dataset import Column, Dataset, Regime, Row, columns_of
-from scm_world.discovery.data.designs import Design
+from scm_world.discovery.data.dataset import Dataset, Regime, Row
+from scm_world.discovery.data.designs import Design, Grid
 from scm_world.discovery.data.pictures import Pictures
 from scm_world.discovery.data.pictures import Row as Picture
 from scm_world.discovery.data.recorded import (
+    columns_of,
     columns_of_outcome,
     default_causes,
     default_outcomes,
     is_state,
-    labelled,
     reached,
     settable,
 )
-from scm_world.discovery.data.sources import FORMAT, SourceRows, Tell
-from scm_world.discovery.data.truth import (
-    truth_of_episodes,
-    truth_of_model,
-    truth_of_steps,
-)
+from scm_world.discovery.data.truth import truth_of_episodes, truth_of_model, truth_of_steps
 from scm_world.env.observer import published
 from scm_world.env.vector import WIDE, bounds, spread
-from scm_world.errors import Forbidden, InterventionError, ModelError, UnknownOption
-from scm_world.graph.structure import Edge
-from scm_world.policies.scripted import Sequence as Given
+from scm_world.errors import InterventionError, ModelError, UnknownOption
+from scm_world.graph import SCM
 from scm_world.queries.episodes import Episode, Unit
-from scm_world.queries.equations import Equations, System
+from scm_world.queries.equations import Equations, length
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.local import contact_terms
 from scm_world.queries.outcomes import Outcome, as_outcomes
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Setting
-from scm_world.queries.twins import Result, Twins
+from scm_world.queries.twins import Result, asked
 from scm_world.variables import Noise, Normal
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import Simulation
@@ -57,10 +55,65 @@ STREAM = "sensor of"
 NORMAL = Normal()
 
 
-@typed
 @final
-class WorldSource:
-    """Episodes of a world or of equations, under a design.
+class ModelRows:
+    """Episodes of a causal model without a backend, as rows of all its variables.
+
+    Row i of a model without lagged edges is that of
+    ``model.do(regime(i).plan.at_start()).draw(1, seed=seed, first=i)``.
+
+    Args:
+        model: The causal model.
+        design: The interventions.
+        seed: Seed of the noise.
+        steps: Control steps of an episode, each of them a row; None where nothing is lagged.
+    """
+
+    shard = 10_000
+
+    def __init__(self, model: SCM, design: Design, seed: int, steps: int | None) -> None:
+        self._model, self._design, self._seed = model, design, seed
+        self._twins, system = asked(model)
+        self._length = length(system, steps)
+        for name, act in design.acts.items():
+            model.do({name: act})
+        self.columns = tuple(c for v in model.variables for c in columns_of(v))
+        self.about = {
+            "system": "model",
+            "fingerprint": fingerprint({**model.__fingerprint__(), "design": design.acts}),
+            "seed": seed,
+            "steps": 1 if steps is None else steps,
+            "design": design.as_dict(),
+            "truth": truth_of_model(model),
+            "versions": versions(),
+        }
+
+    def rows(self, numbers: range) -> tuple[Dataset, bytes]:
+        """Run some episodes together."""
+        (cases,) = self._design.cases(self._seed, numbers)
+        units = [Unit(self._seed, i, regime.plan, None, self._length) for i, _, regime in cases]
+        vectors = self._twins.paths(units)[:, min(self._length, 1) :]
+        n, instants, size = vectors.shape
+        kinds = {id(regime): regime for *_, regime in cases}
+        at = {key: i for i, key in enumerate(kinds)}
+        regimes = (
+            replace(regime, targets=reached(self._model, regime.targets, self.columns))
+            for regime in kinds.values()
+        )
+        table = Dataset(
+            values=vectors.reshape(n * instants, size),
+            columns=self.columns,
+            regimes=tuple(regimes),
+            regime=np.repeat([at[id(regime)] for *_, regime in cases], instants),
+            episode=np.repeat(np.arange(numbers.start, numbers.stop), instants),
+            step=np.tile(np.arange(instants), n),
+        )
+        return table, b""
+
+
+@final
+class WorldRows:
+    """Episodes of a world or of equations as rows.
 
     A row is an episode: causes as they are at its beginning, and outcomes. With ``every_step`` it
     is a control step: everything as it is when the action is chosen, and the action. Sensors have
@@ -69,50 +122,48 @@ class WorldSource:
     bounds: no parameters, no actions, no counts.
 
     Args:
-        twins: Where the episodes are run; see ``asked``.
-        world: Is not touched; what is given to it holds in every episode.
-        design: What is done at the beginning.
-        causes: Patterns of the parameters to write down; ``default_causes`` if None. The targets
-            of the design are among them.
+        system: A world or an SCM. It is not changed; interventions given to it hold in every
+            episode.
+        design: The interventions at the beginning.
+        setting: Policy, context distribution, steps and seed.
+        causes: Patterns of the parameters that have columns; ``default_causes`` if None. The
+            targets of the design are among them.
         outcomes: Names of variables or ``Outcome``; ``default_outcomes`` if None.
         every_step: One row for each control step in place of one for each episode.
-        setting: Who acts, what varies by itself, how long, and the seed.
         pictures: To take at each control step, or at the beginning and at the end; none if None.
         contacts: Whether to record which bodies touch.
 
     Raises:
-        InterventionError: A target, or what varies, cannot be set to its values.
+        InterventionError: A target, or a variable of the context, cannot be set to its values.
         UnknownVariable: No variable has this name.
-        UnknownOption: An outcome is a function, sums up an episode with ``every_step``, or is
-            written down as a cause already; or there is no such camera.
+        UnknownOption: An outcome is a function, sums up an episode with ``every_step``, or has a
+            column as a cause already; or there is no such camera.
     """
 
-    at_once = False
-    uneven = False
+    shard = 100
 
     def __init__(
         self,
-        twins: Twins,
-        world: System,
-        design: Design,
-        *,
-        causes: Iterable[str] | None,
-        outcomes: Iterable[Any] | None,
-        every_step: bool,
+        system: Simulation | SCM,
+        design: Design | Grid,
         setting: Setting,
+        *,
+        causes: Iterable[str] | None = None,
+        outcomes: Iterable[Any] | None = None,
+        every_step: bool = False,
         pictures: Pictures | None = None,
         contacts: bool = False,
     ) -> None:
+        self._twins, world = asked(system)
+        self._world, self._design, self._setting = world, design, setting
         self._pictures, self._contacts = pictures, contacts and isinstance(world, Simulation)
         if pictures is not None:
-            with twins.twin() as twin:  # a camera that does not exist is refused now
-                seen: Any = twin
-                seen.reset(seed=setting.seed)
-                pictures.take(seen.scene(), seen.cameras())
-        self._world, self._twins, self._design = world, twins, design
-        self._setting, self._given = setting, getattr(world, "plan", Plan())
+            with self._twins.twin() as twin:  # a camera that does not exist is refused now
+                twin.reset(seed=setting.seed)
+                pictures.take(twin.scene(), twin.cameras())
+        self._given: Plan = getattr(world, "plan", Plan())
         self._every_step, model = every_step, world.model
-        for name, act in (*design.acts.items(), *Plan(setting.nature).acts()):
+        for name, act in (*design.interventions(), *Plan(setting.nature).acts()):
             model.accept(name, act)
         chosen = default_causes(world) if causes is None else settable(world, causes)
         varied = tuple(dict.fromkeys((*chosen, *design.targets)))
@@ -129,54 +180,57 @@ class WorldSource:
         if every_step:
             parts = [columns_of(model.declared(name)) for name in self._watched]
         else:
-            parts = [
-                *(labelled(columns_of(model.declared(n), "first"), "first" * is_state(model, n))
-                  for n in varied),
-                *(columns_of_outcome(model.declared(o.name), o) for o in measured),
-            ]  # fmt: skip
-        self.columns: tuple[Column, ...] = tuple(column for part in parts for column in part)
+            firsts = {name: "first" if is_state(model, name) else "" for name in varied}
+            parts = [columns_of(model.declared(n), "first", label) for n, label in firsts.items()]
+            parts += [columns_of_outcome(model.declared(o.name), o) for o in measured]
+        self.columns = tuple(column for part in parts for column in part)
         there = [column.name for column in self.columns]
         twice = sorted({name for name in there if there.count(name) > 1})
         if twice:  # before episodes are run for them
-            allowed = ("what is no cause: those have a column already",)
+            allowed = ("other variables than the causes, which have a column already",)
             raise UnknownOption("outcomes", ", ".join(twice), allowed)
         self._half: dict[str, Floats] = {}
         if isinstance(world, Simulation) and SENSOR_NOISE in model:
             self._half = {name: half_range(world, name) for name in self._watched}
-        self.edges: tuple[Edge, ...] | None = model.edges
-        self.about: dict[str, Any] = {
-            "format": FORMAT,
-            **_system(world, twins),
-            "fingerprint": fingerprint(
-                {
-                    **(world.model if isinstance(world, Equations) else world).__fingerprint__(),
-                    "policy": setting.policy,
-                    "given": list(self._given.acts()),
-                    "nature": list(Plan(setting.nature).acts()),
-                    "design": design.acts,
-                }
-            ),
+        self.about = self._about(varied, measured)
+
+    def _about(self, varied: Sequence[str], measured: Sequence[Outcome]) -> dict[str, Any]:
+        world, setting, nature = self._world, self._setting, Plan(self._setting.nature)
+        pure = isinstance(world, Equations)
+        system = (world.model if pure else world).__fingerprint__() | {
+            "policy": setting.policy,
+            "given": list(self._given.acts()),
+            "nature": list(nature.acts()),
+            "design": list(self._design.interventions()),
+        }
+        found: dict[str, Any] = {"system": "model"}
+        if not pure:
+            options = plain_options(self._twins.options)
+            found = {"system": self._twins.task.name, "options": options}
+        if self._pictures is not None:
+            found["pictures"] = asdict(self._pictures)
+        if self._contacts:
+            found["contacts"] = "steps" if self._every_step else "episodes"
+        return {
+            **found,
+            "fingerprint": fingerprint(system),
             "given": self._given.as_dict()["do"],
             "seed": setting.seed,
             "steps": setting.steps,
             "policy": policy_name(setting.policy),
-            "nature": Plan(setting.nature).as_dict()["do"],
-            "design": design.as_dict(),
-            "engine": "equations" if isinstance(world, Equations) else world.backend.name,
-            **({} if pictures is None else {"pictures": asdict(pictures)}),
-            **({"contacts": "steps" if every_step else "episodes"} if self._contacts else {}),
+            "nature": nature.as_dict()["do"],
+            "design": self._design.as_dict(),
+            "engine": "equations" if pure else world.backend.name,
             "truth": self._truth(varied, measured),
-            "versions": versions("" if isinstance(world, Equations) else world.engine),
+            "versions": versions("" if pure else world.engine),
         }
 
     def _truth(self, varied: Sequence[str], measured: Sequence[Outcome]) -> dict[str, Any] | None:
-        """Write the graph over the columns; None where nature acts later than at the beginning."""
+        """Return the graph over the columns; None where the context changes during an episode."""
         world, model = self._world, self._world.model
         if isinstance(world, Equations) and (self._every_step or not model.is_temporal):
             return truth_of_model(model)
-        terms: Any = (
-            contact_terms(world) if self._contacts and isinstance(world, Simulation) else {}
-        )
+        terms = contact_terms(world) if self._contacts else {}
         if self._every_step:
             bundles = getattr(world.compiled, "bundles", {})
             return truth_of_steps(model, self._watched, bundles, terms)
@@ -188,78 +242,71 @@ class WorldSource:
             return None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Go elsewhere, where workers share the cores: an engine has one thread there."""
+        """Use one thread in other processes, where workers share the cores."""
         setting = replace(self._setting, workers=self._setting.workers or 1)
         return {**self.__dict__, "_setting": setting}
 
-    def part(self, numbers: range, tell: Tell) -> SourceRows:
+    def rows(self, numbers: range) -> tuple[Dataset, bytes]:
         """Run some episodes; those that are refused are left out."""
-        chosen = self._design.chosen(self._setting.seed, numbers.start, len(numbers))
-        regimes = [self._design.regime_of(kind) for kind in chosen]
+        model, seed = self._world.model, self._setting.seed
+        rows: list[Row] = []
+        shots: list[Picture] = []
+        refused: dict[str, str] = {}
+        touching: dict[str, Any] = {}
 
-        seen: dict[int, list[Picture]] = {}
-        touching: dict[int, Any] = {}
-
-        def finish(place: int, result: Result) -> Floats | str:
-            if isinstance(result, Exception) and not isinstance(result, InterventionError):
-                raise result
-            found: Floats | str
+        def finish(_: int, result: Result) -> Any:
+            if isinstance(result, InterventionError):
+                return str(result), [], {}
             if isinstance(result, Exception):
-                found = str(result)
-            else:
-                found = self._row(result)
-                if self._contacts:
-                    touching[numbers[place]] = _runs(result.touched)
-                if self._pictures is not None:
-                    seen[place] = self._look(self._pictures, result)
-            tell(1)
-            return found
+                raise result
+            return self._values(result), self._look(result), _runs(result.touched)
 
         kept = {*self._world.compiled.slices, *self._world.static_names}
         written = tuple(name for name in self._watched if name not in kept)
-        units: list[Unit] = []
-        for number, done in zip(numbers, regimes, strict=True):
-            given = Plan(merged(self._world.model, self._given, done.plan))
-            unit = self._setting.unit(self._world, given, number, written)
-            units.append(replace(unit, listens=self._contacts))
-        found = self._twins.run(units, finish, self._setting.workers)
-        rows: list[Row] = []
-        refused: list[tuple[int, str]] = []
-        for number, done, values in zip(numbers, regimes, found, strict=True):
-            if isinstance(values, str):
-                refused.append((number, values))
-                continue
-            for step, row in enumerate(values):
-                named = replace(done, targets=self._targets(done.targets, step))
-                rows.append((number, step, named, row))
-        table = Dataset.stacked(self.columns, rows, self.about)
-        shots = [shot for place in sorted(seen) for shot in seen[place]]
+        for cases in self._design.cases(seed, numbers):
+            units = []
+            for _, number, regime in cases:
+                given = Plan(merged(model, self._given, regime.plan))
+                unit = self._setting.unit(self._world, given, number, written)
+                units.append(replace(unit, listens=self._contacts))
+            found = self._twins.run(units, finish, self._setting.workers)
+            named = dict[tuple[tuple[str, ...], bool], Regime]()  # by targets, and at which row
+            for (number, _, regime), (values, seen, runs) in zip(cases, found, strict=True):
+                if isinstance(values, str):
+                    refused[str(number)] = values
+                    continue
+                shots += ({"episode": number, **shot} for shot in seen)
+                touching[str(number)] = runs
+                for step, row in enumerate(values):
+                    key = regime.targets, step == 0
+                    if key not in named:
+                        targets = self._targets(regime.targets, step)
+                        named[key] = replace(regime, targets=targets)
+                    rows.append((number, step, named[key], row))
+        rows.sort(key=lambda row: row[:2])
+        about = {"refused": refused, "touching": touching if self._contacts else {}}
+        table = Dataset.stacked(self.columns, rows, about)
         keys = [f"{shot['episode']:08d}-{shot['step']:06d}" for shot in shots]
-        pictures = b"" if self._pictures is None else self._pictures.encoded(shots, keys)
-        touched = {str(number): touching[number] for number in sorted(touching)}
-        return SourceRows(table, tuple(refused), pictures, touched)
+        return table, b"" if self._pictures is None else self._pictures.encoded(shots, keys)
 
-    def _look(self, pictures: Pictures, episode: Episode) -> list[Picture]:
+    def _look(self, episode: Episode) -> list[Picture]:
         """Take the pictures of an episode, one row of them for each of its rows."""
+        take = self._pictures and self._pictures.take
+        if take is None:
+            return []
         if self._every_step:
-            return [
-                {"episode": episode.number, "step": t, **pictures.take(*episode.scene(t))}
-                for t in range(episode.steps)
-            ]
-        first = pictures.take(*episode.scene(0), "first_image")
-        return [
-            {"episode": episode.number, "step": 0, **first}
-            | pictures.take(*episode.scene(episode.steps))
-        ]
+            return [{"step": t, **take(*episode.scene(t))} for t in range(episode.steps)]
+        first = take(*episode.scene(0), "first_image")
+        return [{"step": 0, **first, **take(*episode.scene(episode.steps))}]
 
     def _targets(self, names: Iterable[str], step: int) -> tuple[str, ...]:
-        """Name the columns' variables that are set in a row; a state is at the first step only."""
+        """Return the variables that are set in a row; a state is at the first step only."""
         model, whole = self._world.model, not self._every_step
         there = reached(model, names, self.columns, first=whole)
         return tuple(n for n in there if whole or step == 0 or not is_state(model, n))
 
-    def _row(self, episode: Episode) -> Floats:
-        """Read an episode, shape (rows, p)."""
+    def _values(self, episode: Episode) -> Floats:
+        """Return the rows of an episode, shape (rows, p)."""
         last = episode.steps
         if self._every_step:
             parts = [
@@ -280,7 +327,7 @@ class WorldSource:
         return np.concatenate([np.ravel(value) for value in values])[None]
 
     def _sensed(self, episode: Episode, name: str, steps: Iterable[int]) -> Floats:
-        """Read a variable at every instant, with sensor noise at some instants."""
+        """Return a variable at every instant, with sensor noise at some instants."""
         values, half = np.array(episode[name], dtype=np.float64), self._half.get(name)
         if half is None or not half.any() or not np.any(episode[SENSOR_NOISE]):
             return values
@@ -293,7 +340,7 @@ class WorldSource:
 
 
 def _runs(steps: Sequence[frozenset[tuple[str, str]]]) -> dict[str, Any]:
-    """Write what touched in each control step.
+    """Return which bodies touched in each control step, as plain data.
 
     Example:
         >>> _runs([frozenset({("a", "b")}), frozenset({("a", "b")}), frozenset()])
@@ -306,16 +353,10 @@ def _runs(steps: Sequence[frozenset[tuple[str, str]]]) -> dict[str, Any]:
     return {"pairs": [list(pair) for pair in pairs], "runs": runs}
 
 
-def _system(world: System, twins: Twins) -> dict[str, Any]:
-    if twins.model is not None:
-        return {"system": "model"}
-    return {"system": twins.task.name, "options": plain_options(twins.options)}
-
-
 def half_range(world: Simulation, name: str) -> Floats:
-    """Give half the range of each number of a variable that a sensor measures, shape (k,).
+    """Return half the range of each number of a variable that a sensor measures, shape (k,).
 
-    It is that of the environment's observations. 0 where there is none, or no sensor.
+    It is that of the environment's observations; 0 where there is none, or no sensor.
     """
     variable = world.model.declared(name)
     if variable.role not in ("state", "readout") or variable.dtype != "real":
@@ -340,96 +381,69 @@ def _outcomes(given: Iterable[Any], *, every_step: bool) -> tuple[Outcome, ...]:
 
 
 def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Name the engine of a world among its options, where it was given as an object."""
+    """Return the options of a world, with the name of the backend where it is an object."""
     backend = options["backend"]
     name = backend if isinstance(backend, str) else type(backend).__qualname__
     return {**options, "backend": name}
 
 
 def policy_name(policy: Any) -> str:
-    """Name who acts, the same way in every process.
+    """Return the name of a policy; its fingerprint tells it from others of this name.
 
     Example:
         >>> policy_name("random"), policy_name(None), policy_name(len)
         ('random', 'still', 'builtins:len')
     """
-    if policy is None:
-        return "still"
-    if isinstance(policy, str):
-        return policy
-    if hasattr(policy, "__qualname__"):
-        return f"{policy.__module__}:{policy.__qualname__}"
-    if callable(policy):
-        kind = type(policy)
-        text = repr(policy) if hasattr(kind, "__dataclass_fields__") else ""
-        return f"{kind.__module__}:{text or kind.__qualname__}"
-    actions = Given(policy).actions
-    digest = hashlib.sha256(np.ascontiguousarray(actions).tobytes()).hexdigest()
-    return f"actions of shape {actions.shape}, sha256 {digest}"
-
-
-# --- through a laboratory -------------------------------------------------------------------------
+    if policy is None or isinstance(policy, str):
+        return policy or "still"
+    named = policy if hasattr(policy, "__qualname__") else type(policy)
+    return f"{named.__module__}:{named.__qualname__}"
 
 
 @final
-class Experiments:
-    """Experiments of one episode each, through ``see`` and ``do`` of a laboratory.
+class LaboratoryRows:
+    """Experiments of one episode each, through ``see`` and ``do`` of a laboratory, as rows.
 
     Its permissions and its budget hold, and its errors are raised. A row has its outcomes as it
     reports them; its number of the unit is the number of the episode.
 
     Args:
-        laboratory: Says who acts, what varies, and what is measured.
-        design: What is done.
-        n: How many experiments there will be.
-        seed: Of what the design draws by lot.
-
-    Raises:
-        Forbidden: Fewer episodes are left.
+        laboratory: Has the policy, the context distribution and the outcomes.
+        design: The interventions.
+        seed: Seed of the random choices of the design.
     """
 
-    at_once = False
-    uneven = False
-    edges: tuple[Edge, ...] | None = None
+    shard = 100
 
-    def __init__(self, laboratory: Laboratory, design: Design, n: int, *, seed: int) -> None:
-        left = laboratory.remaining
-        if left is not None and n > left:
-            raise Forbidden(f"run {n} more episodes", [f"{left} episodes"])
+    def __init__(self, laboratory: Laboratory, design: Design, seed: int) -> None:
         self._laboratory, self._design, self._seed = laboratory, design, seed
         # For units and shapes only; it is private, since it would show the graph.
         self._model = laboratory._world.model
         declared = self._model.declared
-        self.columns: tuple[Column, ...] = tuple(
+        self.columns = tuple(
             c for o in laboratory.outcomes for c in columns_of_outcome(declared(o.name), o)
         )
         terms = laboratory.terms()
-        self.about: dict[str, Any] = {
-            "format": FORMAT,
+        self.about = {
             "system": "laboratory",
             "terms": {**terms, "options": plain_options(terms["options"])},
             "seed": seed,
             "design": design.as_dict(),
         }
 
-    def part(self, numbers: range, tell: Tell) -> SourceRows:
+    def rows(self, numbers: range) -> tuple[Dataset, bytes]:
         """Carry out some experiments; those that are refused cost their episode."""
         rows: list[Row] = []
-        refused: list[tuple[int, str]] = []
-        for number in numbers:
-            regime = self._design.regime(number, seed=self._seed)
+        refused: dict[str, str] = {}
+        (cases,) = self._design.cases(self._seed, numbers)
+        for number, _, regime in cases:
+            plan, targets = regime.plan, regime.targets
             try:
-                found = (
-                    self._laboratory.do(regime.plan) if regime.targets else self._laboratory.see(1)
-                )
+                found = self._laboratory.do(plan) if targets else self._laboratory.see(1)
             except InterventionError as problem:
-                refused.append((number, str(problem)))
+                refused[str(number)] = str(problem)
             else:
-                (row,) = found.matrix()[0]
-                rows.append((found.numbers[0], 0, self._named(regime), row))
-            tell(1)
-        return SourceRows(Dataset.stacked(self.columns, rows, self.about), tuple(refused))
-
-    def _named(self, regime: Regime) -> Regime:
-        names = reached(self._model, regime.targets, self.columns, first=True)
-        return replace(regime, targets=names)
+                row = np.concatenate([np.ravel(values) for values in found.values()])
+                names = reached(self._model, targets, self.columns, first=True)
+                rows.append((found.numbers[0], 0, replace(regime, targets=names), row))
+        return Dataset.stacked(self.columns, rows, {"refused": refused, "touching": {}}), b""

@@ -281,6 +281,7 @@ def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM
     Raises:
         UnknownOption: There are options for a world that is made.
     """
+    system = system.model if isinstance(system, Equations) else system
     if options and isinstance(system, Simulation | SCM):
         raise UnknownOption("option for a world that is made", next(iter(options)), ())
     if isinstance(system, SCM):

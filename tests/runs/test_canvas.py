@@ -8,7 +8,7 @@ import pytest
 from matplotlib.image import imread
 
 from scm_world.errors import UnwritableFolder
-from scm_world.output.canvas import HEIGHT, WIDTH, blank, png, save
+from scm_world.runs.canvas import HEIGHT, WIDTH, blank, png, save
 
 
 def test_a_picture_is_written_whole(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Players: policies of every form behind two methods, ``begin`` and ``act``."""
+"""Agents: policies of every form behind two methods, ``start`` and ``act``."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import load
-from scm_world._types import Floats
-from scm_world.env import ScmWorldEnv
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile, blamed
-from scm_world.output.reading import LARGEST_TABLE, read_bytes
-from scm_world.policies import MlpPolicy, PolicyAbout, file_of, load_policy, load_sb2
-from scm_world.policies.cards import FORM
+from scm_world.policies.cards import PolicyAbout
+from scm_world.policies.networks import MlpPolicy, load_policy, load_sb2
 from scm_world.policies.scripted import NAMED, OpenLoopPolicy, Policy
 from scm_world.policies.zoo import PREFIX as ZOO
+from scm_world.policies.zoo import file_of
+from scm_world.runs.files import read_bytes
 from scm_world.variables import Function
 from scm_world.world import Simulation
 
@@ -32,11 +31,9 @@ About = dict[str, Any]
 """Description of a policy as plain data: its kind, its name, and where it comes from."""
 
 Actor = Callable[[Any], Any]
-"""Gives an action for an observation, within one episode."""
+"""Returns an action for an observation, within one episode."""
 
-PACKAGE, SB3 = "scm_world", "stable_baselines3"
-SUFFIXES = (".safetensors", ".zip")
-_ADVICE = "give the path of a policy"
+SB3 = "stable_baselines3"
 _FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 
 
@@ -50,7 +47,7 @@ def _still() -> Policy:
 
 
 NAMES: Mapping[str, Callable[[], Policy]] = {"still": _still, **NAMED}
-"""Policies that have a name; each entry gives the policy of one episode."""
+"""Policies that have a name; each entry returns the policy of one episode."""
 
 OWN_POLICIES = frozenset(
     Function(getattr(made, "func", made)).reference for made in (still, *NAMED.values())
@@ -75,7 +72,7 @@ FORMS = (
 class WorldPolicy:
     """Marks a policy that reads the world instead of the observation.
 
-    It is called with the world of the environment and gives an action in the units of the action
+    It is called with the world of the environment and returns an action in the units of the action
     mode (rad, N m or m), shape (n_actions,). It serves as a decorator.
 
     Attributes:
@@ -99,67 +96,59 @@ class WorldPolicy:
 
 
 @final
-class Player:
-    """Acts in an environment, episode after episode; ``as_player`` makes it.
+class Agent:
+    """Acts in an environment, episode after episode; ``as_agent`` makes it.
 
     Args:
-        about: Description of the policy.
-        start: Gives what acts in the episode that an environment has begun.
-        made_for: What the policy was trained for, if known.
-
-    Attributes:
-        policy: What ``as_player`` was given.
+        about: Description of the policy, as plain data.
+        begin: Returns what acts in the episode that an environment has begun.
+        policy: What ``as_agent`` was given.
+        card: What the policy was trained for, if known.
     """
 
     def __init__(
         self,
         about: Mapping[str, Any],
-        start: Callable[[ScmWorldEnv], Actor],
-        *,
-        made_for: PolicyAbout | None = None,
+        begin: Callable[[Any], Actor],
+        policy: Any = None,
+        card: PolicyAbout | None = None,
     ) -> None:
-        self._about, self._start = dict(about), start
-        self._who = f"the policy {self._about['name']!r}"
-        self.policy: Any = None
-        self.made_for = made_for
-        self._env: ScmWorldEnv | None = None
+        self.about: About = dict(about)
+        self.policy, self.card = policy, card
+        self._begin = begin
+        self._env: Any = None
         self._act: Actor | None = None
 
-    @property
-    def about(self) -> About:
-        """Description of the policy; ``player_from`` makes it again where that is possible."""
-        return dict(self._about)
-
-    def begin(self, env: ScmWorldEnv) -> None:
+    def start(self, env: Any) -> None:
         """Begin an episode; called after every reset.
 
         Args:
-            env: Whose episode has begun.
+            env: The ``ScmWorldEnv`` whose episode has begun.
 
         Raises:
             UnknownOption: It has other observations or actions than the policy was trained with.
             ActionError: Its observations or actions have other shapes.
-            UnreadableFile: A network in a file takes other observations.
             FunctionFailure: The policy raised an error.
         """
-        with blamed(self._who):
-            self._env, self._act = env, self._start(env)
+        with blamed(f"the policy {self.about['name']!r}"):
+            self._env, self._act = env, self._begin(env)
 
     def act(self, observation: Any) -> Actions:
         """Choose an action of the environment, shape (n_actions,).
 
         Args:
-            observation: Of the environment: an array, or arrays by name.
+            observation: An array, or arrays by name.
 
         Raises:
             ActionError: The policy gave no such action, or no episode has begun.
             FunctionFailure: It raised an error.
         """
+        name = self.about["name"]
         if self._act is None:
-            raise ActionError(f"{self._who} acts in no episode; call begin()", None)
-        with blamed(self._who):
+            raise ActionError(f"the policy {name!r} acts in no episode; call start()", None)
+        with blamed(f"the policy {name!r}"):
             action = self._act(observation)
-        return checked(action, self._env, self._about["name"])
+        return checked(action, self._env, name)
 
     def __getstate__(self) -> dict[str, Any]:
         """Copy and pickle without the episode."""
@@ -170,15 +159,15 @@ def checked(action: Any, env: Any, name: str) -> Actions:
     """Check that a policy gave finite numbers; numbers beyond the range are left alone.
 
     Args:
-        action: What it gave.
-        env: Where it acts, which says how many numbers there are; any number if None.
-        name: Of the policy.
+        action: The answer of the policy.
+        env: Where it acts, which determines the shape; any number of components if None.
+        name: Name of the policy.
 
     Returns:
         The same array; anything but floats becomes 64-bit floats.
 
     Raises:
-        ActionError: It is no such array.
+        ActionError: It is not such an array.
 
     Example:
         >>> checked([0] * 9, None, "lazy")
@@ -211,22 +200,18 @@ def checked(action: Any, env: Any, name: str) -> Actions:
     )
 
 
-# --- how episodes begin -----------------------------------------------------------------------
+# --- how episodes begin: each function returns what acts in an episode ----------------------------
 
 
-def _function(policy: Any, env: ScmWorldEnv) -> Actor:
+def _function(policy: Any, env: Any) -> Actor:
     if callable(getattr(policy, "reset", None)):
         policy.reset()
     act: Actor = policy
     return act
 
 
-def _model(model: Any, env: ScmWorldEnv) -> Actor:
-    """Carry the state of a recurrent model from step to step.
-
-    Raises:
-        ActionError: It observes something of another shape.
-    """
+def _model(model: Any, env: Any) -> Actor:
+    """Carry the state of a recurrent model from step to step."""
     shapes = [_shapes(getattr(one, "observation_space", None)) for one in (model, env)]
     if shapes[0] not in (None, shapes[1]):
         problem = f"it observes shape {shapes[0]}, and the environment shows {shapes[1]}"
@@ -245,7 +230,7 @@ def _model(model: Any, env: ScmWorldEnv) -> Actor:
 
 
 def _shapes(space: Any) -> Any:
-    """Return the shape of what a space contains, by name where it has parts; None without one.
+    """Return the shape of a space, by name where it has parts; None without a space.
 
     Pictures have one shape, wherever their channels stand.
     """
@@ -256,15 +241,15 @@ def _shapes(space: Any) -> Any:
     return tuple(sorted(shape)) if shape is not None and len(shape) == 3 else shape
 
 
-def _network(policy: MlpPolicy, name: str, env: ScmWorldEnv) -> Actor:
+def _network(policy: MlpPolicy, name: str, env: Any) -> Actor:
     if policy.made_for is not None:
         policy.made_for.check(env, name)
     policy.check(env.observe(), env.world.compiled.n_actions)
-    return _model(policy, env) if policy.made_for is not None and policy.made_for.memory else policy
+    return _model(policy, env) if policy.about.memory else policy
 
 
-def _of_world(make: Any, name: str, env: ScmWorldEnv) -> Actor:
-    """Give actions that lead as near to the command of a world policy as one action can."""
+def _of_world(make: Callable[[], Any], name: str, env: Any) -> Actor:
+    """Return actions that lead as near to the command of a world policy as one action can."""
     policy = _function(make(), env)
     return lambda _: env.as_action(checked(policy(env.world), env, name))
 
@@ -277,17 +262,17 @@ def _itself(policy: Policy) -> Policy:
     return policy
 
 
-def _open_loop(actions: Actions, name: str, env: ScmWorldEnv) -> Actor:
+def _open_loop(actions: Actions, name: str, env: Any) -> Actor:
     """Play actions of the environment one after another, and hold the last one."""
     checked(actions[0], env, name)
     rows = chain(actions, repeat(actions[-1]))
     return lambda _: next(rows)
 
 
-# --- what a user gives ------------------------------------------------------------------------
+# --- what a user gives ----------------------------------------------------------------------------
 
 
-def as_player(policy: Any, *, trusted: Sequence[str] | None = None) -> Player:
+def as_agent(policy: Any, *, trusted: Sequence[str] | None = None) -> Agent:
     """Read a policy.
 
     Args:
@@ -308,77 +293,23 @@ def as_player(policy: Any, *, trusted: Sequence[str] | None = None) -> Player:
         MissingExtra: The file needs a library that is not installed.
 
     Example:
-        >>> about = as_player("random").about
-        >>> about["kind"], player_from(about).about == about
+        >>> about = as_agent("random").about
+        >>> about["kind"], agent_from(about).about == about
         ('named', True)
     """
-    if isinstance(policy, Player):
+    if isinstance(policy, Agent):
         return policy
     if isinstance(policy, str | Path):
-        made = _of_text(str(policy), trusted)
-    elif isinstance(policy, np.ndarray | list | tuple):
-        made = _of_actions(policy, {"kind": "actions", "name": "actions"})
-    elif callable(policy) or hasattr(policy, "predict"):
-        made = _of_object(policy, _description(policy))
-    else:
-        raise UnknownOption("policy", policy, FORMS)
-    made.policy = policy
-    return made
+        return _of_text(str(policy), trusted)
+    if isinstance(policy, np.ndarray | list | tuple):
+        return _of_actions(policy)
+    if callable(policy) or hasattr(policy, "predict"):
+        return _of_object(policy, _description(policy))
+    raise UnknownOption("policy", policy, FORMS)
 
 
-def in_world(policy: Any, world: Simulation) -> Policy:
-    """Return a policy of observations as one of a world, for ``rollout`` and ``live``.
-
-    It observes what an environment would show it, and its actions are turned into commands.
-
-    Args:
-        policy: As in ``as_player``; one that says how it was trained gets such observations.
-        world: In which it acts, or one like it.
-
-    Raises:
-        UnknownOption: There is no such policy, or it was trained with other options.
-        SnapshotMismatch: When it acts: that world has another task or other options.
-        ActionError: When it acts: it has a memory, and this is not the control step after the last
-            one, as in a branch of an episode.
-
-    Example:
-        >>> from scm_world.queries import World
-        >>> world = World("pushing", backend="fake")
-        >>> world.rollout(in_world("zoo:pushing", world), steps=2).actions.shape
-        (2, 9)
-    """
-    player = as_player(policy)
-    options = {} if player.made_for is None else player.made_for.unusual(FORM)
-    env = ScmWorldEnv(
-        world.structures.task,
-        backend=world.backend.name,
-        preset=world.options.preset,
-        resolution=world.options.resolution,
-        frame_skip=world.options.frame_skip,
-        max_episode_length=world.options.given_length,
-        conventions=world.options.conventions.name,
-        **options,
-    )
-    remembers = player.made_for is not None and player.made_for.memory > 0
-    last = (-1, -1, -1)
-
-    def act(now: Simulation) -> Floats:
-        nonlocal last
-        env.world.restore(now.snapshot())
-        present = now.noise.seed, now.episode, now.index
-        if now.index > 0 and remembers and present != (*last[:2], last[2] + 1):
-            problem = "a policy with a memory acts from the first control step on, in one world"
-            raise ActionError(f"{problem}; make one for each branch, and begin at step 0", None)
-        if now.index == 0 or present[:2] != last[:2]:
-            player.begin(env)
-        last = present
-        return env.command(player.act(env.observe()))
-
-    return act
-
-
-def player_from(about: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Player:
-    """Make the player again that ``Player.about`` describes.
+def agent_from(about: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Agent:
+    """Make the agent again that ``Agent.about`` describes.
 
     Args:
         about: Description in a results file.
@@ -392,7 +323,7 @@ def player_from(about: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Pla
     kind, name = about.get("kind"), str(about.get("name"))
     advice = "give the policy itself: policy=…"
     if kind == "named" and name in NAMES:
-        return as_player(name)
+        return as_agent(name)
     if kind == "function":
         found = _resolved(name, trusted)
         if about.get("sees") == "world" and not isinstance(found, WorldPolicy):
@@ -404,42 +335,36 @@ def player_from(about: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Pla
     path = file_of(text)
     if _sha256(path, advice) != about["sha256"]:
         raise UnreadableFile(str(path), "it is another file than the one that acted", advice)
-    return as_player(text, trusted=trusted)
+    return as_agent(text, trusted=trusted)
 
 
-def _of_text(text: str, trusted: Sequence[str] | None) -> Player:
-    ours = _library(PACKAGE)
+def _of_text(text: str, trusted: Sequence[str] | None) -> Agent:
+    ours = _library("scm_world")
+    about: About
     if text in NAMES:
         about = {"kind": "named", "name": text, **ours}
-        return Player(about, partial(_of_world, partial(_named, text), text))
+        return Agent(about, partial(_of_world, partial(_named, text), text), text)
     if text.startswith(ZOO):
         path, about = file_of(text), {"kind": "zoo", "name": text, **ours}
     elif Path(text).is_dir():
         path = file_of(text)
         about = {"kind": "file", "name": Path(text).resolve().name, "path": str(path)}
-    elif Path(text).suffix in SUFFIXES:
+    elif Path(text).suffix in (".safetensors", ".zip"):
         path, about = Path(text), {"kind": "file", "name": Path(text).name, "path": text}
     elif ":" in text:
         about = {"kind": "function", "name": text, **_library(text)}
         return _of_object(_resolved(text, trusted), about)
     else:
         raise UnknownOption("policy", text, FORMS)
-    about["sha256"] = _sha256(path, _ADVICE)
-    if path.suffix == ".safetensors":
-        return _of_network(load_policy(path), about)
-    found = _archived(path, trusted or ())
+    about["sha256"] = _sha256(path, "give the path of a policy")
+    found = load_policy(path) if path.suffix == ".safetensors" else _archived(path, trusted or ())
     if isinstance(found, MlpPolicy):
-        return _of_network(found, about)
-    return Player({**about, **_library(SB3)}, partial(_model, found))
+        return Agent(about, partial(_network, found, about["name"]), text, found.made_for)
+    return Agent({**about, **_library(SB3)}, partial(_model, found), text)
 
 
 def _archived(path: Path, trusted: Sequence[str]) -> Any:
-    """Read an archive of Stable-Baselines 2, or the policy of one of Stable-Baselines3.
-
-    Raises:
-        UnreadableFile: It is neither, or one of Stable-Baselines3, and that is not trusted.
-        MissingExtra: Stable-Baselines3 is not installed.
-    """
+    """Read an archive of Stable-Baselines 2, or a trusted one of Stable-Baselines3."""
     try:
         return load_sb2(path)
     except UnreadableFile as error:
@@ -448,7 +373,7 @@ def _archived(path: Path, trusted: Sequence[str]) -> Any:
         if SB3 not in trusted:
             advice = (
                 f"if you trust it, say so by trusted=({SB3!r},), or --trust {SB3}, or give the "
-                "model: as_player(PPO.load(path))"
+                "model: as_agent(PPO.load(path))"
             )
             reason = "it is one of Stable-Baselines3, whose reading may run any code in it"
             raise UnreadableFile(str(path), reason, advice) from error
@@ -460,11 +385,11 @@ def _archived(path: Path, trusted: Sequence[str]) -> Any:
         kind = kind or ("PPO" if "clip_range" in data else "A2C")
         return getattr(library, kind).load(path, device="cpu").policy
     except Exception as error:  # of many kinds: torch, pickle, zip, Stable-Baselines3
-        advice = "load it yourself, and give the model: as_player(PPO.load(path))"
+        advice = "load it yourself, and give the model: as_agent(PPO.load(path))"
         raise UnreadableFile(str(path), f"it cannot be loaded ({error})", advice) from error
 
 
-def _of_actions(actions: Any, about: About) -> Player:
+def _of_actions(actions: Any) -> Agent:
     try:
         rows = np.atleast_2d(np.asarray(actions, dtype=getattr(actions, "dtype", np.float64)))
     except (TypeError, ValueError):
@@ -472,37 +397,29 @@ def _of_actions(actions: Any, about: About) -> Player:
     if rows.ndim != 2 or not len(rows):
         raise ActionError("actions have shape (n,) or (steps, n), with one step at least", actions)
     for row in rows:
-        checked(row, None, about["name"])
-    about = {"sha256": hashlib.sha256(rows.tobytes()).hexdigest(), **about}
-    return Player(about, partial(_open_loop, rows, about["name"]))
+        checked(row, None, "actions")
+    digest = hashlib.sha256(rows.tobytes()).hexdigest()
+    about = {"kind": "actions", "name": "actions", "sha256": digest}
+    return Agent(about, partial(_open_loop, rows, "actions"), actions)
 
 
-def _of_network(policy: MlpPolicy, about: About) -> Player:
-    start = partial(_network, policy, about["name"])
-    return Player(about, start, made_for=policy.made_for)
-
-
-def _of_object(policy: Any, about: About) -> Player:
-    if isinstance(policy, type):
-        return _of_object(policy(), about)
-    if isinstance(policy, WorldPolicy) or policy is still or isinstance(policy, OpenLoopPolicy):
-        inside = policy.policy if isinstance(policy, WorldPolicy) else policy
+def _of_object(policy: Any, about: About) -> Agent:
+    made = policy() if isinstance(policy, type) else policy
+    if isinstance(made, WorldPolicy | OpenLoopPolicy) or made is still:
+        inside = made.policy if isinstance(made, WorldPolicy) else made
         make = inside if isinstance(inside, type) else partial(_itself, inside)
-        start = partial(_of_world, make, about["name"])
-        return Player({**about, "sees": "world"}, start)
-    if isinstance(policy, MlpPolicy):
-        return _of_network(policy, {**about, "sha256": policy.sha256})
-    if hasattr(policy, "predict"):
-        return Player(about, partial(_model, policy), made_for=_env_of(policy))
-    return Player(about, partial(_function, policy))
-
-
-def _env_of(model: Any) -> PolicyAbout | None:
-    """Say what a model was trained for that still has an environment of this package."""
+        begin = partial(_of_world, make, about["name"])
+        return Agent({**about, "sees": "world"}, begin, policy)
+    if isinstance(made, MlpPolicy):
+        about = {**about, "sha256": made.sha256}
+        return Agent(about, partial(_network, made, about["name"]), policy, made.made_for)
+    if not hasattr(made, "predict"):
+        return Agent(about, partial(_function, made), policy)
     try:
-        return PolicyAbout.in_env(model.get_env())
-    except (AttributeError, UnknownOption):
-        return None
+        card = PolicyAbout.in_env(made.get_env())
+    except (AttributeError, UnknownOption):  # it has no environment of this package any more
+        card = None
+    return Agent(about, partial(_model, made), policy, card)
 
 
 def _description(policy: Any) -> About:
@@ -542,6 +459,6 @@ def _resolved(name: str, trusted: Sequence[str] | None) -> Any:
 
 def _sha256(path: Path, advice: str) -> str:
     try:
-        return hashlib.sha256(read_bytes(path, LARGEST_TABLE)).hexdigest()
+        return hashlib.sha256(read_bytes(path)).hexdigest()
     except OSError as error:
         raise UnreadableFile(str(path), error.strerror or str(error), advice) from None

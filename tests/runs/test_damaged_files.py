@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 from collections.abc import Callable
@@ -11,24 +10,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow
-import pyarrow.parquet
 import pytest
 
 from scm_world import SCM
 from scm_world.backends import read_model
 from scm_world.curricula import Curriculum
-from scm_world.discovery.data.folders import SIDECAR
-from scm_world.discovery.data.folders import load as dataset_of
+from scm_world.discovery.data import load as dataset_of
 from scm_world.errors import ModelError, ScmWorldError, UnreadableFile
 from scm_world.evaluation import Evaluation, evaluate
-from scm_world.evaluation.again import shard_runner_of
-from scm_world.evaluation.players import as_player
+from scm_world.evaluation.preparation import again
 from scm_world.evaluation.recording import Recording
 from scm_world.geometry.hulls import load_hull
 from scm_world.graph.files import from_dict, from_json
-from scm_world.output import reading
 from scm_world.policies import load_sb2
+from scm_world.policies.agents import as_agent
 from scm_world.queries import Plan, World, load_episode, save_episode
 from scm_world.training.recipe import Recipe
 from scm_world.variables import Derived, Exogenous
@@ -61,8 +56,8 @@ def _named_by(text: str, path: Path) -> Any:
 
 
 READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
-    "policy": (".safetensors", as_player),
-    "network": (".safetensors", as_player),
+    "policy": (".safetensors", as_agent),
+    "network": (".safetensors", as_agent),
     "archive": (".zip", load_sb2),
     "episode": (".npz", load_episode),
     "recording": (".parquet", Recording.load),
@@ -78,34 +73,23 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
 
 @pytest.mark.parametrize("reader", READERS)
 def test_files_without_an_end_are_not_opened(reader: str, tmp_path: Path) -> None:
-    """Nobody waits for a pipe, reads a device to its end, or fills the memory."""
+    """Nobody waits for a pipe, or reads a device to its end."""
     ending, read = READERS[reader]
-    path = tmp_path / (f"it{ending}" if reader != "dataset" else SIDECAR)
+    path = tmp_path / (f"it{ending}" if reader != "dataset" else "study.json")
     os.mkfifo(path)
-    with pytest.raises(ScmWorldError, match="not a regular file"):
+    with pytest.raises(ScmWorldError, match="regular file"):
         read(path)
     path.unlink()
     path.symlink_to("/dev/zero")
-    with pytest.raises(ScmWorldError, match="not a regular file"):
+    with pytest.raises(ScmWorldError, match="regular file"):
         read(path)
     path.unlink()
+    if reader == "dataset":  # what is large is read as far as there is memory
+        return
     with path.open("wb") as stream:
         stream.truncate(2**40)
     with pytest.raises(ScmWorldError, match=r"at most|cannot be read as a mesh"):
         read(path)
-
-
-def test_what_is_packed_in_a_file_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A small archive or table of large arrays is refused before it is unpacked."""
-    many = np.zeros(100_000)
-    np.savez_compressed(tmp_path / "it.npz", many=many)
-    stream = io.BytesIO()
-    pyarrow.parquet.write_table(pyarrow.table({"many": many}), stream)
-    monkeypatch.setattr(reading, "LARGEST_TABLE", 700_000)
-    with pytest.raises(OSError, match="at most 700,000"):
-        reading.read_arrays(tmp_path / "it.npz", 700_000)
-    with pytest.raises(ValueError, match="at most 700,000"):
-        reading.read_table(stream.getvalue())
 
 
 def test_functions_that_are_no_mechanisms_are_not_trusted() -> None:
@@ -180,7 +164,7 @@ def test_results_that_say_something_else_are_not_played_again(changed: dict[str,
     short = {"max_episode_length": 1}
     found = evaluate("still", "P0", task="reaching", n=1, backend="fake", env=short)
     with pytest.raises(ScmWorldError):
-        shard_runner_of(Evaluation({**found.about, **changed}, found.columns))
+        again(Evaluation({**found.about, **changed}, found.columns))
 
 
 def test_damaged_episodes_are_told(episode_file: Path, tmp_path: Path) -> None:
@@ -196,29 +180,3 @@ def test_damaged_episodes_are_told(episode_file: Path, tmp_path: Path) -> None:
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(UnreadableFile):
         load_episode(path)
-
-
-def test_results_with_another_bit_are_refused(tmp_path: Path) -> None:
-    """The summary has a checksum; spaces do not count."""
-    found = evaluate(
-        "still", "P0", task="pushing", n=2, backend="fake", env={"max_episode_length": 2}
-    )
-    summary, _ = found.save(tmp_path)
-    data, random = summary.read_bytes(), np.random.default_rng(0)
-    assert len(Evaluation.load(tmp_path)) == 2
-    whole = json.loads(data)
-    for place in random.choice(len(data), 120, replace=False):
-        changed = bytearray(data)
-        changed[place] ^= 1 << int(random.integers(7))
-        try:
-            same = json.loads(changed.decode()) == whole
-        except ValueError:
-            same = False
-        summary.write_bytes(bytes(changed))
-        if same:
-            continue
-        with pytest.raises(UnreadableFile):
-            Evaluation.load(tmp_path)
-    summary.write_text(DEEP)
-    with pytest.raises(UnreadableFile):
-        Evaluation.load(tmp_path)

@@ -11,8 +11,7 @@ import pytest
 from stores import MemoryFileSystem, fresh, refuse
 
 from scm_world.errors import MissingExtra, UnknownOption, UnwritableFolder
-from scm_world.output.durable import write_whole
-from scm_world.output.remote import Location, located
+from scm_world.runs.files import Location, located, write_whole
 
 
 @pytest.fixture(params=("path", "memory"))

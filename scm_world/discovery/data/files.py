@@ -1,0 +1,250 @@
+"""Datasets in folders: a study whose files are tables of Parquet."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from scm_world._arguments import typed, whole_number
+from scm_world.discovery.data.dataset import (
+    NUMBERS,
+    RESERVED,
+    TARGETS,
+    Column,
+    Dataset,
+    Regime,
+    check_names,
+)
+from scm_world.errors import DAMAGED, ModelError, UnreadableFile, in_one_line
+from scm_world.queries.plans import FORMAT as PLAN
+from scm_world.queries.plans import Plan
+from scm_world.runs.files import Location, located, read_bytes, read_text, write_whole
+from scm_world.runs.study import Study, settings_in
+
+KIND = "dataset"
+COUNT = "dataset.json"
+"""Holds how many episodes there are, once it is known, and how many files."""
+ABOUT = "table"
+"""What the settings have beside the ``about`` of the dataset: its columns, and the file size."""
+KEY = b"scm_world"
+
+
+def shard_name(index: int) -> str:
+    """Return the name of a file."""
+    return f"shard-{index:05d}.parquet"
+
+
+def settings_of(about: dict[str, Any], columns: Sequence[Column], shard: int) -> dict[str, Any]:
+    """Return the settings of a study; its episodes may become more.
+
+    Raises:
+        ModelError: ``about`` is not plain data, or a column has a name that all files have.
+    """
+    check_names(columns)
+    found = {**about, ABOUT: {"columns": [asdict(c) for c in columns], "shard": shard}}
+    try:
+        plain: dict[str, Any] = json.loads(json.dumps(found, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise ModelError([f"the dataset's 'about' is not plain data: {error}"]) from None
+    return plain
+
+
+def count_in(folder: Location) -> dict[str, int]:
+    """Return how many ``"episodes"`` and ``"files"`` a folder has when it is complete."""
+    path = folder / COUNT
+    try:
+        found = json.loads(read_text(path))
+        return {name: whole_number(name, found[name], least=0) for name in ("episodes", "files")}
+    except DAMAGED as error:
+        advice = "collect again with the same settings, or save the dataset again elsewhere"
+        raise UnreadableFile(str(path), in_one_line(error), advice) from None
+
+
+def write_count(folder: Location, episodes: int, files: int) -> None:
+    """Write what ``count_in`` returns."""
+    write_whole(folder / COUNT, json.dumps({"episodes": episodes, "files": files}) + "\n")
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def encoded(table: Dataset) -> bytes:
+    """Return rows as a Parquet file, the same bytes every time; regimes are in its metadata.
+
+    Raises:
+        ModelError: A plan has a function without a name.
+    """
+    import pyarrow as arrow
+    from pyarrow import parquet
+
+    used, number = np.unique(table.regime, return_inverse=True)
+    acts: dict[str, int] = {}  # many regimes share them: each is written once
+    regimes = []
+    for regime in (table.regimes[kind] for kind in used):
+        done = (json.dumps(act) for act in regime.plan.as_dict()["do"].items())
+        regimes.append([[acts.setdefault(act, len(acts)) for act in done], list(regime.targets)])
+    header = {"about": table.about, "acts": [json.loads(act) for act in acts], "regimes": regimes}
+    numbers = {"episode": table.episode, "step": table.step, "regime": number.reshape(-1)}
+    texts = [";".join(names) for names in table.target_names]
+    columns = {
+        **numbers,
+        TARGETS: arrow.array([texts[kind] for kind in table.regime], arrow.string()),
+        **dict(zip(table.names, table.values.T.copy(), strict=True)),
+    }
+    made = arrow.table(columns).replace_schema_metadata({KEY: json.dumps(header, sort_keys=True)})
+    sink = arrow.BufferOutputStream()
+    # Only words repeat; numbers keep every bit without a dictionary, and are faster.
+    how: Any = {"compression": "zstd", "use_dictionary": [TARGETS], "write_page_checksum": True}
+    parquet.write_table(made, sink, **how)
+    return bytes(sink.getvalue())
+
+
+def decoded(data: bytes, columns: Sequence[Column], trusted: Sequence[str]) -> Dataset:
+    """Read what ``encoded`` returned.
+
+    Raises:
+        ValueError: It is damaged, or has other columns.
+        ModelError: A plan names a function outside of the trusted packages.
+    """
+    import pyarrow as arrow
+    from pyarrow import parquet
+
+    try:
+        source = arrow.BufferReader(data)
+        file = parquet.read_table(source, use_threads=False, page_checksum_verification=True)
+    except (arrow.ArrowException, OSError) as error:
+        raise ValueError(f"it is not a whole Parquet file ({error})") from None
+    names = [column.name for column in columns]
+    if file.column_names != [*RESERVED, *names]:
+        raise ValueError("it has other columns")
+    header = json.loads(file.schema.metadata[KEY])
+    acts = [
+        (name, Plan.from_dict({"format": PLAN, "do": {name: parts}}, trusted=trusted)[name])
+        for name, parts in header["acts"]
+    ]
+    regimes = (
+        Regime(Plan(dict(acts[number] for number in numbers)), tuple(targets))
+        for numbers, targets in header["regimes"]
+    )
+    values = [file[name].to_numpy() for name in names]
+    return Dataset(
+        values=np.stack(values, axis=1) if values else np.empty((file.num_rows, 0)),
+        columns=tuple(columns),
+        regimes=tuple(regimes),
+        about=header["about"],
+        **{name: file[name].to_numpy().astype(np.int64) for name in NUMBERS},
+    )
+
+
+# --- whole datasets -------------------------------------------------------------------------------
+
+
+def together(settings: Mapping[str, Any], parts: Sequence[Dataset]) -> Dataset:
+    """Return the rows of all files as one table, with all that is said of its episodes."""
+    about = {name: value for name, value in settings.items() if name != ABOUT}
+    said = {
+        name: {number: each for part in parts for number, each in part.about.get(name, {}).items()}
+        for name in ("refused", "touching")
+    }
+    about |= {"refused": said["refused"]} if said["refused"] else {}
+    if "contacts" in about and "touching" not in about:  # a saved table has it
+        whole = about["contacts"] == "episodes"
+        about["touching"] = {"whole": whole, "episodes": said["touching"]}
+    return replace(Dataset.joined([replace(part, about={}) for part in parts]), about=about)
+
+
+@typed
+def load(folder: Location | str, *, trusted: Sequence[str] = (), partial: bool = False) -> Dataset:
+    """Read a dataset.
+
+    Args:
+        folder: A folder, or a URL, that ``collect`` or ``save`` wrote.
+        trusted: Packages other than this one whose functions may be mechanisms of its plans.
+        partial: Whether files may be missing, since a collection was interrupted.
+
+    Raises:
+        UnreadableFile: A file is missing, damaged, or of another kind; the error names it and the
+            remedy.
+        ModelError: A plan names a function outside of the trusted packages.
+    """
+    place = located(folder)
+    settings = settings_in(place, KIND)
+    parts = [*batches(place, trusted=trusted, partial=partial)]
+    columns, none = _columns(settings), np.zeros(0, dtype=np.int64)
+    empty = Dataset(np.empty((0, len(columns))), columns, (), none, none, none)
+    return together(settings, parts or [empty])
+
+
+@typed
+def batches(
+    folder: Location | str, *, trusted: Sequence[str] = (), partial: bool = False
+) -> Iterator[Dataset]:
+    """Read a dataset file by file, in bounded memory; see ``load``.
+
+    Returns:
+        The rows of each file. Their ``about`` has which episodes were ``"refused"``.
+    """
+    place = located(folder)
+    columns = _columns(settings_in(place, KIND))
+    for path in (place / shard_name(index) for index in range(count_in(place)["files"])):
+        try:
+            yield decoded(read_bytes(path), columns, trusted)
+        except FileNotFoundError:
+            if partial:
+                continue
+            advice = "collect again with the same settings to go on, or load it with partial=True"
+            raise UnreadableFile(str(path), "it is not there yet", advice) from None
+        except DAMAGED as error:
+            if isinstance(error, ModelError) and "trusted" in str(error):
+                raise
+            advice = "delete it, and collect again with the same settings: only it is made anew"
+            raise UnreadableFile(str(path), in_one_line(error), advice) from None
+
+
+def _columns(settings: Mapping[str, Any]) -> tuple[Column, ...]:
+    return tuple(Column(**column) for column in settings[ABOUT]["columns"])
+
+
+@typed
+def save(
+    dataset: Dataset | Iterable[Dataset], folder: Location | str, *, shard: int = 10_000
+) -> Location:
+    """Write a dataset to a new folder, without loss.
+
+    Args:
+        dataset: A table, or tables of the same columns and ``about``, which are written one by one
+            in bounded memory. Their ``about`` has to be plain data.
+        folder: New or empty; it may be a URL.
+        shard: How many episodes are in a file, at most.
+
+    Raises:
+        UnreadableFile: Something is in the folder.
+        UnwritableFolder: There is no room, or no permission.
+        ModelError: A part of it cannot be written.
+    """
+    place, size = located(folder), whole_number("shard", shard, least=1)
+    if place.exists() and any(True for _ in place.iterdir()):
+        raise UnreadableFile(str(place), "it is not empty", "give a new or an empty folder")
+    tables = iter([dataset] if isinstance(dataset, Dataset) else dataset)
+    first = next(tables, None)
+    if first is None:
+        raise ModelError(["there is no table to save"])
+    episodes = files = 0
+    with Study(place, KIND, settings_of(first.about, first.columns, size)):
+        for table in itertools.chain([first], tables):
+            if table.columns != first.columns or table.about != first.about:
+                raise ModelError(["tables with other columns or from elsewhere cannot be joined"])
+            starts = np.flatnonzero(np.diff(table.episode, prepend=table.episode[:1] - 1))
+            ends = [*starts[::size], len(table)]
+            for begin, end in itertools.pairwise(ends):
+                rows = replace(table.rows(slice(begin, end)), about={})
+                write_whole(place / shard_name(files), encoded(rows))
+                files += 1
+            episodes += len(starts)
+        write_count(place, episodes, files)
+    return place

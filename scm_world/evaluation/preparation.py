@@ -1,0 +1,382 @@
+"""Preparing an evaluation: agents, their task and options, and the first try of everything.
+
+A trained policy says with which options it was trained. What is observed and what actions mean may
+differ between agents of one evaluation: each acts in an environment of its own form, with the same
+draws. The length of a control step and the conventions are shared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from scm_world._arguments import one_of, whole_number
+from scm_world._fingerprint import differing, fingerprint
+from scm_world.backends import backends
+from scm_world.env import ENV_OPTIONS, ScmWorldEnv
+from scm_world.errors import (
+    DAMAGED,
+    EvaluationError,
+    ModelError,
+    ScmWorldError,
+    SnapshotMismatch,
+    UnknownOption,
+    in_one_line,
+)
+from scm_world.evaluation.episodes import EpisodeRunner, unrelated
+from scm_world.evaluation.protocols import Protocol, chosen, named, protocols_of
+from scm_world.evaluation.setups import Setup, several
+from scm_world.policies.agents import Agent, agent_from, as_agent
+from scm_world.policies.cards import COMMON, FORM, FREE, contradiction, plain, usual
+from scm_world.queries.experiments.versions import versions
+from scm_world.queries.plans import FORMAT, Plan
+from scm_world.tasks import Task, tasks
+from scm_world.tasks.factories import is_model, refuse_untrusted
+
+_MINE = ("task", "backend", "render_mode")
+"""Options of the environment that an evaluation sets by itself."""
+
+TASK = "pushing"
+"""The default task of agents that name none."""
+
+_TRIES = 25  # observations on which a policy without a file is tried out
+
+Agents = Mapping[tuple[str, int], Agent]
+"""Agents by name and training run."""
+
+
+def prepare(
+    policy: Any,
+    protocols: Any,
+    *,
+    task: Task | str | None,
+    n: int,
+    seeds: Any,
+    backend: Any,
+    env: Mapping[str, Any] | None,
+    trusted: Sequence[str] | None,
+) -> Setup:
+    """Check everything that can be checked before the first episode.
+
+    The arguments are those of ``evaluate``.
+
+    Raises:
+        ScmWorldError: What is wrong, by name.
+    """
+    agents = load_agents(policy, trusted)
+    for (name, _), agent in agents.items():
+        about = agent.about
+        learned = str(about.get("path", "")).endswith(".zip") and "library" in about
+        learned = learned or (hasattr(agent.policy, "predict") and "sha256" not in about)
+        if learned and agent.card is None and not {*FORM} & {*(env or {})}:
+            gymnasium.logger.warn(
+                f"{name!r} does not say how it observes and acts; it acts here with the "
+                "defaults of gymnasium.make, and recipes train with other actions: give "
+                "env={'action_mode': …} as in its training, or a file that export_sb3 has written"
+            )
+    task = task_for(task, agents, trusted or ())
+    if not isinstance(task, Task | str):
+        raise UnknownOption("task", task, tasks())
+    if not isinstance(env, Mapping | None):
+        raise UnknownOption("env", env, ("options of the environment, by name",))
+    for name in env or {}:
+        allowed = [name for name in ENV_OPTIONS if name not in _MINE]
+        one_of("option of the environment", name, allowed)
+    engines = several("backend", backend)
+    for engine in engines:
+        if not isinstance(engine, str) or engine not in backends():
+            raise UnknownOption("backend", engine, backends())
+    texts = several("seeds", seeds)
+    noises = tuple(int(s) if isinstance(s, str) and s.isdecimal() else s for s in texts)
+    for noise in noises:
+        if whole_number("seed", noise, least=0) >= 2**63:
+            raise UnknownOption("seed", noise, ("any whole number below 2**63",))
+    count = whole_number("n", n, least=1)
+    place = Setup(task, shared_options(env, agents), agents, engines, {}, noises, count)
+    wanted = {one.name: one for one in chosen(protocols, protocols_of(place.made, engines[0]))}
+    found: dict[str, dict[str, str]] = {}
+    silent: dict[str, tuple[str, ...]] = {}
+    for engine in engines:
+        with closing(EpisodeRunner(place.env(engine))) as runner:
+            for protocol in wanted.values():
+                runner.try_out(protocol, seed=noises[0])
+            found[engine] = versions(runner.env.world.engine)
+            for (name, run), agent in agents.items() if engine == engines[0] else ():
+                own = runner.env if agent.card is None else place.env(engine, agent)
+                try:
+                    _try_out(agent, own)
+                    silent[name] = unrelated(own, agent.about)
+                except ScmWorldError as error:
+                    raise EvaluationError({"agent": name, "run": run}, str(error)) from error
+                finally:
+                    if own is not runner.env:
+                        own.close()
+    setup = Setup(task, place.options, agents, engines, wanted, noises, count, found, silent)
+    setup.about()  # refuses what cannot be written down, before any time is spent
+    return setup
+
+
+def _try_out(agent: Agent, env: ScmWorldEnv) -> None:
+    """Let an agent act; describe a policy without a file by its source and by what it repeats."""
+    is_known = "sha256" in agent.about or agent.about.get("kind") == "named"
+    traits: dict[str, Any] = (
+        {} if is_known else {"fingerprint": fingerprint({"policy": agent.policy})}
+    )
+    actions = _walked(agent, env, 1 if is_known else _TRIES)
+    if not is_known and actions != _walked(agent, env, _TRIES):
+        traits["repeats"] = "no"
+    agent.about |= traits
+
+
+def _walked(agent: Agent, env: Any, steps: int) -> list[bytes]:
+    """Return its actions along a random walk that is always the same one."""
+    observation, _ = env.reset(seed=0)
+    agent.start(env)
+    walk = np.random.default_rng(0)
+    low, high = np.clip(env.action_space.low, -1e3, 1e3), np.clip(env.action_space.high, -1e3, 1e3)
+    found = []
+    for _ in range(steps):
+        found.append(agent.act(observation).tobytes())
+        taken = walk.uniform(low, high).astype(np.float32)
+        observation, _, terminated, truncated, _ = env.step(taken)
+        if terminated or truncated:
+            break
+    return found
+
+
+# --- agents ---------------------------------------------------------------------------------------
+
+
+def load_agents(policy: Any, trusted: Sequence[str] | None) -> dict[tuple[str, int], Agent]:
+    """Load the agents by name and training run; they are not tried out yet.
+
+    Args:
+        policy: A policy; a list of them, one for each training run; or either by the name of the
+            agent. Without a name, it is the last part of a path or of a module, as it can stand in
+            a table.
+        trusted: Packages whose functions may be policies, if named by a text.
+
+    Raises:
+        UnknownOption: There is none, or two have one name.
+    """
+    found: dict[tuple[str, int], Agent] = {}
+    for given, run, one in listed(policy):
+        agent = as_agent(one, trusted=trusted)
+        last = str(agent.about["name"]).replace("\\", "/").rstrip("/").rpartition("/")[2]
+        name = last.rpartition(":")[2].replace(",", " ").strip() or "policy"
+        if given is not None:
+            name = given
+        elif found:  # a list is one agent
+            name = next(iter(found))[0]
+        found[named("name of an agent", name), run] = agent
+    if not found:
+        raise UnknownOption("policy", policy, ("one or several",))
+    return found
+
+
+def listed(policy: Any) -> Iterator[tuple[str | None, int, Any]]:
+    """List policies with agent and training run; the agent is None if it was not named.
+
+    Raises:
+        UnknownOption: The list of an agent is empty.
+
+    Example:
+        >>> list(listed({"mine": ["a.zip", "b.zip"], "other": "still"}))
+        [('mine', 0, 'a.zip'), ('mine', 1, 'b.zip'), ('other', 0, 'still')]
+    """
+    agents = policy if isinstance(policy, Mapping) else {None: policy}
+    for agent, given in agents.items():
+        # A list of numbers is actions, of one policy.
+        is_numbers = isinstance(given, list) and given and isinstance(given[0], list | float | int)
+        runs = given if isinstance(given, list) and not is_numbers else [given]
+        if not runs:
+            raise UnknownOption(f"policies of {agent}", given, ("one policy or more",))
+        if agent is not None:
+            named("name of an agent", agent)
+        for run, one in enumerate(runs):
+            yield agent, run, one
+
+
+# --- tasks and options ----------------------------------------------------------------------------
+
+
+def task_of(policy: Any, trusted: Sequence[str] | None = None) -> str:
+    """Return the name of the default task of policies; arguments as in ``prepare``.
+
+    Raises:
+        ScmWorldError: A policy cannot be read, or they were trained for several tasks.
+    """
+    return str(task_for(None, load_agents(policy, trusted), trusted or ()))
+
+
+def task_for(task: Task | str | None, agents: Agents, trusted: Sequence[str] = ()) -> Task | str:
+    """Choose the task: the one that is given, else the one that the agents were trained for.
+
+    Warn of an agent that was trained for another task than the one that is given.
+
+    Args:
+        task: If it is given.
+        agents: The agents.
+        trusted: Packages whose functions may be called for a task that only a policy names.
+
+    Raises:
+        UnknownOption: They were trained for several, or for a function of no trusted package.
+    """
+    cards = {name: agent.card for (name, _), agent in agents.items() if agent.card is not None}
+    if task is not None:
+        given = getattr(task, "name", task)
+        for name, card in cards.items():
+            if card.task != given:
+                gymnasium.logger.warn(
+                    f"{name!r} was trained for the task {card.task!r}, and acts in {given!r}"
+                )
+        return task
+    trained = list(dict.fromkeys(card.task for card in cards.values()))
+    if len(trained) > 1:
+        raise UnknownOption("task", None, [f"{one!r}" for one in trained])
+    for one in trained:
+        refuse_untrusted(one, trusted)
+    return trained[0] if trained else TASK
+
+
+def shared_options(given: Mapping[str, Any] | None, agents: Agents) -> dict[str, Any]:
+    """Choose the options of the environment that are shared by all agents.
+
+    Args:
+        given: What the user asks for; it counts. Options of ``FORM`` among it are for the agents
+            that do not say how they were trained.
+        agents: The agents.
+
+    Raises:
+        UnknownOption: An option contradicts an agent, or agents contradict one another.
+    """
+    found = dict(given or {})
+    trained = [(name, agent.card) for (name, _), agent in agents.items() if agent.card is not None]
+    all_say = bool(trained) and len(trained) == len(agents)
+    for option in (*FORM, *COMMON) if all_say else COMMON:
+        for name, card in trained:
+            wanted = card.option(option)
+            if option in found and wanted is not None and plain(found[option]) != wanted:
+                raise contradiction(option, found[option], wanted, name)
+    if all_say:
+        found = {option: value for option, value in found.items() if option not in FORM}
+    for option in (name for name in (*COMMON, *FREE) if name not in found):
+        options = [card.option(option) for _, card in trained]
+        if any(one != options[0] for one in options):
+            each = "; ".join(f"{name} with {card.option(option)!r}" for name, card in trained)
+            allowed = f"the same for all agents, and they were trained {each}: "
+            allowed += "evaluate them apart" if option in COMMON else f"give {option} in env"
+            raise UnknownOption(option, "several values", (allowed,))
+        if options and options[0] != usual(option, trained[0][1].task):
+            found[option] = options[0]
+    return found
+
+
+# --- an evaluation that was run -------------------------------------------------------------------
+
+
+def again(
+    evaluation: Any, policy: Any = None, task: Task | str | None = None, trusted: Sequence[str] = ()
+) -> Setup:
+    """Prepare to run episodes of an evaluation again: the agents and backends of its table.
+
+    Args:
+        evaluation: That was run.
+        policy: As it was given to ``evaluate``; if None the one that was given in this process, or
+            one made again from its description.
+        task: If it is a task of the user's own class.
+        trusted: Packages whose functions may be policies, or parts of protocols.
+
+    Raises:
+        SnapshotMismatch: It was made with other versions.
+        UnknownOption: A policy cannot be made again, or the task is not registered.
+        UnreadableFile: The file of a policy has changed.
+    """
+    about = evaluation.about
+    try:
+        options = _acts(about["env"], trusted)
+        if task is None:
+            task = text = str(about["task"])
+            refuse_untrusted(text, None if evaluation.policies else trusted)
+            if text not in tasks() and not is_model(text) and ":" not in text:
+                raise UnknownOption("task", text, (*tasks(), "one of your own, if given: task="))
+            if about["arguments"]:
+                options["task_options"] = about["arguments"]
+        protocols = [Protocol.from_dict(one, trusted=trusted) for one in about["protocols"]]
+        setup = Setup(
+            task,
+            options,
+            dict(_acted(evaluation, policy, trusted)),
+            evaluation.engines,
+            {one.name: one for one in protocols},
+            tuple(about["seeds"]),
+            about["n"],
+            about["versions"],
+        )
+        now = setup.made.__fingerprint__()
+        there = {name: part for name, part in about["fingerprint"].items() if name in now}
+        if parts := differing(there, fingerprint(now, libraries=False)):
+            advice = f"the one that was evaluated, given as task=: {', '.join(parts)} differ"
+            raise UnknownOption("task", setup.place["task"], (advice,))
+        for engine in setup.engines:
+            _same_versions(about["versions"][engine], setup.env(engine))
+        return setup
+    except DAMAGED as error:
+        if isinstance(error, ScmWorldError):
+            raise
+        problem = f"the description of the evaluation cannot be used: {in_one_line(error)}"
+        raise ModelError([problem]) from error
+
+
+def _acted(
+    evaluation: Any, policy: Any, trusted: Sequence[str]
+) -> Iterator[tuple[tuple[str, int], Agent]]:
+    """Find who acted: the policy given now, one in a file, one given then, or one by its name."""
+    agents = {(one["agent"], one["run"]): one for one in evaluation.about["agents"]}
+    names = list(dict.fromkeys(agent for agent, _ in agents))
+    if policy is not None and not isinstance(policy, Mapping):
+        if len(names) > 1:
+            raise UnknownOption("policy", policy, (f"one by the name of each of {names}",))
+        policy = {names[0]: policy}
+    given = {(str(agent), run): one for agent, run, one in listed(policy or {})}
+    for agent, run in given.keys() - agents.keys():
+        raise UnknownOption("policy", f"{agent}, run {run}", [f"{a}, run {r}" for a, r in agents])
+    for who, one in agents.items():
+        if who[0] not in evaluation.agents:
+            continue
+        what = one["policy"]
+        if who in given:
+            yield who, as_agent(given[who])
+        elif who in evaluation.policies and "path" not in what:
+            yield who, as_agent(evaluation.policies[who])
+        else:
+            yield who, agent_from(what, trusted=trusted)
+
+
+def _acts(options: Any, trusted: Sequence[str]) -> Any:
+    """Read the interventions among the options of an environment, which were written down."""
+    if not isinstance(options, Mapping):
+        return options
+    if isinstance(options.get("kind"), str):
+        data = {"format": FORMAT, "do": {"option": [options]}}
+        return Plan.from_dict(data, trusted=trusted)["option"][0]
+    return {name: _acts(value, trusted) for name, value in options.items()}
+
+
+def _same_versions(then: Mapping[str, str], env: ScmWorldEnv) -> None:
+    now = versions(env.world.engine)
+    env.close()
+    differ = [
+        f"{package} {then.get(package, 'none')} (here {now.get(package, 'none')})"
+        for package in sorted(then.keys() | now.keys())
+        if then.get(package) != now.get(package)
+    ]
+    if differ:
+        raise SnapshotMismatch(
+            f"it was made with {', '.join(differ)}; the same bits are promised for the same "
+            "versions only: install those"
+        )
