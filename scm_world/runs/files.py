@@ -59,9 +59,9 @@ def located(given: Location | str) -> Location:
     protocol, slashes, rest = given.partition("://")
     if not slashes:
         return Path(given)
-    if protocol == "file" and rest.startswith("/"):
-        return Path(unquote(rest))
-    if protocol in ("", "file"):
+    if protocol in ("file", "local") and rest.removeprefix("localhost").startswith("/"):
+        return Path(unquote(rest.removeprefix("localhost")))
+    if protocol in ("", "file", "local"):
         raise UnknownOption("URL", given, ("s3://bucket/run", "file:///… with three slashes"))
     if _PASSWORD.search(given):
         safe = ["one without a password: fsspec reads it from its own configuration"]

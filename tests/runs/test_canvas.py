@@ -22,6 +22,7 @@ def test_a_picture_is_written_whole(tmp_path: Path) -> None:
 
 
 def test_a_picture_nowhere_is_an_error_of_ours(tmp_path: Path) -> None:
-    """The folder has to be there."""
-    with pytest.raises(UnwritableFolder, match=r"sheet\.png"):
-        save(blank(), tmp_path / "none" / "sheet.png")
+    """There can be no folder in the place of a file."""
+    (tmp_path / "file").touch()
+    with pytest.raises(UnwritableFolder, match="file"):
+        save(blank(), tmp_path / "file" / "sheet.png")
