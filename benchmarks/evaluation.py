@@ -151,7 +151,7 @@ def whole(n: int, core: int) -> dict[str, Any]:
     return {
         "episodes": len(one),
         "versions": one.about["versions"],
-        "control steps": int(one.columns["steps"].sum()),
+        "control steps": int(one.frame["steps"].sum()),
         "one worker": single,
         "two workers": {"seconds": double["seconds"]},
         "shards": len(one.protocols) * -(-n // SHARD),

@@ -13,7 +13,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.evaluation.episodes import EpisodeRunner, Hook, Scores
 from scm_world.evaluation.protocols import Protocol, protocols_of
 from scm_world.policies.agents import as_agent
-from scm_world.world import WorldSnapshot
+from scm_world.world import Snapshot
 
 
 class Recorder:
@@ -36,7 +36,7 @@ class Beginning(Hook):
 
     def begin(self, env: ScmWorldEnv, observation: Any) -> None:
         """Save the world after the reset."""
-        self.snapshot: WorldSnapshot = env.world.snapshot()
+        self.snapshot: Snapshot = env.world.snapshot()
 
 
 def shares(task: str, episodes: int) -> dict[str, float]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         World,
         do,
     )
-    from scm_world.queries.verify import verify
+    from scm_world.queries.verification import verify
     from scm_world.tasks import ModelTask, StepTask, Task, TriFingerTask, make_task
     from scm_world.variables import (
         Action,

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, Any
 from uuid import uuid4
 
@@ -23,6 +24,7 @@ from scm_world.cli.arguments import suffix
 from scm_world.runs.files import Location, made, removed, write_whole
 
 WIDTH, PAGE = 160, 200  # [characters] where there is no terminal to ask; for the widest tables
+LONG = 80  # [characters] longer lists are written once
 RESULTS = Path("scm-world-results")
 INTERRUPTED = 130  # exit code after Ctrl-C
 
@@ -84,6 +86,50 @@ def table(
     for row in rows:
         made.add_row(*(cell if isinstance(cell, Text) else Text(str(cell)) for cell in row))
     terminal(width=width, file=file).print(made)
+
+
+def edge_table(
+    names: Sequence[str],
+    edges: Mapping[tuple[str, str, int], str],
+    *,
+    signs: Mapping[str, str] = MappingProxyType({}),
+    file: IO[str] | None = None,
+    **how: Any,
+) -> None:
+    """Print one row per variable with its causes, and the names of variables without causes.
+
+    Args:
+        names: The variables.
+        edges: The style of each edge (cause, effect, lag).
+        signs: What stands before causes of a style.
+        file: Where to; standard output if None.
+        how: See ``table``.
+    """
+    from scm_world.discovery.names import by_entity
+
+    first: dict[str, str] = {}  # the variable at which a long list of causes is written
+    rows, roots = list[tuple[object, ...]](), []
+    for effect in names:
+        cells = []
+        for lag in (0, 1):
+            styles = {cause: edges.get((cause, effect, lag)) for cause in names}
+            parts = [
+                Text(signs.get(style, "") + short, style)
+                for style in dict.fromkeys(style for style in styles.values() if style is not None)
+                for short in by_entity(cause for cause in names if styles[cause] == style)
+            ]
+            cell = Text(", ").join(parts)
+            like = first.setdefault(cell.plain, effect)
+            again = like != effect and len(cell) > LONG
+            cells.append(Text(f"same as {like}", "italic") if again else cell)
+        if any(cells):
+            rows.append((Text(effect, "bold"), *cells))
+        else:
+            roots.append(effect)
+    headers = ("variable", "causes at once", "causes one step earlier")
+    table(headers, rows, whole=(0,), file=file, **how)
+    if roots:
+        terminal(file=file).print(Text(f"without causes: {', '.join(by_entity(roots))}"))
 
 
 def facts(rows: Any) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from enum import StrEnum
 from io import StringIO
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.text import Text
@@ -18,9 +18,7 @@ from scm_world.errors import UnknownOption
 if TYPE_CHECKING:
     from scm_world.graph import SCM
 
-KIND_STYLE = {"exogenous": "yellow", "derived": "green", "measured": "blue", "action": "magenta"}
-LONG = 80  # [characters] what is longer is written once
-Format = StrEnum("Format", ["table", "json", "png", "html", "graphml"])
+Format = StrEnum("Format", ["table", "json", "png", "graphml"])
 """How a graph is written down."""
 
 
@@ -49,7 +47,7 @@ def graph(
 ) -> None:
     """Show the declared causal graph of a system.
 
-    Example: scm-world graph pushing --out graph.html
+    Example: scm-world graph pushing --out graph.png
 
     Args:
         format_: How to write it.
@@ -79,13 +77,15 @@ def graph(
 
             draw_model(model, out, title=title)
         case "table":
-            _parents_table(model, None if out is None else page)
+            edges = {edge.key: "" for edge in model.edges}
+            console.edge_table(
+                tuple(model),
+                edges,
+                title=f"{len(model)} variables, {len(edges)} edges",
+                file=None if out is None else page,
+            )
         case "json":
             page.write(to_json(model) + "\n")
-        case "html":
-            from scm_world.discovery.model_pictures import to_html
-
-            page.write(to_html(model, title=title))
         case "graphml":
             import networkx as nx
 
@@ -98,81 +98,33 @@ def graph(
     console.say(f"written: {out}", stderr=True)
 
 
-def _parents_table(model: SCM, file: IO[str] | None) -> None:
-    """Print one row per variable; rows that differ in a number of the name only become one."""
-    from scm_world.discovery.names import braces, by_entity
-
-    alike: dict[tuple[str, ...], list[str]] = {}
-    for variable in model.variables:
-        given: Any = variable
-        parents = []
-        for lag in (0, 1):
-            here = {parent.name for parent in variable.all_parents if parent.lag == lag}
-            if here:
-                short = by_entity(name for name in model if name in here)
-                parents.append(f"lag {lag}: {', '.join(short)}")
-        cells = (
-            given.kind if given.kind == variable.role else f"{given.kind}\n{variable.role}",
-            *_described(given, variable.a, variable.b),
-            "\n".join(parents),
-        )
-        alike.setdefault(cells, []).append(variable.name)
-    first: dict[str, str] = {}  # the variable at which a long list of parents is written out
-    rows: list[tuple[object, ...]] = []
-    for (kind, *rest, links), names in alike.items():
-        for name in braces(names):
-            lines = links.splitlines()
-            for number, line in enumerate(lines):
-                like = first.setdefault(line, name)
-                if like != name and len(line) >= LONG:
-                    lines[number] = f"{line.partition(':')[0]}: same as {like}"
-            style = KIND_STYLE.get(kind.partition("\n")[0], "")
-            rows.append((Text(name, "bold"), Text(kind, style), *rest, "\n".join(lines)))
-    console.table(
-        ("variable", "kind", "unit", "shape", "default", "A", "B", "parents"),
-        rows,
-        title=f"{len(model)} variables, {len(model.edges)} edges",
-        whole=(0,),
-        width=console.PAGE,
-        file=file,
-    )
-
-
-def _described(variable: Any, *spaces: Any) -> tuple[str, ...]:
-    """Return a variable's unit, shape and default, and the lines of its spaces."""
-    from scm_world.graph.exchange import space_lines
-
-    default = getattr(variable, "value" if variable.kind == "fixed" else "default", None)
-    text = "" if default is None else console.show(default)
-    if variable.kind == "measured" and variable.start is not None:
-        text = "follows lag 0"
-    shape = "x".join(map(str, variable.shape)) or "-"
-    return variable.unit, shape, text, *("\n".join(space_lines(space)) for space in spaces)
-
-
 def variables(task: options.System, option: options.Option = None) -> None:
     """Show every variable of a system: role, unit, shape, default, and the spaces A and B.
 
     A is the training space, B the held-out one. "Possible" is what physics allows.
     Example: scm-world variables pushing
     """
+    from scm_world.graph.exchange import space_lines
+
     model, rows = _model(task, option), list[tuple[object, ...]]()
     for variable in model.variables:
         given: Any = variable
+        default = getattr(given, "value" if given.kind == "fixed" else "default", None)
+        text = "" if default is None else console.show(default)
+        spaces = (variable.bounds, variable.a, variable.b)
         rows.append(
             (
                 Text(variable.name, "bold"),
-                Text(variable.role, KIND_STYLE.get(given.kind, "")),
-                *_described(given, variable.bounds, variable.a, variable.b),
+                variable.role,
+                variable.unit,
+                "x".join(map(str, variable.shape)) or "-",
+                "follows lag 0" if getattr(given, "start", None) is not None else text,
+                *("\n".join(space_lines(space)) for space in spaces),
             )
         )
-    console.table(
-        ("variable", "role", "unit", "shape", "default", "possible", "A", "B"),
-        rows,
-        title=f"{len(model)} variables",
-        whole=(0,),
-        width=console.PAGE,
-    )
+    heads = ("variable", "role", "unit", "shape", "default", "possible", "A", "B")
+    title = f"{len(model)} variables"
+    console.table(heads, rows, title=title, whole=(0,), width=console.PAGE)
 
 
 def list_(zoo: bool = False) -> None:
@@ -247,7 +199,7 @@ def list_(zoo: bool = False) -> None:
             name: ": ".join(filter(None, (one.task, policies.best_known(one))))
             for name, one in trained.items()
         },
-        "families": {f"{name}:N": first_line(draw.__doc__) for name, draw in FAMILIES.items()}
+        "families": {f"{name}:N": family.doc for name, family in FAMILIES.items()}
         | {f"{name}:N": doc for name, doc in PHYSICS.items()},
         "environments": {name: f"gymnasium.make({name!r})" for name in IDS},
     }

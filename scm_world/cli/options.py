@@ -1,6 +1,6 @@
 """Options that several commands share, and how the help of all others is read.
 
-What an option means is said in the docstring of its command, or here if several have it.
+The help of an option stands in the docstring of its command, or here if several have it.
 """
 
 from __future__ import annotations
@@ -23,43 +23,16 @@ if TYPE_CHECKING:
     from scm_world.runs.pool import Pool
 
 
-def documented(command: Callable[..., None]) -> str:
-    """Give the options of a command the help texts that its docstring has under Args.
-
-    Returns:
-        The help text of the command: the rest of the docstring.
-    """
-    text, _, described = (inspect.getdoc(command) or "").partition("\n\nArgs:\n")
-    found = re.findall(r"^ {4}(\w+): (.*(?:\n {6,}.*)*)", described, flags=re.MULTILINE)
-    helps = {name: " ".join(said.split()) for name, said in found}
-    hints = get_type_hints(command, include_extras=True)
-    for name in inspect.signature(command).parameters:
-        if name in helps:
-            kind, *given = get_args(hints[name]) if _is_annotated(hints[name]) else (hints[name],)
-            flag = (f"--{name.replace('_', '-')}",) if kind is bool else ()
-            option = copy.copy(given[0]) if given else typer.Option(*flag)
-            option.help = helps[name]
-            command.__annotations__[name] = Annotated[kind, option]
-    return text
-
-
-def _is_annotated(hint: Any) -> bool:
-    return hasattr(hint, "__metadata__")
-
-
 # --- kinds of options -----------------------------------------------------------------------------
 
 Text = str | None
 Count = Annotated[int, typer.Option(min=1)]
-MaybeCount = Annotated[int | None, typer.Option(min=1)]
 NotNegative = Annotated[int, typer.Option(min=0)]
 Amount = Annotated[float, typer.Option(min=0.0)]
 N = Annotated[int, typer.Option("-n", "--n", min=1)]
 Patterns = Annotated[list[str] | None, typer.Option(metavar="PATTERN")]
 Pairs = Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE")]
 Do = Annotated[list[str] | None, typer.Option("--do", metavar="NAME=VALUE")]
-
-# --- systems --------------------------------------------------------------------------------------
 
 System = Annotated[
     str,
@@ -76,44 +49,6 @@ Systems = Annotated[
         help="A task, a model.xml, model.urdf or model.json, module:name, or 'all'.",
     ),
 ]
-Option = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME=VALUE",
-        help="Argument of the task or model, such as num_of_levels=2 or control_dt=0.01; "
-        "repeat it for more.",
-    ),
-]
-Backend = Annotated[
-    str | None,
-    typer.Option(
-        help="Physics backend: mujoco, bullet, step or fake; see 'scm-world list'.",
-        show_default="that of the task",
-    ),
-]
-Preset = Annotated[
-    str | None,
-    typer.Option(help="Physics time step of the TriFinger: fast or precise.", show_default="fast"),
-]
-Resolution = Annotated[
-    str | None,
-    typer.Option(
-        help="Nodes of the TriFinger's graph: vector, finger or joint.", show_default="vector"
-    ),
-]
-
-# --- episodes and interventions -------------------------------------------------------------------
-
-Seed = Annotated[int, typer.Option(min=0, help="Seed of every random choice.")]
-Steps = Annotated[int, typer.Option(min=1, help="Control steps of an episode.")]
-Policy = Annotated[
-    str | None,
-    typer.Option(
-        help="random, still or mpc; of the TriFinger also feedback, or sweep: the fingertips go to "
-        "the middle.",
-        show_default="random; still without a backend",
-    ),
-]
 Assignments = Annotated[
     list[str],
     typer.Argument(
@@ -121,24 +56,32 @@ Assignments = Annotated[
         help="Interventions. A value is a number, a list 1,2,3, shift:0.1, scale:2 or draw:A.",
     ),
 ]
-Nature = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME=VALUE",
-        help="Context distribution: what varies between episodes, such as gravity=draw:A; "
-        "repeat it for more.",
-    ),
-]
+Backend = Annotated[str | None, typer.Option(show_default="that of the task")]
+Preset = Annotated[str | None, typer.Option(show_default="fast")]
+Resolution = Annotated[str | None, typer.Option(show_default="vector")]
+Policy = Annotated[str | None, typer.Option(show_default="random; still without a backend")]
 Outcomes = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="HOW:NAME",
-        help="Outcome, such as reward or sum:reward; repeat it for more.",
-        show_default="the usual ones",
-    ),
+    list[str] | None, typer.Option(metavar="HOW:NAME", show_default="the usual ones")
 ]
-
-# --- results --------------------------------------------------------------------------------------
+Trust = Annotated[list[str] | None, typer.Option(metavar="PACKAGE")]
+Option = Pairs
+Nature = Pairs
+Changes = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE")]
+Seed = NotNegative
+Steps = Count
+Shard = Count
+Files = Annotated[str, typer.Option("--format", help="Format of the table: parquet or csv.")]
+Quiet = Annotated[bool, typer.Option("--quiet")]
+Observations = Annotated[str | None, typer.Option(show_default="plain")]
+Executor = Annotated[
+    str | None,
+    typer.Option("--executor", "--engine", show_default="process; with one worker serial"),
+]
+Workers = Annotated[
+    int | None, typer.Option(min=0, show_default="1; with --executor as many as there are cores")
+]
+ManyWorkers = Annotated[int | None, typer.Option(min=0, show_default="as many as there are cores")]
+Address = Annotated[str | None, typer.Option(metavar="HOST:PORT")]
 
 
 def read_location(text: str) -> Location:
@@ -155,67 +98,58 @@ def read_location(text: str) -> Location:
 
 Out = Annotated[
     Any,  # a Location or None, which typer does not know
-    typer.Option(
-        parser=read_location,
-        metavar="PATH",
-        help="Folder for the results, or a URL such as s3://bucket/run.",
-        show_default="under scm-world-results",
-    ),
-]
-Shard = Annotated[int, typer.Option(min=1, help="Episodes in one file.")]
-Files = Annotated[str, typer.Option("--format", help="Format of the table: parquet or csv.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Print the result only.")]
-Trust = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="PACKAGE",
-        help="Package whose functions may be called because results name them; repeat it for more.",
-    ),
+    typer.Option(parser=read_location, metavar="PATH", show_default="under scm-world-results"),
 ]
 
-# --- training -------------------------------------------------------------------------------------
+SHARED = {
+    "option": "Argument of the task or model, such as num_of_levels=2 or control_dt=0.01; repeat "
+    "it for more.",
+    "backend": "Physics backend: mujoco, bullet, step or fake; see 'scm-world list'.",
+    "preset": "Physics time step of the TriFinger: fast or precise.",
+    "resolution": "Nodes of the TriFinger's graph: vector, finger or joint.",
+    "seed": "Seed of every random choice.",
+    "steps": "Control steps of an episode.",
+    "policy": "random, still or mpc; of the TriFinger also feedback, or sweep: the fingertips go "
+    "to the middle.",
+    "nature": "Context distribution: what varies between episodes, such as gravity=draw:A; repeat "
+    "it for more.",
+    "outcome": "Outcome, such as reward or sum:reward; repeat it for more.",
+    "out": "Folder for the results, or a URL such as s3://bucket/run.",
+    "shard": "Episodes in one file.",
+    "quiet": "Print the result only.",
+    "trust": "Package whose functions may be called because results name them; repeat it for more.",
+    "observations": "Observations of the policy: plain, or privileged: with every causal "
+    "parameter.",
+    "changes": "Any other field, such as network.hidden=[64,64] or env.frame_skip=5; the value is "
+    "JSON or a word. Repeat it for more.",
+    "executor": "What runs independent episodes: serial, process or ray.",
+    "workers": "How many run at the same time; 0 for as many as there are cores.",
+    "address": "Address of a Ray cluster, or 'auto'; without it, Ray is started on this machine.",
+}
+"""Help of the options that several commands have, where a docstring has no other one."""
 
-Observations = Annotated[
-    str | None,
-    typer.Option(
-        help="Observations of the policy: plain, or privileged: with every causal parameter.",
-        show_default="plain",
-    ),
-]
-Changes = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="NAME=VALUE",
-        help="Any other field, such as network.hidden=[64,64] or env.frame_skip=5; the value is "
-        "JSON or a word. Repeat it for more.",
-    ),
-]
 
-# --- executors ------------------------------------------------------------------------------------
+def documented(command: Callable[..., None]) -> str:
+    """Add to the options of a command the help texts of its docstring's Args, or of ``SHARED``.
 
-Executor = Annotated[
-    str | None,
-    typer.Option(
-        "--executor",
-        "--engine",
-        help="What runs independent episodes: serial, process or ray.",
-        show_default="process; with one worker serial",
-    ),
-]
-_MANY = "How many run at the same time; 0 for as many as there are cores."
-_ONE = "1; with --executor as many as there are cores"
-Workers = Annotated[int | None, typer.Option(min=0, help=_MANY, show_default=_ONE)]
-ManyWorkers = Annotated[
-    int | None, typer.Option(min=0, help=_MANY, show_default="as many as there are cores")
-]
-Address = Annotated[
-    str | None,
-    typer.Option(
-        metavar="HOST:PORT",
-        help="Address of a Ray cluster, or 'auto'; without it, Ray is started on this machine.",
-    ),
-]
+    Returns:
+        The help text of the command: the rest of the docstring.
+    """
+    text, _, described = (inspect.getdoc(command) or "").partition("\n\nArgs:\n")
+    found = re.findall(r"^ {4}(\w+): (.*(?:\n {6,}.*)*)", described, flags=re.MULTILINE)
+    helps = {name: " ".join(said.split()) for name, said in found}
+    hints = get_type_hints(command, include_extras=True)
+    for name in inspect.signature(command).parameters:
+        kind, *given = get_args(hints[name]) if _is_annotated(hints[name]) else (hints[name],)
+        flag = (f"--{name.replace('_', '-')}",) if kind is bool else ()
+        option = copy.copy(given[0]) if given else typer.Option(*flag)
+        option.help = helps.get(name) or option.help or SHARED.get(name)
+        command.__annotations__[name] = Annotated[kind, option]
+    return text
+
+
+def _is_annotated(hint: Any) -> bool:
+    return hasattr(hint, "__metadata__")
 
 
 @contextmanager

@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium.envs.registration import VectorizeMode
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorWrapper
+from gymnasium.vector.utils import concatenate, create_empty_array
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from scm_world._arguments import whole_number
@@ -249,10 +250,17 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
                 then["stages"] = self.curriculum.counted(now.stages, now.staged, success=success)
         self._state = now.model_copy(update=then)
 
-    def rerun(self, actions: Any) -> None:
-        """Take the steps of an episode again, from its reset on."""
-        for action in actions:
+    def rerun(self, actions: Any, lengths: Any) -> Any:
+        """Take the steps of an episode again, from its reset on; return the observation.
+
+        Args:
+            actions: Those of all environments that share the episodes, shape (steps, n, n_actions).
+            lengths: How many steps each of them took, shape (n,).
+        """
+        index = self._state.episode % self._state.every
+        for action in actions[: lengths[index], index]:
             self.step(action)
+        return self._inner.observe()
 
 
 def _plain(curriculum: Curriculum) -> Any:
@@ -413,6 +421,7 @@ class CurriculumVectorEnv(VectorWrapper):
         self.resume(state)
         self.env.reset()
         given = np.asarray(actions, dtype=np.float64)
-        for index, length in enumerate(lengths):
-            self._members.call_in([index], "rerun", given[:length, index])
-        return self._members.present()[0]
+        shown = self._members.call("rerun", given, np.asarray(lengths))
+        space = self.single_observation_space
+        rows: Any = create_empty_array(space, self.num_envs)
+        return concatenate(space, shown, rows)

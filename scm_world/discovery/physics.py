@@ -21,7 +21,7 @@ from scm_world._arguments import whole_number
 from scm_world.discovery.data import Dataset, Design, collect
 from scm_world.discovery.data.dataset import Column
 from scm_world.discovery.data.truth import observed_part
-from scm_world.discovery.learners.simulators import PairedSimulator
+from scm_world.discovery.learners.paired import PairedSimulator
 from scm_world.errors import UnknownOption
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.outcomes import Outcome, read

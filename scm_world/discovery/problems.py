@@ -5,14 +5,13 @@ from __future__ import annotations
 import inspect
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, final, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, final, runtime_checkable
 
 import networkx as nx
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world import queries
 from scm_world._arguments import one_of, typed, whole_number
@@ -27,11 +26,10 @@ from scm_world.discovery.data.truth import (
     truth_of_model,
     truth_of_steps,
 )
-from scm_world.discovery.learners.simulators import (
+from scm_world.discovery.learners.paired import (
     EpisodeSimulator,
     PairedSimulator,
-    SCMSimulator,
-    StepSimulator,
+    SystemSimulator,
 )
 from scm_world.discovery.physics import PHYSICS, ServoProblem, Springs, numbers_of, servo
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
@@ -55,6 +53,52 @@ DONE = Normal(mean=2.0, std=1.0)
 """What interventions draw in random models by default: another mean, the same spread."""
 
 
+class Family(NamedTuple):
+    """Random models: how the graph and the mechanisms are drawn, the number in the seed, words."""
+
+    graph: Literal["random", "hubs first", "hubs last", "step"]
+    mechanism: str
+    number: int
+    doc: str
+
+
+ER = "Erdős–Rényi DAG"
+SF = "Scale-free DAG"
+FAMILIES: Mapping[str, Family] = {
+    "er2": Family("random", "linear", 1, f"{ER}, 2 edges per node, linear Gaussian"),
+    "sf2": Family(
+        "hubs first",
+        "linear",
+        2,
+        f"{SF} (Barabási–Albert, 2 per node), linear Gaussian; hubs are causes",
+    ),
+    "sf2in": Family("hubs last", "linear", 2, f"{SF}, linear Gaussian; hubs are effects"),
+    "mlp2": Family(
+        "random", "network", 4, f"{ER}, a random network of ten tanh units for each variable"
+    ),
+    "gp2": Family(
+        "random",
+        "process",
+        5,
+        f"{ER}, a function of a Gaussian process (length 1) for each variable",
+    ),
+    "sine2": Family("random", "sine", 6, f"{ER}, a weighted sum of a sine of each cause"),
+    "iscm2": Family(
+        "random", "standardised", 7, f"{ER}, linear Gaussian, every variable with variance 1 (iSCM)"
+    ),
+    "uneven2": Family(
+        "random", "uneven", 8, f"{ER}, linear, the spread of the noise depends on the causes"
+    ),
+    "heavy2": Family("random", "heavy", 9, f"{ER}, linear, noise with heavy tails (kurtosis 11.7)"),
+    "tanh4": Family("step", "tanh", 3, "One control step, at most 4 causes each, tanh of a sum"),
+}
+"""By name. Weights are uniform in ±[0.5, 2], noise has standard deviation 1 (0.1 for ``tanh4``).
+
+In ``mlp2`` both layers have such weights, the second one times 2 / √10; functions of ``gp2`` have
+standard deviation 2; in ``sine2`` frequencies are uniform in [1, 3].
+"""
+
+
 @typed
 def random_model(name: str, seed: int = 0) -> SCM:
     """Draw model number ``seed`` of a family, ``"er2:20"`` for 20 variables.
@@ -64,7 +108,10 @@ def random_model(name: str, seed: int = 0) -> SCM:
 
     Source:
         Zheng et al., *DAGs with NO TEARS*, NeurIPS 2018, section 5.1, for weights and densities;
-        Barabási and Albert, *Emergence of scaling in random networks*, Science 1999.
+        Barabási and Albert, *Emergence of scaling in random networks*, Science 1999; Ormaniec et
+        al., *Standardizing structural causal models*, ICLR 2025, for variables of variance 1;
+        Rahimi and Recht, *Random features for large-scale kernel machines*, NeurIPS 2007, for
+        Gaussian processes as sums of cosines.
 
     Example:
         >>> len(random_model("er2:20", seed=0))
@@ -75,78 +122,74 @@ def random_model(name: str, seed: int = 0) -> SCM:
     if family not in FAMILIES or not re.fullmatch(r"[0-9]+", size) or not 2 <= int(size) <= MOST:
         shown = tuple(f"{known}:N" for known in FAMILIES)
         raise UnknownOption("family of models", name, (*shown, f"with N from 2 to {MOST}"))
-    return FAMILIES[family](int(size), whole_number("seed", seed, least=0))
-
-
-def _erdos_renyi(n: int, seed: int, kind: str = "linear", number: int = 1) -> SCM:
-    """Erdős–Rényi DAG, 2 edges per node, linear Gaussian."""
-    rng = np.random.default_rng([seed, n, number])
-    chance = min(1.0, 2.0 * PER_NODE / (n - 1))
-    return _on_graph(np.triu(rng.random((n, n)) < chance, 1), rng, kind)
-
-
-def _scale_free(n: int, seed: int, *, hubs_last: bool = False) -> SCM:
-    """Scale-free DAG (Barabási–Albert, 2 per node), linear Gaussian; hubs are causes."""
-    rng = np.random.default_rng([seed, n, 2])
-    drawn = nx.barabasi_albert_graph(n, min(PER_NODE, n - 1), seed=int(rng.integers(2**31)))
+    n, (graph, kind, number, _) = int(size), FAMILIES[family]
+    rng = np.random.default_rng([int(seed), n, number])
+    names = [f"x{i:0{len(str(n - 1))}d}" for i in range(n)]
+    made: list[Derived] = []
+    if graph == "step":
+        for each in names:
+            causes = rng.choice(n, size=int(rng.integers(1, min(4, n) + 1)), replace=False)
+            lagged = tuple(Parent(names[i], 1) for i in causes)
+            weights = tuple(_signed(rng, len(causes)).tolist())
+            mechanism: Any = Function(tanh_of_sum, constants={"weights": weights})
+            noise = Normal(mean=0.0, std=0.1)
+            made.append(Derived(name=each, parents=lagged, mechanism=mechanism, noise=noise))
+        return SCM(made)
     upper = np.zeros((n, n), bool)
-    for one, other in drawn.edges:
-        upper[min(one, other), max(one, other)] = True  # hubs come early: they cause much
-    return _on_graph(upper[::-1, ::-1].T if hubs_last else upper, rng)
-
-
-def _hubs_last(n: int, seed: int) -> SCM:
-    """Scale-free DAG, linear Gaussian; hubs are effects."""
-    return _scale_free(n, seed, hubs_last=True)
-
-
-def _networks(n: int, seed: int) -> SCM:
-    """Erdős–Rényi DAG, a random network of ten tanh units for each variable."""
-    return _erdos_renyi(n, seed, "network", 4)
-
-
-def _processes(n: int, seed: int) -> SCM:
-    """Erdős–Rényi DAG, a function of a Gaussian process (length 1) for each variable."""
-    return _erdos_renyi(n, seed, "process", 5)
-
-
-def _sines(n: int, seed: int) -> SCM:
-    """Erdős–Rényi DAG, a weighted sum of a sine of each cause."""
-    return _erdos_renyi(n, seed, "sine", 6)
-
-
-def _standardised(n: int, seed: int) -> SCM:
-    """Erdős–Rényi DAG, linear Gaussian, every variable with variance 1 (iSCM)."""
-    return _erdos_renyi(n, seed, "standardised", 7)
-
-
-def _uneven(n: int, seed: int) -> SCM:
-    """Erdős–Rényi DAG, linear, the spread of the noise depends on the causes."""
-    return _erdos_renyi(n, seed, "uneven", 8)
-
-
-def _heavy(n: int, seed: int) -> SCM:
-    """Erdős–Rényi DAG, linear, noise with heavy tails (kurtosis 11.7)."""
-    return _erdos_renyi(n, seed, "heavy", 9)
-
-
-def _one_step(n: int, seed: int) -> SCM:
-    """One control step, at most 4 causes each, tanh of a sum."""
-    rng = np.random.default_rng([seed, n, 3])
-    names, made = _names(n), []
-    for name in names:
-        causes = rng.choice(n, size=int(rng.integers(1, min(4, n) + 1)), replace=False)
-        size = rng.uniform(WEAKEST, STRONGEST, len(causes))
-        weights = size * rng.choice([-1.0, 1.0], len(causes))
-        made.append(
-            Derived(
-                name=name,
-                parents=tuple(Parent(names[i], 1) for i in causes),
-                mechanism=Function(tanh_of_sum, constants={"weights": tuple(weights.tolist())}),
-                noise=Normal(mean=0.0, std=0.1),
-            )
-        )
+    if graph == "random":
+        upper = np.triu(rng.random((n, n)) < min(1.0, 2.0 * PER_NODE / (n - 1)), 1)
+    else:
+        drawn = nx.barabasi_albert_graph(n, min(PER_NODE, n - 1), seed=int(rng.integers(2**31)))
+        for one, other in drawn.edges:
+            upper[min(one, other), max(one, other)] = True  # hubs come early: they cause much
+        upper = upper[::-1, ::-1].T if graph == "hubs last" else upper
+    size_of = _signed(rng, (n, n))
+    places = rng.permutation(n)  # of the causal order among the names
+    upper_weights, stds = np.where(upper, size_of, 0.0), np.ones(n)
+    if kind == "standardised":
+        totals = np.zeros((n, n))  # of each variable, the weights of all noise
+        for j in range(n):
+            totals[j] = upper_weights[:, j] @ totals + np.eye(n)[j]
+            stds[j] = 1.0 / np.linalg.norm(totals[j])
+            totals[j] *= stds[j]
+            upper_weights[:, j] *= stds[j]
+    all_weights, noise_of = np.zeros((n, n)), np.ones(n)
+    all_weights[np.ix_(places, places)], noise_of[places] = upper_weights, stds
+    for j, each in enumerate(names):
+        ids = np.flatnonzero(all_weights[:, j]).tolist()
+        mechanism = _mechanism(kind, all_weights[ids, j], rng)
+        parents = tuple(names[i] for i in ids)
+        noise = Normal(mean=0.0, std=float(noise_of[j]))
+        made.append(Derived(name=each, parents=parents, mechanism=mechanism, noise=noise))
     return SCM(made)
+
+
+def _signed(rng: np.random.Generator, shape: Any) -> Floats:
+    return np.asarray(rng.uniform(WEAKEST, STRONGEST, shape) * rng.choice([-1.0, 1.0], shape))
+
+
+def _mechanism(kind: str, weights: Floats, rng: np.random.Generator) -> Any:
+    """Draw the mechanism of a variable with these weights of its causes."""
+    w, k = tuple(weights.tolist()), len(weights)
+    if kind in ("linear", "standardised"):
+        return Linear(weights=w)
+    if kind == "uneven":
+        spread = tuple((rng.normal(size=k) / max(k, 1)).tolist())
+        return Function(uneven, constants={"weights": w, "spread": spread})
+    if kind == "heavy":
+        return Function(heavy, constants={"weights": w})
+    if kind == "network":
+        inner, outer = _signed(rng, (k, 10)), 2.0 * _signed(rng, 10) / math.sqrt(10)
+        phase = rng.normal(size=10)
+    elif kind == "process":
+        inner, phase = rng.normal(size=(k, 200)), rng.uniform(0.0, 2.0 * np.pi, 200)
+        outer = 0.2 * rng.normal(size=200)
+    else:
+        inner, phase = np.diag(rng.uniform(1.0, 3.0, k)), rng.uniform(0.0, 2.0 * np.pi, k)
+        outer = weights
+    given = {"inner": inner, "phase": phase, "outer": outer}
+    constants: dict[str, Any] = {n: tuple(np.ravel(v).tolist()) for n, v in given.items()}
+    return Function(layer, constants={**constants, "wave": float(kind != "network")})
 
 
 def tanh_of_sum(*parents: Value, noise: Value | float = 0.0, weights: Floats) -> Any:
@@ -182,88 +225,6 @@ def heavy(*parents: Value, noise: Value | float = 0.0, weights: Floats) -> Any:
     """Return a weighted sum, plus noise squared with its sign, of variance 1."""
     total = sum((w * x for w, x in zip(weights, parents, strict=True)), np.zeros(()))
     return total + noise * np.abs(noise) / math.sqrt(3.0)
-
-
-def _on_graph(upper: NDArray[np.bool_], rng: np.random.Generator, kind: str = "linear") -> SCM:
-    """Draw mechanisms for the edges of a causal order, shuffle the order, add unit Gaussian noise.
-
-    Source:
-        Ormaniec et al., *Standardizing structural causal models*, ICLR 2025, for variables of
-        variance 1; Rahimi and Recht, *Random features for large-scale kernel machines*, NeurIPS
-        2007, for Gaussian processes as sums of cosines.
-    """
-    n = len(upper)
-    size = rng.uniform(WEAKEST, STRONGEST, (n, n)) * rng.choice([-1.0, 1.0], (n, n))
-    places = rng.permutation(n)
-    upper_weights = np.where(upper, size, 0.0)
-    stds = np.ones(n)
-    if kind == "standardised":
-        totals = np.zeros((n, n))  # of each variable, the weights of all noise
-        for j in range(n):
-            totals[j] = upper_weights[:, j] @ totals + np.eye(n)[j]
-            stds[j] = 1.0 / np.linalg.norm(totals[j])
-            totals[j] *= stds[j]
-            upper_weights[:, j] *= stds[j]
-    weights, noise_of = np.zeros((n, n)), np.ones(n)
-    weights[np.ix_(places, places)], noise_of[places] = upper_weights, stds
-    names, made = _names(n), []
-    for j, name in enumerate(names):
-        causes = np.flatnonzero(weights[:, j]).tolist()
-        w, k = tuple(weights[causes, j].tolist()), len(causes)
-        mechanism: Any
-        match kind:
-            case "linear" | "standardised":
-                mechanism = Linear(weights=w)
-            case "uneven":
-                spread = tuple((rng.normal(size=k) / max(k, 1)).tolist())
-                mechanism = Function(uneven, constants={"weights": w, "spread": spread})
-            case "heavy":
-                mechanism = Function(heavy, constants={"weights": w})
-            case "network":
-                inner, outer = _signed(rng, (k, 10)), 2.0 * _signed(rng, 10) / math.sqrt(10)
-                mechanism = _layer(inner, rng.normal(size=10), outer, 0.0)
-            case "process":
-                inner, phase = rng.normal(size=(k, 200)), rng.uniform(0.0, 2.0 * np.pi, 200)
-                mechanism = _layer(inner, phase, 0.2 * rng.normal(size=200), 1.0)
-            case _:
-                inner, phase = np.diag(rng.uniform(1.0, 3.0, k)), rng.uniform(0.0, 2.0 * np.pi, k)
-                mechanism = _layer(inner, phase, np.array(w), 1.0)
-        parents, noise = tuple(names[i] for i in causes), Normal(mean=0.0, std=float(noise_of[j]))
-        made.append(Derived(name=name, parents=parents, mechanism=mechanism, noise=noise))
-    return SCM(made)
-
-
-def _signed(rng: np.random.Generator, shape: Any) -> Floats:
-    return np.asarray(rng.uniform(WEAKEST, STRONGEST, shape) * rng.choice([-1.0, 1.0], shape))
-
-
-def _layer(inner: Floats, phase: Floats, outer: Floats, wave: float) -> Function:
-    given = {"inner": inner, "phase": phase, "outer": outer}
-    constants = {name: tuple(np.ravel(value).tolist()) for name, value in given.items()}
-    return Function(layer, constants={**constants, "wave": wave})
-
-
-def _names(n: int) -> list[str]:
-    return [f"x{i:0{len(str(n - 1))}d}" for i in range(n)]
-
-
-FAMILIES: Mapping[str, Callable[[int, int], SCM]] = {
-    "er2": _erdos_renyi,
-    "sf2": _scale_free,
-    "sf2in": _hubs_last,
-    "mlp2": _networks,
-    "gp2": _processes,
-    "sine2": _sines,
-    "iscm2": _standardised,
-    "uneven2": _uneven,
-    "heavy2": _heavy,
-    "tanh4": _one_step,
-}
-"""By name. Weights are uniform in ±[0.5, 2], noise has standard deviation 1 (0.1 for ``tanh4``).
-
-In ``mlp2`` both layers have such weights, the second one times 2 / √10; functions of ``gp2`` have
-standard deviation 2; in ``sine2`` frequencies are uniform in [1, 3].
-"""
 
 
 # --- problems -------------------------------------------------------------------------------------
@@ -357,7 +318,7 @@ class SCMProblem:
         if self._hidden:
             what = f"{self.truth.name} hides variables, which paired experiments would set"
             raise ModelError([f"{what}; take data='observational' or 'interventional'"])
-        return SCMSimulator(self._scm, seed)
+        return SystemSimulator(self._scm, seed)
 
     def close(self) -> None:
         """Do nothing: there is no backend."""
@@ -585,7 +546,7 @@ class WorldProblem:
         that are thrown at the wall: past the fingers, and so hard that they come back and hit one.
         """
         if self._by_step:
-            return StepSimulator(self._world, seed)
+            return SystemSimulator(self._world, seed)
         contexts = {n: act for n, act in self._contexts.items() if n != "sensor_noise"}
         length, blocks = self._view.steps, [n for n in self._causes if self._is_start(n)]
         settings = [Setting(self._policy, contexts, length, seed)]

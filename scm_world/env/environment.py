@@ -50,7 +50,7 @@ from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import TERMINATED, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.subsets import AnyRegion, as_region
-from scm_world.world import Audit, WorldSnapshot
+from scm_world.world import Audit, Snapshot
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.interventions import merged
 from scm_world.world.mechanisms import Rows
@@ -77,7 +77,7 @@ class EnvSnapshot:
         memory: The state of a curriculum around it.
     """
 
-    world: WorldSnapshot
+    world: Snapshot
     interventions: tuple[tuple[int, dict[str, Any]], ...]
     ended: bool = False
     memory: Any = None

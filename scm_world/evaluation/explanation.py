@@ -176,7 +176,7 @@ def why(
     metric = evaluation.metric(metric)
     one = evaluation.only(protocol=protocol, episode=episode)
     agent, engine = one.the("agent", None), one.the("engine", None)
-    run, seed = (int(one.columns[name][0]) for name in ("run", "seed"))
+    run, seed = (int(one.frame[name][0]) for name in ("run", "seed"))
     one_of("versus", versus, (None, *VERSUS))
     setup = again(evaluation.only(agent=agent, engine=engine), policy, task, trusted)
     actor, done_there = setup.agents[agent, run], setup.protocols[protocol]
@@ -184,7 +184,7 @@ def why(
     found, left_out = [], {}
     with closing(EpisodeRunner(setup.env(engine, actor))) as runner:
         row = runner.play(actor, done_there, **where)
-        if row.hash != one.only(run=run, seed=seed).columns["hash"][0]:
+        if row.hash != one.only(run=run, seed=seed).frame["hash"][0]:
             raise SnapshotMismatch(f"{protocol}, episode {episode} does not happen again")
         if not row.drawn:
             allowed = ("an episode in which a protocol varies something",)

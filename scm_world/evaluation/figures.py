@@ -1,17 +1,17 @@
 """Figures of evaluations: bars, radars and performance profiles.
 
 Each function returns a matplotlib figure; ``save`` writes it, with the same bytes for the same
-evaluation. matplotlib is loaded when one is drawn.
+evaluation. matplotlib is loaded when one is drawn. Lines of equal scores lie on one another, so the
+first one is the widest and their markers are at different places.
 """
 
 from __future__ import annotations
 
 import math
 import textwrap
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -38,6 +38,7 @@ BAR = 0.16  # [inches] of a bar, and of a line of text
 PAPER = {"fc": "white", "ec": "none", "pad": 0.6}
 HATCHES = ("", "////", "....", "xxxx")
 MARKERS = "osD^vPX*<>ph"
+WIDEST, THINNEST = 4.5, 1.2  # [points] of the first and the last line
 DASHES: Sequence[Any] = ("solid", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
 
@@ -51,21 +52,14 @@ WORDS: Mapping[str, str] = {
 }
 
 
-@final
-@dataclass(frozen=True)
-class Line:
-    """An agent on a backend: one line of a figure, or one bar of each protocol."""
-
-    agent: str
-    engine: str
+Line = tuple[str, str]
+"""An agent on a backend: one line of a figure, or one bar of each protocol."""
 
 
 def lines_of(evaluation: Evaluation) -> list[Line]:
     """List which agent acted on which backend, agents in their order and then backends."""
-    columns = evaluation.columns
-    there = set(zip(columns["agent"].tolist(), columns["engine"].tolist(), strict=True))
-    every = (Line(a, e) for a in evaluation.agents for e in evaluation.engines)
-    return [line for line in every if (line.agent, line.engine) in there]
+    there = set(evaluation.frame[["agent", "engine"]].itertuples(index=False, name=None))
+    return [line for line in product(evaluation.agents, evaluation.engines) if line in there]
 
 
 def metric_words(metric: str) -> str:
@@ -81,15 +75,13 @@ def is_fraction(metric: str) -> bool:
 
 def counted(evaluation: Evaluation) -> str:
     """Return how many runs and episodes a number is of."""
-    keys = ("agent", "engine", "protocol", "run")
-    rows = zip(*(evaluation.columns[key].tolist() for key in keys), strict=True)
-    each = Counter(rows).values()
+    each = evaluation.frame.groupby(["agent", "engine", "protocol", "run"]).size()
     runs = [len(evaluation.runs(agent)) for agent in evaluation.agents]
     some = "" if max(runs) == 1 else f" and {_range(runs)} training runs of each agent"
     return f"{_range(each)} episodes of each protocol{some}"
 
 
-def _range(numbers: Collection[int]) -> str:
+def _range(numbers: Iterable[int]) -> str:
     low, high = min(numbers), max(numbers)
     return f"{low}" if low == high else f"{low} to {high}"
 
@@ -118,7 +110,7 @@ def scores_of(evaluation: Evaluation, metric: str) -> Scores:
     return {
         (line, protocol): mine.score(protocol, metric)
         for line in lines_of(evaluation)
-        for mine in [evaluation.only(agent=line.agent, engine=line.engine)]
+        for mine in [evaluation.only(agent=line[0], engine=line[1])]
         for protocol in mine.protocols
     }
 
@@ -180,13 +172,15 @@ class Look:
 
     Attributes:
         label: In legends.
-        line: Arguments of a line.
+        line: Arguments of a line; of several lines the first one is the widest.
         bar: Arguments of a bar.
+        shift: Place among all lines, from -0.5 to 0.5: markers are shifted by it.
     """
 
     label: str
     line: Mapping[str, Any]
     bar: Mapping[str, Any]
+    shift: float
 
 
 def looks_of(lines: Sequence[Line]) -> dict[Line, Look]:
@@ -194,21 +188,24 @@ def looks_of(lines: Sequence[Line]) -> dict[Line, Look]:
     import matplotlib
     from matplotlib.colors import to_hex
 
-    agents = list(dict.fromkeys(line.agent for line in lines))
-    engines = list(dict.fromkeys(line.engine for line in lines))
+    agents, engines = (list(dict.fromkeys(names)) for names in zip(*lines, strict=True))
     colors = list(PALETTE)
     if len(agents) > len(PALETTE):
         colors = [*map(to_hex, matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, len(agents))))]
     found = {}
-    for line in lines:
-        a, e = agents.index(line.agent), engines.index(line.engine)
-        name = line.agent if len(engines) == 1 else f"{line.agent} on {line.engine}"
-        dashes, marker = DASHES[e % len(DASHES)], MARKERS[a % len(MARKERS)]
-        found[line] = Look(
-            textwrap.fill(name, 60),
-            {"color": colors[a], "marker": marker, "linestyle": dashes, "markersize": 5.0},
-            {"facecolor": colors[a], "edgecolor": "white", "hatch": HATCHES[e % len(HATCHES)]},
-        )
+    for place, (agent, engine) in enumerate(lines):
+        a, e = agents.index(agent), engines.index(engine)
+        name = agent if len(engines) == 1 else f"{agent} on {engine}"
+        share = place / max(len(lines) - 1, 1)
+        line = {
+            "color": colors[a],
+            "marker": MARKERS[a % len(MARKERS)],
+            "linestyle": DASHES[e % len(DASHES)],
+            "linewidth": WIDEST + share * (THINNEST - WIDEST) if len(lines) > 1 else 1.8,
+            "markersize": 5.0,
+        }
+        bar = {"facecolor": colors[a], "edgecolor": "white", "hatch": HATCHES[e % len(HATCHES)]}
+        found[agent, engine] = Look(textwrap.fill(name, 60), line, bar, share - 0.5)
     return found
 
 
@@ -285,7 +282,7 @@ def bars_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
             if one is None:
                 ax.text(0.0, y, " –", va="center_baseline", size=7)
                 continue
-            gid = f"{line.agent}|{line.engine}|{protocol}"
+            gid = "|".join((*line, protocol))
             bar = ax.barh(y, one.value, 0.9 * BAR / row, gid=gid, xerr=_reach(one),
                           error_kw={"ecolor": INK, "elinewidth": 1.1}, **look.bar)  # fmt: skip
             ax.bar_label(bar, [_number(one.value)], padding=3, size=7, bbox=PAPER)
@@ -363,7 +360,9 @@ def profile_figure(
     axes = figure.subplots(len(found), 2 if most else 1, squeeze=False)
     for (engine, one), (left, *right) in zip(found.items(), axes, strict=True):
         for agent, profile in one.profiles.items():
-            style = {**looks[Line(agent, engine)].line, "markevery": 0.12, "markersize": 4.0}
+            look = looks[agent, engine]
+            markers = {"markevery": (0.06 + 0.1 * look.shift, 0.12), "markersize": 4.0}
+            style = {**look.line, **markers}
             at, gid = profile.thresholds, f"band {agent}"
             left.plot(at, profile.share, drawstyle="steps-post", gid=agent, **style)
             left.fill_between(at, profile.low, profile.high, step="post", color=style["color"],
@@ -432,11 +431,12 @@ def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     for line, look in looks.items():
         ring = [scores.get((line, protocol)) for protocol in (*words, next(iter(words)))]
         known = [one or Interval(math.nan, math.nan, math.nan, 0.0, 0) for one in ring]
-        gid, style = f"{line.agent}|{line.engine}", look.line
-        ax.plot(turns, [one.value for one in known], gid=gid, clip_on=False, zorder=3, **style)
+        gid, style = "|".join(line), look.line
+        beside = turns + look.shift * np.pi / (4 * len(words))
+        ax.plot(beside, [one.value for one in known], gid=gid, clip_on=False, zorder=3, **style)
         lows, highs = ([f(one.ends) for one in known] for f in (min, max))
         band = {"color": style["color"], "alpha": 0.16, "lw": 0, "gid": f"band {gid}"}
-        ax.fill_between(turns, lows, highs, **band)
+        ax.fill_between(beside, lows, highs, **band)
     return figure
 
 

@@ -12,7 +12,7 @@ import pandas
 
 from scm_world._arguments import one_of
 from scm_world.errors import DAMAGED, UnreadableFile, in_one_line
-from scm_world.evaluation.results import KEYS, TEXTS, WHOLE, Evaluation
+from scm_world.evaluation.results import KEYS, Evaluation
 from scm_world.runs.files import Location, read_bytes, read_text, removed, write_whole
 
 FORMAT = "scm_world/evaluation/2"
@@ -20,17 +20,22 @@ RESULTS = "results.json"
 FORMS = ("parquet", "csv")
 ABOUT = ("task", "arguments", "env", "engines", "agents", "protocols", "seeds", "n", "versions")
 ADVICE = "give the folder, or the results.json, that an evaluation wrote"
+TYPES: dict[str, Any] = {
+    **dict.fromkeys(("agent", "engine", "protocol", "hash"), str),
+    **dict.fromkeys(("run", "seed", "episode", "steps"), np.int64),
+}
+"""Types of the columns that do not hold 64-bit floats."""
 
 
 def save(evaluation: Evaluation, folder: Location, form: str) -> tuple[Location, Location]:
     """Write the table, then the summary that names it; see ``Evaluation.save``."""
     one_of("format", form, FORMS)
     summary, table = folder / RESULTS, folder / f"episodes.{form}"
-    frame, content = pandas.DataFrame(evaluation.columns), io.BytesIO()
+    content = io.BytesIO()
     if form == "parquet":
-        frame.to_parquet(content, compression="zstd", index=False)
+        evaluation.frame.to_parquet(content, compression="zstd", index=False)
     else:
-        frame.to_csv(content, index=False, na_rep="nan", lineterminator="\n")
+        evaluation.frame.to_csv(content, index=False, na_rep="nan", lineterminator="\n")
     data = {
         "format": FORMAT,
         "table": {"file": table.name, "rows": len(evaluation)},
@@ -82,11 +87,7 @@ def load(path: Location) -> Evaluation:
         if missing or len(frame) != data["table"]["rows"]:
             lacks = f"lacks {missing[0]!r}" if missing else "has another number of rows"
             raise ValueError(f"it, or {table.name}, {lacks}")
-        kinds: dict[str, Any] = {**dict.fromkeys(TEXTS, str), **dict.fromkeys(WHOLE, np.int64)}
-        columns = {
-            str(name): np.array(list(frame[name]), dtype=kinds.get(str(name), np.float64))
-            for name in frame
-        }
+        frame = frame.astype({name: TYPES.get(str(name), np.float64) for name in frame})
     except DAMAGED as error:
         raise UnreadableFile(str(file), in_one_line(error), ADVICE) from None
-    return Evaluation(data["about"], columns)
+    return Evaluation(data["about"], frame)

@@ -12,7 +12,7 @@ from typing import Any, final
 
 from scm_world.evaluation.episodes import METRICS, EpisodeRow, EpisodeRunner, Hook
 from scm_world.evaluation.preparation import prepare
-from scm_world.evaluation.results import Evaluation, columns_of
+from scm_world.evaluation.results import Evaluation, frame_of
 from scm_world.evaluation.setups import Setup, Shard, form_of
 from scm_world.queries.progress import Progress, Tell, clock
 from scm_world.runs.files import Location
@@ -139,7 +139,7 @@ def evaluate(
             pool.check(f"policy {name!r} with several workers", agent.policy)
         rows = _all_rows(setup, pool, study, progress, tell)
     policies = {who: agent.policy for who, agent in setup.agents.items()}
-    return Evaluation(setup.about(), columns_of(rows), policies)
+    return Evaluation(setup.about(), frame_of(rows), policies)
 
 
 def _all_rows(

@@ -111,16 +111,6 @@ class AppliedIntervention:
     requested: Variable
 
 
-def source_of(act: AppliedIntervention) -> Distribution:
-    """Return the distribution that a draw is taken from."""
-    draw: Any = act.intervention
-    named = isinstance(draw.source, str)
-    space = act.requested.space(draw.source) if named else draw.source
-    if space is None:
-        raise ModelError([f"{act.requested.name!r} has no space {draw.source}"])
-    return space
-
-
 def noise_of(
     variable: Variable, mechanism: Derived | Mechanism, key: NoiseKey | None, values: Values
 ) -> dict[str, Value]:
@@ -200,7 +190,8 @@ class Evaluator:
         else:
             if getattr(requested, "per", "step") == "episode" and key.origin is None:
                 key = replace(key, step=0)
-            source, stream = source_of(act), getattr(act.intervention, "stream", None)
+            draw: Any = act.intervention
+            source, stream = draw.drawn_from(requested), draw.stream
             if stream is None and key.origin is None and key.given is None:
                 stream = "do"  # of a model; a world counts its draws
             value = key.draw(source, requested.name, requested.shape, values, stream)

@@ -23,14 +23,12 @@ from scm_world.errors import (
     UnknownVariable,
     raise_all,
 )
-from scm_world.graph.acceptance import accepted, settable_causes
 from scm_world.graph.evaluate import (
     AppliedIntervention,
     Evaluator,
     NoiseKey,
     earlier,
     first_value,
-    source_of,
 )
 from scm_world.graph.structure import Edge, EdgeIndex, checked
 from scm_world.variables import (
@@ -51,6 +49,7 @@ from scm_world.variables import (
     divided,
     whole_of,
 )
+from scm_world.variables.checks import accepted, settable_causes
 from scm_world.variables.spaces import Frozen
 
 BEFORE = 2**32
@@ -177,14 +176,15 @@ class SCM:
         """Return the variable as it is in this model: ``Fixed`` where ``do`` has set it."""
         variable, act = self.declared(name), self._acts.get(name)
         done = None if act is None else act.intervention
-        if act is None or isinstance(done, SOFT):
+        if act is None or not isinstance(done, Hard | Draw | Mechanism):
             return variable
         kept = {field: getattr(variable, field) for field in Variable.model_fields}
         if isinstance(done, Hard):
             value = self._evaluator.forced(name, act, {}, None)
             return Fixed(value=value, intervenable=True, **kept)
-        if not isinstance(done, Mechanism):
-            return Exogenous(default=np.zeros(variable.shape), distribution=source_of(act), **kept)
+        if isinstance(done, Draw):
+            source = done.drawn_from(act.requested)
+            return Exogenous(default=np.zeros(variable.shape), distribution=source, **kept)
         own = variable.noise if isinstance(variable, Derived) else None
         noise = done.noise or (own if done.equation.takes_noise else None)
         return Derived(
@@ -245,8 +245,8 @@ class SCM:
                 return ()
             case Mechanism(parents=parents):
                 return parents
-            case Draw() if act is not None:
-                return tuple(map(Parent, sorted(source_of(act).parents())))
+            case Draw() as draw if act is not None:
+                return tuple(map(Parent, sorted(draw.drawn_from(act.requested).parents())))
         return self._declared[name].all_parents
 
     @property
@@ -364,9 +364,9 @@ class SCM:
         model._structure = None if acts else self._structure
         model._adds_edges = False
         for held in model._acts.values():
-            kind = type(held.intervention)
-            if kind is Mechanism or (kind is Draw and source_of(held).parents()):
-                model._adds_edges = True
+            act = held.intervention
+            draws = isinstance(act, Draw) and bool(act.drawn_from(held.requested).parents())
+            model._adds_edges |= draws or isinstance(act, Mechanism)
         # Cutting edges keeps every causal order valid.
         model._order = model.structure.order if model._adds_edges else self._order
         return model

@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import networkx as nx
 import numpy as np
 
 from scm_world._arguments import typed, whole_number
-from scm_world.errors import ModelError, UnknownOption, UnknownVariable
+from scm_world.errors import ModelError
 from scm_world.graph.ancestral import window
 from scm_world.graph.exchange import to_digraph
 from scm_world.graph.scm import SCM
-
-Node = str | tuple[str, int]
-"""A variable now, or a variable at an earlier slice: ``("tool_block.mass", -1)``."""
-
-
-def _longest_lag(graph: nx.MultiDiGraph) -> int:
-    return max((lag for *_, lag in graph.edges(keys=True)), default=0)
 
 
 def unrolled(source: SCM | nx.DiGraph, steps: int) -> nx.DiGraph:
@@ -56,40 +48,17 @@ def _held(graph: nx.MultiDiGraph) -> list[str]:
     ]
 
 
-def window_of(graph: nx.MultiDiGraph) -> nx.DiGraph:
-    """Return the present and as many slices before it as the longest lag, with their common past.
-
-    Two nodes are d-separated exactly where they are in a graph unrolled without end: this is its
-    latent projection. Nodes are those of ``unrolled``; ``("past", 1)``, … are unobserved.
-
-    Source:
-        Verma and Pearl, *Equivalence and synthesis of causal models*, UAI 1990, for projections;
-        a clique of bidirected edges separates as one common cause does.
-    """
-    past, place = _longest_lag(graph), {name: number for number, name in enumerate(graph)}
-    edges = np.zeros((past + 1, len(place), len(place)), dtype=bool)  # lag, cause, effect
-    for cause, effect, lag in graph.edges(keys=True):
-        edges[lag, place[cause], place[effect]] = True
-    for name in _held(graph) if past else ():
-        edges[1, place[name], place[name]] = True
-    _, shared = window(edges, np.zeros_like(edges), past)
-    nodes = [(name, slice_) for slice_ in range(-past, 1) for name in graph]
-    pairs = nx.Graph((nodes[i], nodes[j]) for i, j in np.argwhere(np.triu(shared)).tolist())
-    made = unrolled(graph, past + 1)
-    for number, effects in enumerate(sorted(map(sorted, nx.find_cliques(pairs))), start=1):
-        made.add_node(("past", number), observed="no")
-        made.add_edges_from((("past", number), effect) for effect in effects)
-    return made
-
-
 def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
-    """Return the acyclic graph of a model that ``identify`` and DoWhy take.
+    """Return the acyclic graph of a model that ``identify``, networkx and DoWhy take.
+
+    ``networkx.is_d_separator(to_dag(model), {"x"}, {"y"}, {"z"})`` asks for d-separation.
 
     Without lags it has the names of the variables. With lags there are as many slices as the
     longest lag reaches: ``name`` is now, ``name@-1`` one step ago. A parameter keeps its value, so
     its past is called ``name@=-1`` and has an edge to ``name``. Causes before the first slice that
     several nodes have in common are nodes ``past_1@-2``, … with ``observed="no"``, DoWhy's mark of
-    unobserved nodes.
+    unobserved nodes: two nodes are d-separated exactly where they are in a graph unrolled without
+    end, of which this is the latent projection.
 
     Args:
         source: A model, or any directed networkx graph; the attribute ``lag`` of an edge counts.
@@ -97,24 +66,37 @@ def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
     Raises:
         ModelError: Edges of lag 0 form a cycle.
         UnknownOption: The source is not a graph.
+
+    Source:
+        Verma and Pearl, *Equivalence and synthesis of causal models*, UAI 1990, for projections;
+        a clique of bidirected edges separates as one common cause does.
     """
     graph, made = to_digraph(source), nx.DiGraph()
-    held, past, slices = _held(graph), _longest_lag(graph), window_of(graph)
-
-    def named(node: tuple[str, int]) -> str:
-        name, slice_ = node
-        if slice_ > 0:
-            return f"past_{slice_}@-{past + 1}"
-        return f"{name}@{'=' if name in held else ''}{slice_}" if slice_ else name
-
-    for node in sorted(slices, key=lambda node: (node[1] > 0, abs(node[1]))):  # the present first
-        data = graph.nodes.get(node[0], {}) if node[1] <= 0 else slices.nodes[node]
-        made.add_node(named(node), **{k: v for k, v in data.items() if k == "observed"})
-    made.add_edges_from((named(cause), named(effect)) for cause, effect in slices.edges)
+    past, held = max((lag for *_, lag in graph.edges(keys=True)), default=0), _held(graph)
+    nodes = [(name, slice_) for slice_ in range(-past, 1) for name in graph]
+    named = {
+        (name, slice_): f"{name}@{'=' * (name in held)}{slice_}" if slice_ else name
+        for name, slice_ in nodes
+    }
+    for name, slice_ in sorted(nodes, key=lambda node: -node[1]):  # the present first
+        data = graph.nodes[name]
+        made.add_node(named[name, slice_], **{k: v for k, v in data.items() if k == "observed"})
+    made.add_edges_from((named[a], named[b]) for a, b in unrolled(graph, past + 1).edges)
     if not nx.is_directed_acyclic_graph(made):
         cycle = [cause for cause, _ in nx.find_cycle(made)]
         path = " → ".join([*cycle, cycle[0]])
         raise ModelError([f"edges of lag 0 form a cycle: {path}; give edges their lag"])
+    place = {name: number for number, name in enumerate(graph)}
+    edges = np.zeros((past + 1, len(place), len(place)), dtype=bool)  # lag, cause, effect
+    for cause, effect, lag in graph.edges(keys=True):
+        edges[lag, place[cause], place[effect]] = True
+    for name in held if past else ():
+        edges[1, place[name], place[name]] = True
+    _, shared = window(edges, np.zeros_like(edges), past)
+    pairs = nx.Graph((nodes[i], nodes[j]) for i, j in np.argwhere(np.triu(shared)).tolist())
+    for number, effects in enumerate(sorted(map(sorted, nx.find_cliques(pairs))), start=1):
+        made.add_node(hidden := f"past_{number}@-{past + 1}", observed="no")
+        made.add_edges_from((hidden, named[effect]) for effect in effects)
     return made
 
 
@@ -162,36 +144,3 @@ def episode_outcome(
         graph.add_edges_from((parameter, outcome) for parameter in sorted(direct))
         graph.add_edges_from((f"{name}@0", outcome) for name in starts if name in causes)
     return graph
-
-
-@typed
-def d_separated(
-    model: SCM, x: Iterable[Node], y: Iterable[Node], given: Iterable[Node] = ()
-) -> bool:
-    """Return whether ``given`` blocks every path between ``x`` and ``y``.
-
-    In a model with lagged edges a plain name means the present slice and ``(name, -1)`` the one
-    before. A common past connects two nodes, however long ago it was.
-
-    Raises:
-        UnknownVariable: A node is not in the model.
-        UnknownOption: A node is in two of the sets.
-
-    Source:
-        Pearl, *Causality*, 2nd ed., section 1.2.3; computed by networkx.
-    """
-    graph = window_of(to_digraph(model))
-
-    def nodes(chosen: Iterable[Node]) -> set[Any]:
-        found: set[Any] = set()
-        for node in (chosen,) if isinstance(chosen, str) else chosen:
-            full = (node, 0) if isinstance(node, str) else node
-            if full not in graph or not -1 <= full[1] <= 0:
-                raise UnknownVariable(str(node), list(model))
-            found.add(full)
-        return found
-
-    first, second, blocked = nodes(x), nodes(y), nodes(given)
-    if twice := (first & second) | (first & blocked) | (second & blocked):
-        raise UnknownOption("nodes", sorted(twice), ("three sets without a node in common",))
-    return bool(nx.is_d_separator(graph, first, second, blocked))

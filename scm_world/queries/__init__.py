@@ -19,8 +19,7 @@ from scm_world.queries.outcomes import Outcome
 from scm_world.queries.plans import Plan, do
 from scm_world.queries.questions import SCM
 from scm_world.queries.samples import Samples, Setting
-from scm_world.queries.verification import Verification
-from scm_world.queries.verify import verify
+from scm_world.queries.verification import Verification, verify
 from scm_world.queries.world import World
 
 __all__ = [

@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
-import copy
-import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
-from typing import Any, Self, final
+from typing import Any, final
 
-import gymnasium
 import numpy as np
 
 from scm_world._arguments import real_numbers, whole_number
 from scm_world._types import ArrayLike, Floats, Value, Values
-from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
+from scm_world.errors import (
+    InterventionError,
+    ModelError,
+    SnapshotMismatch,
+    UnknownOption,
+    raise_all,
+)
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.variables import Draw, Noise
-from scm_world.world import Audit, Simulation
+from scm_world.variables import Draw
+from scm_world.variables.checks import check_space
+from scm_world.variables.subsets import AnyRegion, as_region
+from scm_world.world import Audit, Simulation, Snapshot
 from scm_world.world.audit import Applied
 from scm_world.world.compiled_task import ActionVector, slices_of
-from scm_world.world.interventions import same
+from scm_world.world.interventions import fixed_action, same
+from scm_world.world.philox import CompiledNoise
+from scm_world.world.system import CausalSystem
+
+PRESENT = ("_models", "_before", "_action", "_drawn", "_solved", "_order")
+"""The attributes of equations that a snapshot keeps."""
 
 
 @final
@@ -79,8 +89,8 @@ class CompiledModel(ActionVector):
         return {"model": self.model}
 
 
-class Equations:
-    """A causal model that is stepped: it has the methods of a ``Simulation`` that queries use.
+class Equations(CausalSystem):
+    """A causal model without a backend that is stepped.
 
     Instant 0 of a model with lagged edges is the one that its first step looks back at (see
     ``SCM.begin``); instant t + 1 is drawn with the noise of step t. A model without lagged edges
@@ -98,8 +108,11 @@ class Equations:
             it has among others; what ``compiled`` says if None.
     """
 
+    compiled: CompiledModel
     static_names: tuple[str, ...] = ()
     engine = "equations"
+    _solved: dict[str, Value] | None
+    _order: tuple[str, ...] | None
 
     def __init__(
         self,
@@ -108,48 +121,34 @@ class Equations:
         *,
         vectorised: bool | None = None,
     ) -> None:
-        self.compiled, self.model = compiled, compiled.model
+        self.compiled = compiled
         vectorised = compiled.is_vectorised if vectorised is None else vectorised
         self._groups = np.zeros(1, dtype=int) if groups is None else np.asarray(groups)
         self._is_one = groups is None
         self._count = len(self._groups) if vectorised else None
-        self.version, self.index, self.has_begun = 0, 0, False
-        self.noise, self.episode = Noise(0), 0
-        self._models: tuple[SCM, ...] = (self.model,)
+        self._have_no_episode()
+
+    def _have_no_episode(self) -> None:
+        self._started = False
+        self.noise, self.episode = CompiledNoise(0), 0
+        self._clear()
+
+    def _begin(self) -> None:
+        self._started = True
+        self._clear()
+
+    def _clear(self) -> None:
+        self._models: tuple[SCM, ...] = (self.model,) * (int(self._groups.max()) + 1)
+        self.index = 0
         self._before: Values = {}
-        self._action: Values = {}
+        self._action: Values = self._split(self.idle())
         self._drawn: Mapping[str, int] = {}  # how often, at this instant
-        self._solved: dict[str, Value] | None = None
-        self._order: tuple[str, ...] | None = None
+        self._changed()
 
     # --- what a world reports -------------------------------------------------------------------
 
-    @property
-    def action_low(self) -> Floats:
-        """Lower end of all actions, shape (n_actions,)."""
-        return self.compiled.action_bounds[0]
-
-    @property
-    def action_high(self) -> Floats:
-        """Upper end of all actions, shape (n_actions,)."""
-        return self.compiled.action_bounds[1]
-
-    @property
-    def action_space(self) -> gymnasium.spaces.Box:
-        """The space of actions."""
-        return gymnasium.spaces.Box(self.action_low, self.action_high, dtype=np.float64)
-
-    @property
-    def observation_space(self) -> gymnasium.spaces.Dict:
-        """The space of all variables by name; nothing is clipped."""
-        shapes = {name: self.model.declared(name).shape for name in self.model}
-        box = gymnasium.spaces.Box
-        return gymnasium.spaces.Dict(
-            {name: box(-np.inf, np.inf, shape, np.float64) for name, shape in shapes.items()}
-        )
-
     def idle(self) -> Floats:
-        """Give the action that is nearest to zero, shape (n_actions,)."""
+        """Return the action that is nearest to zero, shape (n_actions,)."""
         return np.clip(np.zeros(self.compiled.n_actions), *self.compiled.action_bounds)
 
     @property
@@ -166,16 +165,8 @@ class Equations:
         flat: Floats = np.concatenate(parts, axis=-1).astype(np.float64)
         return flat[0] if self._is_one and lead else flat
 
-    def __getitem__(self, name: str) -> Value:
-        self.model.declared(name)
-        return np.array(self._shown(self._now()[name]))
-
-    def values(self) -> dict[str, Value]:
-        """Give the present value of every variable, as copies."""
-        return {name: self[name] for name in self.model}
-
-    def evaluate(self, names: Sequence[str]) -> dict[str, Value]:
-        """Give all present values."""
+    def evaluate(self, names: tuple[str, ...] | None = None) -> dict[str, Value]:
+        """Return all present values."""
         return {name: self._shown(value) for name, value in self._now().items()}
 
     def _shown(self, value: Value) -> Value:
@@ -184,42 +175,22 @@ class Equations:
 
     # --- what a world does --------------------------------------------------------------------
 
-    def reset(
-        self,
-        *,
-        seed: int | None = None,
-        episode: int = 0,
-        do: Mapping[str, Any] | None = None,
-    ) -> Audit | None:
-        """Begin an episode, or several: ``episode`` is then the number of the first one.
-
-        Without a seed the next episode of the same noise begins; see ``Simulation.reset``.
-        """
-        if seed is not None:
-            self.noise, self.episode = Noise(seed), whole_number("episode", episode, least=0)
-        elif not self.has_begun:
-            self.noise, self.episode = Noise(secrets.randbits(63)), 0
-        else:
-            self.episode += 1
-        self.has_begun = True
-        self._models = (self.model,) * (int(self._groups.max()) + 1)
-        self.index, self._before, self._drawn = 0, {}, {}
-        self._action = self._split(self.idle())
-        self._changed()
-        return self.do(do) if do else None
-
-    def do(self, request: Mapping[Any, Any]) -> Audit:
+    def do(self, request: Mapping[Any, Any], *, space: AnyRegion | None = None) -> Audit:
         """Intervene now.
 
         Args:
             request: Interventions by name; of several episodes, such requests by group.
+            space: In which every value that is set must lie, if any; see ``Simulation.do``. Not
+                of several episodes.
 
         Returns:
             What was requested and applied, and what followed at lag 0.
 
         Raises:
             InterventionError: The request was refused; everything is as before.
+            NotReset: There is no episode yet.
         """
+        self._require_episode()
         if not self._is_one:
             models = [
                 model.do(request[group]) if group in request else model
@@ -233,10 +204,17 @@ class Equations:
             if isinstance(act, Draw) and act.stream is None and act.of is None:
                 times = drawn[name] = drawn.get(name, -1) + 1
                 flat[name] = act.model_copy(update={"stream": f"draw {times}"}) if times else act
-        model, earlier = self.graph.do(flat), self._now()
-        self._models, self._drawn = (model,), drawn
-        self._changed()
-        now, waiting = self._now(), self._action if self.model.is_temporal else {}
+        earlier, before = self._now(), self.snapshot()
+        waiting = self._action if self.model.is_temporal else {}
+        try:
+            self._models, self._drawn = (self.graph.do(flat),), drawn
+            self._changed()
+            now, region = self._now(), as_region("space", space)
+            if region is not None:
+                self._check_space(flat, region, waiting)
+        except BaseException:
+            self.restore(before)
+            raise
         targets = {
             name: Applied(name, act, None if name in waiting else self[name], None)
             for name, act in flat.items()
@@ -248,6 +226,22 @@ class Equations:
         }
         return Audit(lambda: (targets, moved, {}, (), (), ()))
 
+    def _check_space(self, request: Values, region: AnyRegion, waiting: Values) -> None:
+        """Refuse values outside a space; an action must be one that is known."""
+        problems: list[InterventionError] = []
+        now = self.evaluate()
+        for name in request:
+            variable = self.model.declared(name)
+            act: Any = self.graph.act_on(self.model.target(name))
+            try:
+                value = now[name]
+                if name in waiting:
+                    value = fixed_action(name, [act.intervention])
+                check_space(variable, value, region, now)
+            except InterventionError as problem:
+                problems.append(problem)
+        raise_all(problems)
+
     def step(self, action: ArrayLike) -> None:
         """Take a step.
 
@@ -258,6 +252,7 @@ class Equations:
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
             ModelError: The model has no lagged edges, so that it has one instant.
+            NotReset: There is no episode yet.
         """
         if not self.model.is_temporal:
             raise ModelError(["a model without lagged edges has one instant, and takes no step"])
@@ -274,20 +269,35 @@ class Equations:
         self.index += 1
         self._drawn, self._solved = {}, None
 
-    def snapshot(self) -> Self:
-        """Return a copy of everything that decides what follows."""
-        self._now()
-        return copy.copy(self)
+    def snapshot(self) -> Snapshot:
+        """Return everything that decides what follows. It can be pickled.
 
-    def restore(self, snapshot: Any) -> None:
+        Raises:
+            NotReset: There is no episode yet.
+        """
+        self._now()
+        return Snapshot(
+            engine=None,
+            present={name: getattr(self, name) for name in PRESENT},
+            base=None,
+            index=self.index,
+            offset=0,
+            seed=self.noise.seed,
+            episode=self.episode,
+            world=(self.model,),
+        )
+
+    def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot, bit for bit.
 
         Raises:
             SnapshotMismatch: It is none of these equations.
         """
-        if not isinstance(snapshot, Equations) or snapshot.model != self.model:
+        if not isinstance(snapshot, Snapshot) or snapshot.world != (self.model,):
             raise SnapshotMismatch(f"{snapshot!r} is no snapshot of these equations")
-        vars(self).update(vars(snapshot), version=self.version + 1)
+        vars(self).update(snapshot.present, index=snapshot.index, _started=True)
+        self.noise, self.episode = CompiledNoise(snapshot.seed), snapshot.episode
+        self.version += 1
 
     # --- solving ------------------------------------------------------------------------------
 
@@ -302,6 +312,7 @@ class Equations:
 
     def _now(self) -> dict[str, Value]:
         """Solve the present instant, if that has not been done."""
+        self._require_episode()
         if self._solved is None:
             values: dict[str, Value] = dict(self._action)
             starts = self.index == 0 and self.model.is_temporal

@@ -13,9 +13,9 @@ import networkx as nx
 from scm_world._arguments import load, one_of
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM, episode_outcome
-from scm_world.graph.evaluate import AppliedIntervention, source_of
 from scm_world.graph.views import to_dag
 from scm_world.queries.episodes import as_names
+from scm_world.queries.equations import System
 from scm_world.queries.plans import Plan
 from scm_world.variables import Draw, Mechanism
 
@@ -56,7 +56,7 @@ class Identification:
 
 
 def nature_graph(
-    model: SCM,
+    model: SCM | System,
     nature: Mapping[str, Any] | None,
     outcomes: Iterable[str],
     *,
@@ -65,7 +65,7 @@ def nature_graph(
     """Return the static graph of an episode in which nature does something at the beginning.
 
     Args:
-        model: Of the world.
+        model: A world, or its model.
         nature: What varies by itself; a ``Mechanism`` adds its edges, and so does a ``Draw`` from
             a space that follows other variables.
         outcomes: What the episode ends with.
@@ -75,8 +75,9 @@ def nature_graph(
         ModelError: Nature does something later than at the beginning.
         UnknownOption: It is no model, or there are no names of outcomes.
     """
+    model = _graph_of(model)
     if not isinstance(model, SCM):
-        raise UnknownOption("model", model, ("an SCM, such as world.model",))
+        raise UnknownOption("model", model, ("a world, or an SCM, such as world.model",))
     plan = Plan(nature)
     acts = plan.at_start()
     late = sorted(name for name in plan if name not in acts or len(plan[name]) > 1)
@@ -92,14 +93,14 @@ def nature_graph(
         if isinstance(act, Mechanism):
             followed = frozenset(parent.name for parent in act.parents)
         elif isinstance(act, Draw):
-            followed = source_of(AppliedIntervention(act, model.declared(name))).parents()
+            followed = act.drawn_from(model.declared(name)).parents()
         causes = [n if n in graph else f"{n}@0" for n in sorted(followed)]
         graph.add_edges_from((n, f"{target}@0") for target in model.targets(name) for n in causes)
     return graph
 
 
 def identify(
-    graph: SCM | nx.DiGraph,
+    graph: SCM | System | nx.DiGraph,
     treatment: str,
     outcome: str,
     *,
@@ -109,7 +110,7 @@ def identify(
     """Find the variables from which an effect can be estimated without an intervention.
 
     Args:
-        graph: Directed and acyclic; of a model or graph with lagged edges, its two slices.
+        graph: Directed and acyclic; of a world, model or graph with lagged edges, its two slices.
         treatment: A node.
         outcome: A node.
         observed: The observed nodes; if None all but those with the attribute ``observed="no"``.
@@ -131,7 +132,7 @@ def identify(
         >>> identify(graph, "x", "y", observed=["x", "y", "w"]).backdoor is None
         True
     """
-    graph = to_dag(graph)
+    graph = to_dag(_graph_of(graph))
     hidden = {node for node, seen in graph.nodes(data="observed") if seen == "no"}
     seen = set(graph) - hidden if observed is None else set(as_names(observed))
     for node in (treatment, outcome, *seen):
@@ -208,6 +209,10 @@ def estimate(
             control_value=versus,
             treatment_value=do,
         )
+
+
+def _graph_of(system: Any) -> Any:
+    return system.model if isinstance(system, System) else system
 
 
 def _without_edges_from(graph: nx.DiGraph, nodes: Iterable[str]) -> nx.DiGraph:

@@ -8,7 +8,7 @@ that move, are an *island*; what stands still for good (floor, stage, obstacles)
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, final
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import networkx as nx
@@ -41,15 +41,10 @@ def local_graph(world: Simulation, action: ArrayLike | None = None) -> nx.MultiD
     graph = nx.MultiDiGraph()
     graph.add_nodes_from(world.graph)
     for edge in world.graph.edges:
-        if edge.when == "contact" and not acts(edge.cause, edge.effect):
-            continue
-        if edge.when == "set" and world.index > 0:  # it acts where an episode begins
-            continue
-        graph.add_edge(edge.cause, edge.effect, lag=edge.lag, when=edge.when)
+        apart = edge.when == "contact" and not acts(edge.cause, edge.effect)
+        if not apart and (edge.when != "set" or world.index == 0):  # set where an episode begins
+            graph.add_edge(edge.cause, edge.effect, lag=edge.lag, when=edge.when)
     return graph
-
-
-# --- conditions of edges --------------------------------------------------------------------------
 
 
 def contact_terms(world: Simulation) -> dict[str, Any]:
@@ -62,39 +57,34 @@ def contact_terms(world: Simulation) -> dict[str, Any]:
         Plain data. ``"together"``: groups of bodies that are coupled in every step. ``"still"``:
         bodies that never move. ``"of"``: the bodies of each variable, one of each group.
     """
-    model, touched, shaped = (
-        world.model,
-        world.composition.touched(),
-        world.composition.shaped(),
-    )
+    model, touched = world.model, world.composition.touched()
     states = {v.name for v in model.variables if v.role == "state"}
     coupled, ahead, back = nx.Graph(), nx.DiGraph(), nx.DiGraph()  # until the next states
     coupled.add_nodes_from((name, "state") for name in states)
     coupled.add_edges_from(
         ((body, "body"), (name, "state")) for body, moved in touched.items() for name in moved
     )
-    for way in (ahead, back):
-        way.add_nodes_from(model)
-    for edge in model.edges:
-        if edge.when != "contact":
-            ends = edge.cause, edge.effect
-            if states.issuperset(ends):
-                coupled.add_edge(*((name, "state") for name in ends))
-            ahead.add_edges_from([ends] if edge.cause not in states else [])
-            back.add_edges_from([ends[::-1]] if edge.effect not in states else [])
+    ahead.add_nodes_from(model)
+    back.add_nodes_from(model)
+    for cause, effect in ((e.cause, e.effect) for e in model.edges if e.when != "contact"):
+        if cause in states and effect in states:
+            coupled.add_edge((cause, "state"), (effect, "state"))
+        if cause not in states:
+            ahead.add_edge(cause, effect)
+        if effect not in states:
+            back.add_edge(effect, cause)
     together, groups = list[list[str]](), dict[str, list[str]]()  # by state: the first of them
     for part in nx.connected_components(coupled):
         bodies = sorted(name for name, kind in part if kind == "body")
         together += [bodies] if bodies else []
         groups.update((name, bodies[:1]) for name, kind in part if kind == "state")
-    of = {}
+    of = {name: {body} for name, body in world.composition.shaped().items()}
     for name in model:
-        found = {shaped[name]} if name in shaped else set()
         for other in {name} | nx.descendants(ahead, name) | nx.descendants(back, name):
-            found.update(groups.get(other, ()))
-        of[name] = sorted(found)
+            of.setdefault(name, set()).update(groups.get(other, ()))
     still = sorted(body for body, moved in touched.items() if not moved)
-    return {"of": of, "together": sorted(together), "still": still}
+    known = {name: sorted(of[name]) for name in model}
+    return {"of": known, "together": sorted(together), "still": still}
 
 
 def holds(
@@ -124,25 +114,20 @@ def holds(
     return found
 
 
-# --- physics steps --------------------------------------------------------------------------------
-
-
-@final
 class _Listener:
     """Stands in for a backend, which lists the contacts of its last physics step only."""
 
     def __init__(self, backend: Any) -> None:
         self._backend = backend
-        self.contacts: list[tuple[ContactPoint, ...]] = []
+        self.heard: list[tuple[ContactPoint, ...]] = []
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._backend, name)
 
     def step(self, command: Floats, substeps: int) -> None:
-        """Hold a command for some physics steps, and note what touches in each."""
         for _ in range(substeps):
             self._backend.step(command, 1)
-            self.contacts.append(self._backend.contacts())
+            self.heard.append(self._backend.contacts())
 
 
 def contacts_of(world: Simulation, action: ArrayLike) -> Touching:
@@ -151,12 +136,10 @@ def contacts_of(world: Simulation, action: ArrayLike) -> Touching:
         problem = "the contacts in each stage of RK4 are not known, so that any edge may act"
         remedy = "read the model with settings={'integrator': 'implicitfast'} to know them"
         raise ModelError([f"{problem}; {remedy}"])
-    backend: Any = world.backend
-    listener: Any = _Listener(backend)
-    world.backend = listener
+    backend, listener = world.backend, _Listener(world.backend)
+    world.backend = listener  # type: ignore[assignment] # it passes all on
     try:
         world.step(action)
     finally:
         world.backend = backend
-    contacts: Touching = listener.contacts
-    return contacts
+    return listener.heard

@@ -1,22 +1,42 @@
-"""Reports of verification."""
+"""Verification: every declared edge must move its child, every other one must leave it alone."""
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from itertools import accumulate
-from types import MappingProxyType
 from typing import Any, Literal, Self, final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from scm_world._arguments import whole_number
 from scm_world.errors import UnreadableFile
 from scm_world.graph import SCM, Edge
-from scm_world.queries.experiments.effects import EdgeKey, Effects, ProbeSetting
+from scm_world.queries.equations import System
+from scm_world.queries.experiments.effects import EdgeKey, Effects
+from scm_world.queries.experiments.markov import Markov
+from scm_world.queries.experiments.paired import Paired, opened
+from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.progress import Progress
+from scm_world.tasks import Task
 from scm_world.variables import Measured
 from scm_world.world import Simulation
+
+MOST = 200
+"""Largest number of probe states in which declared edges are looked for."""
+
+QUIET = 10
+"""After how many probe states without a new edge the search ends, of a generated graph."""
+
+HELD_OUT = 8
+"""In how many further probe states of another seed effects without an edge are looked for."""
+
+OTHER = 1_000_003
+"""What is added to the seed for these."""
 
 SHOWN = 10  # edges that are written out in a table
 NAMED = 3  # variables that are named in a headline
@@ -176,11 +196,47 @@ class GraphReport(Report):
 
     @classmethod
     def of(
-        cls, system: Simulation | SCM, effects: Effects, edges: Iterable[EdgeReport], **more: Any
+        cls,
+        system: Simulation | SCM,
+        effects: Effects,
+        after: Mapping[EdgeKey, int] | None = None,
+        reason: Callable[[Edge], str] = lambda edge: "not seen",
+        **fields: Any,
     ) -> Self:
-        """Make the report of a system."""
+        """Make the report of a system: declared edges, seen or not, and effects without an edge.
+
+        Args:
+            system: The system.
+            effects: What was seen.
+            after: How many probe states it took until an edge was seen, where that is known.
+            reason: Returns why a declared edge was not seen.
+            fields: Further fields of the report.
+        """
         world = None if isinstance(system, SCM) else system
         model = system if isinstance(system, SCM) else system.model
+        declared = {edge.key: edge for edge in sorted(model.edges, key=lambda edge: edge.key)}
+        observed, edges = effects.edges(declared), list[EdgeReport]()
+        counts = {by: Counter[str]() for by in ("engine", "readout", "definition")}
+
+        def add(key: EdgeKey, status: str, **more: Any) -> None:
+            seen = effects.largest.get(key, 0.0), effects.settings.get(key)
+            size, where = effects.violations.get(key, seen) if status == "undeclared" else seen
+            if where is not None:
+                more |= where._asdict() | {"change": where.change.tolist()}
+            names = dict(zip(("cause", "effect", "lag"), key, strict=True))
+            edges.append(EdgeReport(**names, status=status, size=size, **more))
+            effect: Any = model.declared(key[1])
+            computed = "engine" if getattr(effect, "mechanism", None) is None else "readout"
+            counts[computed if isinstance(effect, Measured) else "definition"][status] += 1
+
+        for key, edge in declared.items():
+            more = {"states": effects.changed[edge.cause]}
+            if key in observed:
+                add(key, "fired", after=(after or {}).get(key, 0), **more)
+            else:
+                add(key, "unseen", reason=reason(edge), **more)
+        for key in sorted(observed - declared.keys() | effects.violations.keys()):
+            add(key, "undeclared")
         return cls(
             task=world.task.name if world else "model",
             backend=world.backend.name if world else "equations",
@@ -189,9 +245,20 @@ class GraphReport(Report):
             rollouts=effects.rollouts,
             unstable=effects.unstable,
             edges=tuple(edges),
-            provenance=by_provenance(model, edges),
-            **more,
+            provenance={
+                by: (found["fired"], found["fired"] + found["unseen"], found["undeclared"])
+                for by, found in counts.items()
+            },
+            **fields,
         )
+
+    def counted(self) -> list[Row]:
+        """List the counts of ``provenance``; of what there is none, there is no row."""
+        return [
+            (f"edges by {by}", f"{seen} of {all_} seen, {others} undeclared", not others)
+            for by, (seen, all_, others) in self.provenance.items()
+            if all_ or others
+        ]
 
 
 @final
@@ -256,9 +323,10 @@ class Verification(GraphReport):
         """The outcome in a sentence: what never changed, what was wrong, what is left."""
         names, its = self.unresponsive, "its" if len(self.unresponsive) == 1 else "their"
         more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-        silent = f"{', '.join(names[:NAMED])}{more}"
         told = {
-            f"{silent} never changed under any of {its} declared causes": names,
+            f"{', '.join(names[:NAMED])}{more} never changed under any of {its} declared causes": (
+                names
+            ),
             f"{len(self.undeclared)} effects without an edge": self.undeclared,
             f"{len(self.unstable)} variables that differ by themselves": self.unstable,
             f"{len(self.unseen)} of {len(self.declared)} edges were never seen": self.unseen,
@@ -286,7 +354,7 @@ class Verification(GraphReport):
             f"{c} -> {', '.join(dict.fromkeys(found))}: {why}" for (c, why), found in unseen.items()
         )
         return (
-            *counted(self.provenance),
+            *self.counted(),
             ("engine", f"{self.backend} {self.versions.get(self.backend, '')}".strip(), None),
             ("preset, seed", f"{self.preset}, {self.seed}", None),
             ("probe states", states + ": interrupted" * self.interrupted, None),
@@ -314,71 +382,6 @@ def failed(outcomes: Iterable[Outcome], *, strict: bool) -> bool:
     return not {*outcomes} <= ({"confirmed"} if strict else {"confirmed", "not refuted"})
 
 
-def by_provenance(model: SCM, edges: Iterable[EdgeReport]) -> dict[str, tuple[int, int, int]]:
-    """Count declared edges that were seen, all of them, and undeclared ones, by what decides.
-
-    The engine decides states and what it reports. What is computed from them is a readout, and
-    everything else follows by definition: its edges hold because the mechanism is what it is.
-    """
-    counts = {by: Counter[str]() for by in ("engine", "readout", "definition")}
-    for edge in edges:
-        effect: Any = model.declared(edge.effect)
-        measured = isinstance(effect, Measured)
-        by = "definition" if not measured else "engine" if effect.mechanism is None else "readout"
-        counts[by][edge.status] += 1
-    return {
-        by: (found["fired"], found["fired"] + found["unseen"], found["undeclared"])
-        for by, found in counts.items()
-    }
-
-
-def edge_reports(
-    model: SCM,
-    effects: Effects,
-    after: Mapping[EdgeKey, int] = MappingProxyType({}),
-    reason: Callable[[Edge], str] = lambda edge: "not seen",
-) -> list[EdgeReport]:
-    """List declared edges, seen or not, and effects without an edge.
-
-    Args:
-        model: Declares the edges.
-        effects: What was seen.
-        after: How many probe states it took until an edge was seen, where that is known.
-        reason: Returns why a declared edge was not seen.
-    """
-    edges, reports = sorted(model.edges, key=lambda edge: edge.key), list[EdgeReport]()
-    declared = {edge.key for edge in edges}
-    observed = effects.edges(declared)
-
-    def add(key: EdgeKey, size: float, setting: ProbeSetting | None, **more: Any) -> None:
-        if setting is not None:
-            more |= setting._asdict() | {"change": setting.change.tolist()}
-        cause, effect, lag = key
-        reports.append(EdgeReport(cause=cause, effect=effect, lag=lag, size=size, **more))
-
-    for edge in edges:
-        more: dict[str, Any] = {"states": effects.changed[edge.cause], "status": "fired"}
-        if edge.key in observed:
-            more["after"] = after.get(edge.key, 0)
-        else:
-            more |= {"status": "unseen", "reason": reason(edge)}
-        where = effects.settings.get(edge.key)
-        add(edge.key, effects.largest.get(edge.key, 0.0), where, **more)
-    for key in sorted(observed - declared | effects.violations.keys()):
-        seen = effects.largest.get(key, 0.0), effects.settings.get(key)
-        add(key, *effects.violations.get(key, seen), status="undeclared")
-    return reports
-
-
-def counted(provenance: Mapping[str, tuple[int, int, int]]) -> list[Row]:
-    """Write the counts of ``by_provenance`` as rows; of what there is none, there is no row."""
-    return [
-        (f"edges by {by}", f"{seen} of {all_} seen, {others} undeclared", not others)
-        for by, (seen, all_, others) in provenance.items()
-        if all_ or others
-    ]
-
-
 def arrow(key: EdgeKey) -> str:
     """Write an edge.
 
@@ -395,3 +398,124 @@ def listed(items: Iterable[object], count: int | None = None) -> str:
     found = [str(item) for item in items]
     more = [f"and {len(found) - SHOWN} more"] if len(found) > SHOWN else []
     return "\n".join([str(len(found) if count is None else count), *found[:SHOWN], *more])
+
+
+def verify(
+    system: System | SCM | Task | str,
+    *,
+    probes: int = MOST,
+    held_out: int = HELD_OUT,
+    seed: int = 0,
+    progress: Progress | None = None,
+    found: Callable[[set[EdgeKey]], object] | None = None,
+    **options: Any,
+) -> Verification:
+    """Check a declared graph against the physics or the equations that realise it.
+
+    Two tests are made. Each declared edge has to change its child when its cause is changed and
+    everything else is kept. And with its parents held, changing everything else together has to
+    leave each variable as it is, bit for bit.
+
+    Edges are looked for in one probe state after another, until each was observed. Effects without
+    an edge are looked for in further states, which are held out: of another seed, half of them
+    with other parameters, where random actions lead, anywhere that is feasible, and where bodies
+    touch. It may be interrupted (Ctrl-C); the report then covers the probe states that were
+    finished.
+
+    A graph that was generated from a model says what can act on what; some of its edges may never
+    show, and stay unseen. So its search ends when nothing new is seen any more.
+
+    A causal model without a backend is its own physics: each mechanism is evaluated with one
+    parent changed, and with everything but its parents changed.
+
+    Args:
+        system: A world, a causal model, a task, the name of one, or a model file.
+        probes: How many states to look for edges in at most.
+        held_out: How many further ones for effects without an edge.
+        seed: Of states and values.
+        progress: Called with (finished, planned) after each probe state.
+        found: Called before that with all edges observed so far: (cause, effect, lag).
+        options: Arguments of ``World``, such as ``backend``, unless ``system`` is one.
+
+    Returns:
+        The report. Its ``outcome`` is ``"confirmed"``, ``"not refuted"`` where declared edges are
+        left that no probe state showed, with the reasons, or ``"refuted"``. A world that was given
+        is afterwards as it was.
+
+    Raises:
+        UnknownOption: ``probes`` is not a positive whole number, ``held_out`` is not a whole
+            number, there are options for a world that is made, or a name does not exist.
+
+    Example:
+        >>> found = verify("reaching", backend="fake", probes=1, held_out=0)
+        >>> found.floor, found.undeclared, found.outcome  # without physics nothing moves
+        (0.0, (), 'not refuted')
+    """
+    whole_number("number of probes", probes, least=1)
+    whole_number("number of held-out probes", held_out, least=0)
+    with opened(system, options) as there:
+        started, paired = time.perf_counter(), Paired(there, seed)
+        world = there if isinstance(there, Simulation) else None
+        markov = None if world is None else Markov(paired)
+        declared = {edge.key for edge in paired.model.edges}
+        missing, after = set(declared), dict[EdgeKey, int]()
+        effects, done, searched, interrupted = Effects(exact=paired.exact), 0, 0, False
+        search = probe_states(there, probes, seed)
+        others = probe_states(there, held_out, seed + OTHER, scenarios=False)
+        try:
+            for held, states in ((False, search), (True, others)):
+                for probe in states:
+                    one = paired.run(done, probe, missing)
+                    if held and markov is not None and not one.unstable:
+                        markov.run(one)
+                    effects.add(one)
+                    done, searched = done + 1, searched + (not held)
+                    now = effects.edges(declared)
+                    after.update(dict.fromkeys(missing & now, done))
+                    missing -= now
+                    quiet = paired.exact and done - max(after.values(), default=0) >= QUIET
+                    last = not held and (quiet or not missing)
+                    if found is not None:
+                        found(now)
+                    if progress is not None:
+                        progress(done, held_out + (searched if held or last else probes))
+                    if last:
+                        break
+        except KeyboardInterrupt:
+            if not done:
+                raise
+            interrupted = True
+        return Verification.of(
+            there,
+            effects,
+            after,
+            partial(_reason, world, effects, effects.edges(declared)),
+            seed=seed,
+            generated=paired.exact,
+            probes=searched,
+            held_out=done - searched,
+            planned=probes,
+            interrupted=interrupted,
+            seconds=time.perf_counter() - started,
+        )
+
+
+def _reason(world: Simulation | None, effects: Effects, observed: set[EdgeKey], edge: Edge) -> str:
+    """Say why an edge was not seen, as far as the experiments tell."""
+    cause, states = edge.cause, effects.changed[edge.cause]
+    if not states:
+        refused = ": every other value that was tried was refused" * (cause in effects.refused)
+        return f"no probe state had another value of {cause}{refused}"
+    if edge.when == "contact":
+        body = cause.partition(".")[0]
+        known = world is not None and body in getattr(world.structure, "bodies", ())
+        if not effects.touched:
+            return "nothing touched in any probe state"
+        if known and body not in effects.touched:
+            return f"{body} touched nothing in any probe state"
+    acted = {name for name, _, lag in observed if lag}
+    for action in () if world is None else world.compiled.actions:
+        if action.partition(".")[0] == cause.partition(".")[0] and action not in acted:
+            return f"no command of {action} acted: each was cut to a limit, or drives nothing"
+    beyond = " beyond rounding and noise" * (effects.largest.get(edge.key, 0.0) > 0.0)
+    return f"no difference{beyond}, though {cause} was changed in {states} of the probe states"

@@ -11,7 +11,7 @@ import networkx as nx
 
 from scm_world._types import ArrayLike
 from scm_world.backends import Backend
-from scm_world.errors import NotReset, UnknownOption
+from scm_world.errors import UnknownOption
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import CompiledModel, Equations
@@ -21,7 +21,7 @@ from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions, planned
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion, as_region
-from scm_world.world import Audit, Batch, Simulation, WorldSnapshot
+from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.interventions import merged
 
 
@@ -351,11 +351,11 @@ class World(Simulation, Questions):
         self._course = self._course._replace(fired=fired, acted=self.index)
         return audit
 
-    def snapshot(self) -> WorldSnapshot:
+    def snapshot(self) -> Snapshot:
         """Save everything, with the plan and the events that have happened."""
         return replace(super().snapshot(), memory=self._course)
 
-    def restore(self, snapshot: WorldSnapshot) -> None:
+    def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot, bit for bit."""
         super().restore(snapshot)
         if snapshot.memory is not None:
@@ -391,16 +391,11 @@ class EquationWorld(Equations, Questions):
 
     counterfactual = World.counterfactual
 
-    def _now(self) -> dict[str, Any]:
-        if not self.has_begun:
-            raise NotReset
-        return super()._now()
-
     def given(self, do: Mapping[str, Any]) -> Self:
         """Return another world in which this is done too, at the same instant; see ``World``."""
         other = copy.copy(self)
         other.compiled = CompiledModel(self.model.do(do))
-        other.model, other._models = other.compiled.model, (self.graph.do(do),)
+        other._models = (self.graph.do(do),)
         other._changed()
         return other
 

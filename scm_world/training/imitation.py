@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 from collections.abc import Iterable, Mapping
@@ -30,14 +31,13 @@ from scm_world.policies.scripted import NAMED
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import made, read_arrays
-from scm_world.runs.pool import Pool, pool_of
+from scm_world.runs.pool import Pool
 from scm_world.runs.study import Study
 from scm_world.tasks import TASKS, make_task
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.training.export import mean, scored, words
 from scm_world.training.loop import torch_threads
 from scm_world.training.settings import (
-    LESSONS,
     Count,
     Network,
     NotNegative,
@@ -50,6 +50,7 @@ from scm_world.training.settings import (
     merged,
     nested,
     observed,
+    presets,
     refused,
 )
 from scm_world.variables.spaces import Frozen
@@ -202,7 +203,7 @@ def lesson(task: str, **changes: Any) -> Lesson:
         40
     """
     fields: dict[str, Any] = Lesson.model_construct(task=task).model_dump(mode="json")
-    fields |= LESSONS.get(task, {})
+    fields |= copy.deepcopy(presets()["lessons"].get(task, {}))
     made = make_task(known_task(task))
     fields["env"] = {**made.training.get("env", {}), **fields["env"]}
     known = protocols_of(made)
@@ -257,31 +258,21 @@ PAIRS = ("observations", "actions", "before", "after")
 """Arrays of ``Demonstrations`` with a row for each control step."""
 
 
-def _load(data: bytes) -> Demonstrations:
-    """Read the content of a file of demonstrations."""
+def _read(data: bytes) -> Demonstrations:
+    """Read a file of demonstrations."""
     file = read_arrays(data)
-    found = Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
-    *pairs, scores, kept = shapes = [array.shape for array in vars(found).values()]
-    same = len({shape[0] for shape in pairs}) == 1 and pairs[2] == pairs[3]
-    if any(len(shape) != 2 for shape in pairs) or not same or scores != kept:
-        raise ValueError(f"its arrays have the shapes {shapes}")
-    if not all(np.isfinite(getattr(found, name)).all() for name in PAIRS):
-        raise ValueError("a number is not finite")
-    return found
+    return Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
 
 
-def _content(shown: Demonstrations) -> bytes:
+def _write(shown: Demonstrations) -> bytes:
+    """Return the content of a file of demonstrations."""
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, **vars(shown))
     return stream.getvalue()
 
 
 def joined(parts: Iterable[Demonstrations]) -> Demonstrations:
-    """Put demonstrations together.
-
-    Raises:
-        ModelError: There is nothing to learn from, or observations have several lengths.
-    """
+    """Put demonstrations together."""
     listed = list(parts)
     scores = np.concatenate([part.scores for part in listed])
     filled = [part for part in listed if len(part)]
@@ -309,22 +300,9 @@ def demonstrated(
     round_: int = 0,
     learner: MlpPolicy | None = None,
 ) -> Demonstrations:
-    """Record episodes of the teacher; those that fail are left out.
+    """Record episodes of the teacher, and now and then of a learner; those that fail are left out.
 
     An episode follows from the seed, the round and its number.
-
-    Args:
-        lesson: How demonstrations are made.
-        numbers: Of the episodes, within the noise.
-        backend: Its name.
-        seed: Of everything that is drawn.
-        round_: Of the lesson.
-        learner: Acts now and then; never if None.
-
-    Raises:
-        ActionError: The teacher cannot act in this task.
-        UnknownOption: An option of the environment does not exist, or the task does not say how
-            episodes end.
     """
     env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
     with closing(EpisodeRunner(env)) as runner:
@@ -357,14 +335,7 @@ def demonstrated(
 class Teaching(Hook):
     """Acts in an episode as the teacher does, or now and then as the learner does.
 
-    Args:
-        lesson: How demonstrations are made.
-        random: Generator of all that is drawn.
-        learner: Acts now and then; never if None.
-        metric: How good the present is, by the name of its info.
-
-    Attributes:
-        pairs: The rows of ``PAIRS``.
+    ``pairs`` are the rows of ``PAIRS``; ``metric`` is the info that says how good the present is.
     """
 
     def __init__(
@@ -421,20 +392,10 @@ class Teaching(Hook):
 def given_demonstrations(
     source: Recording | Path | str, lesson: Lesson
 ) -> tuple[Demonstrations, Lesson]:
-    """Read demonstrations that were made before, and the lesson in their environment.
-
-    Args:
-        source: A recording, its file, or a folder of such files.
-        lesson: How they are used.
-
-    Raises:
-        UnknownOption: They are of another task, their actions are not in [-1, 1], or they lack what
-            privileged observations have.
-        UnreadableFile: There are none.
-        ModelError: None was successful.
-    """
-    recordings = [source] if isinstance(source, Recording) else []
-    if not isinstance(source, Recording):
+    """Read demonstrations of recordings, and return the lesson in their environment."""
+    if isinstance(source, Recording):
+        recordings = [source]
+    else:
         path = Path(source)
         files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
         if not files:
@@ -483,23 +444,15 @@ def fitted(
 ) -> tuple[dict[str, NDArray[np.float32]], float]:
     """Fit a network to demonstrations, by Adam on Huber's loss.
 
-    With a memory the network also learns what the teacher remembers afterwards, from that before.
+    With a memory the network also learns the memory of the teacher afterwards, from that before.
 
     Observations are whitened: turned into their principal components, each with a standard
     deviation of one. So how far a fingertip is from a block counts as much as where both are. The
     first layer of the result has this turned back.
 
-    Args:
-        shown: The demonstrations.
-        lesson: Network and optimiser.
-        seed: Of everything that is drawn.
-
     Returns:
         The tensors of the network, by the names in a policy file, and the mean loss of the last
         tenth of the updates.
-
-    Raises:
-        ModelError: The rate is so large that the network's weights grow without end.
     """
     torch: Any = load("torch", "torch", "train")
     turn, shift = whitening(shown.observations)
@@ -551,14 +504,9 @@ def fitted(
 
 
 def whitening(observations: NDArray[Any]) -> tuple[Floats, Floats]:
-    """Return what turns observations into uncorrelated features with a variance of one.
+    """Return matrix, shape (m, k), and shift, shape (m,), that whiten observations, shape (n, k).
 
-    Args:
-        observations: Shape (n, k).
-
-    Returns:
-        Matrix, shape (m, k), and shift, shape (m,), of a linear map. Directions that do not vary
-        are left out, unless none does; those that hardly do count less.
+    Directions that do not vary are left out, unless none does; those that hardly do count less.
 
     Example:
         >>> points = np.random.default_rng(0).normal(size=(1000, 2)) * [3.0, 0.1] + 5.0
@@ -657,9 +605,9 @@ def clone(
         digest = sha256(given.observations.tobytes() + given.actions.tobytes()).hexdigest()
     else:
         engines = [_checked(lesson, name, number) for name in backend.split(",")]
-    identity = {
+    settings = {
+        **lesson.about(),
         "fingerprint": fingerprint(make_task(lesson.task), libraries=False),
-        "lesson": lesson.about(),
         "seed": number,
         "backend": backend,
         "recording": digest,
@@ -667,8 +615,8 @@ def clone(
     policies: list[MlpPolicy] = []
     with (
         torch_threads(1),
-        pool_of(None, workers) as pool,
-        Study(folder, "clone", identity) as study,
+        Pool(workers=workers) as pool,
+        Study(folder, "clone", settings) as study,
     ):
         who = lesson.teacher if source is None else source
         say(f"Learning {lesson}; from {who} on {backend}, seed {number}, in {folder}")
@@ -686,51 +634,48 @@ def clone(
                 made_with = {"torch": str(torch.__version__)}
                 for engine in engines:
                     made_with |= versions(engine)
-                card = {
-                    "lesson": lesson.about(),
-                    "seed": number,
-                    "backend": backend,
-                    "round": round_,
-                    "control_steps": len(pairs),
-                    "episodes": {"shown": len(pairs.kept), "kept": int(pairs.kept.sum())},
-                    "teacher": float(pairs.scores.mean()),
-                    "loss": loss,
-                    "versions": made_with,
+                about = {
+                    "task": lesson.task,
+                    "env": lesson.options,
+                    "activation": lesson.network.activation,
+                    "memory": pairs.after.shape[1],
+                    "card": {
+                        "lesson": lesson.about(),
+                        "seed": number,
+                        "backend": backend,
+                        "round": round_,
+                        "control_steps": len(pairs),
+                        "episodes": {"shown": len(pairs.kept), "kept": int(pairs.kept.sum())},
+                        "teacher": float(pairs.scores.mean()),
+                        "loss": loss,
+                        "versions": made_with,
+                    },
                 }
-                form: dict[str, Any] = {"task": lesson.task, "env": lesson.options, "card": card}
-                form["activation"] = lesson.network.activation
-                form["memory"] = pairs.after.shape[1]
-                policy = MlpPolicy.of(tensors, form)
-                save_policy(path, policy)  # nothing that fails later costs what was learned
-                save_policy(folder / "policy.safetensors", policy)
+                save_policy(path, tensors, about)  # nothing that fails later costs this
                 say(f"round {round_}: loss {loss:.4f}; written to {path}")
             policy = load_policy(str(path))
+            save_policy(folder / "policy.safetensors", policy)
             if "trials" not in policy.about.card:
                 scores: dict[str, float] = {}
                 if lesson.trials.protocols:
                     first = backend.partition(",")[0]
-                    given_to = (lesson.task, lesson.options, lesson.trials, first)
-                    _, scores = scored(policy, *given_to)
+                    _, scores = scored(policy, lesson.task, lesson.options, lesson.trials, first)
                     say(f"round {round_}: {words(scores)}")
                 save_policy(path, policy, policy.about.with_card(trials=scores))
             policies.append(load_policy(str(path)))
-        trials: list[Any] = [policy.about.card.get("trials") or {} for policy in policies]
-        means = [mean(scores) for scores in trials]
-        last, best = folder / "policy.safetensors", folder / "best.safetensors"
-        save_policy(last, policies[-1])
-        if None in means:
-            return Cloned(folder, lesson, number, last, last, None)
-        ranked = max(range(len(means)), key=lambda i: (means[i], i))
-        save_policy(best, policies[ranked])
-        return Cloned(folder, lesson, number, last, best, means[ranked])
+    trials: list[Any] = [policy.about.card.get("trials") or {} for policy in policies]
+    means = [mean(scores) for scores in trials]
+    last, best = folder / "policy.safetensors", folder / "best.safetensors"
+    save_policy(last, policies[-1])
+    if None in means:
+        return Cloned(folder, lesson, number, last, last, None)
+    ranked = max(range(len(means)), key=lambda i: (means[i], i))
+    save_policy(best, policies[ranked])
+    return Cloned(folder, lesson, number, last, best, means[ranked])
 
 
 def _checked(lesson: Lesson, backend: str, seed: int) -> str:
-    """Check that the teacher can act before a folder is made; return the version of the backend.
-
-    Raises:
-        ActionError: It cannot.
-    """
+    """Check that the teacher can act before a folder is made; return the version of the backend."""
     env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
     try:
         env.reset(seed=seed)
@@ -761,10 +706,9 @@ def _collected(
         )
         for begin in range(first, stop, SHARD)
     }
+    total, done, found = lesson.episodes + lesson.rounds * lesson.more, first, {}
     show = partial(_shown, lesson=lesson, round_=round_, **how)
-    done, total = first, lesson.episodes + lesson.rounds * lesson.more
-    found = {}
-    for name, shown in study.map(cells, show, read=_load, write=_content, pool=pool):
+    for name, shown in study.map(cells, show, read=_read, write=_write, pool=pool):
         found[name] = shown
         done += len(cells[name][0])
         if progress is not None:

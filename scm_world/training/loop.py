@@ -110,7 +110,15 @@ def train(
     first = None if start is None else file_of(start)
     given: dict[str, Any] = {"seed": seed, "backend": backend, "threads": count or 1}
     given["device"] = algorithms.device_for(recipe, device)
-    identity = identity_of(recipe, first, **given)
+    try:
+        given["start"] = None if first is None else sha256(read_bytes(first)).hexdigest()
+    except OSError as error:
+        raise UnreadableFile(str(first), str(error), "give a policy file to start from") from None
+    made_task = make_task(recipe.task, **(recipe.env.get("task_options") or {}))
+    given["fingerprint"] = fingerprint(made_task, libraries=False)
+    settings = {**recipe.as_dict(), **given}
+    if recipe.may_grow:
+        del settings["steps"]
     folder, say = Path(out), tell or (lambda _: None)
     with (
         torch_threads(given["threads"]),
@@ -122,11 +130,11 @@ def train(
         (world,) = worlds.get_attr("world", 0)
         libraries = {name: version(name) for name in ("torch", "stable-baselines3")}
         card = {
-            **identity,
+            **given,
             "recipe": recipe.as_dict(),
             "versions": {**versions(world.engine), **libraries},
         }
-        with Study(folder, "training", identity):
+        with Study(folder, "training", settings):
             say(f"Training {recipe}; on {backend}, seed {seed}, in {folder}")
             algorithms.resume(model, folder, say)
             begins_late = getattr(model, "learning_starts", 0)
@@ -190,31 +198,3 @@ def torch_threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-# --- folders --------------------------------------------------------------------------------------
-
-
-def identity_of(recipe: Recipe, start: Path | None, **more: Any) -> dict[str, Any]:
-    """Return what decides what is learned, as plain data.
-
-    Raises:
-        UnreadableFile: The policy to begin with is not there.
-    """
-    digest = None
-    if start is not None:
-        try:
-            digest = sha256(read_bytes(start)).hexdigest()
-        except OSError as error:
-            advice = "give a policy file to start from"
-            raise UnreadableFile(str(start), str(error), advice) from None
-    made = make_task(recipe.task, **(recipe.env.get("task_options") or {}))
-    options = recipe.as_dict()
-    if recipe.may_grow:  # the same call with more steps goes on
-        del options["steps"]
-    return {
-        "fingerprint": fingerprint(made, libraries=False),
-        "recipe": options,
-        **more,
-        "start": digest,
-    }

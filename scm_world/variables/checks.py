@@ -1,37 +1,24 @@
-"""Checks of values and spaces for a variable, which raise the errors of an intervention."""
+"""Checks of values, spaces and interventions for a variable; they raise errors of interventions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.errors import (
-    InterventionError,
-    OutOfBounds,
-    UnknownVariable,
-    WrongValue,
-)
-from scm_world.variables.interventions import Draw
-from scm_world.variables.kinds import SPACES, SpaceName, Variable
+from scm_world.errors import InterventionError, OutOfBounds, UnknownVariable, WrongValue
+from scm_world.variables.interventions import ACTS, SOFT, Draw, Hard, Intervention, Mechanism, Null
+from scm_world.variables.kinds import SPACES, Derived, SpaceName, Variable
+from scm_world.variables.mechanisms import Function
 from scm_world.variables.noise import Noise
 from scm_world.variables.spaces import Categories, Space
 from scm_world.variables.subsets import Subset
 
 _REFUSED = np.asarray("")
 _LARGEST = 2.0**53  # up to here every whole number is a float, so JSON keeps it
-
-
-def _expected(variable: Variable) -> str:
-    noun = {"real": "numbers", "integer": "whole numbers", "categorical": "whole numbers"}
-    if isinstance(variable.bounds, Categories) and variable.bounds.labels:
-        noun["categorical"] = " or ".join(map(repr, variable.bounds.labels))
-    where = f" of shape {variable.shape}" if variable.shape else ""
-    drawn = [f'Draw("{name}")' for name in SPACES if variable.space(name) is not None]
-    return f"{noun[variable.dtype]}{where}" + (f", or {', '.join(drawn)}" if drawn else "")
 
 
 def coerce(variable: Variable, value: Any) -> Value:
@@ -59,6 +46,15 @@ def coerce(variable: Variable, value: Any) -> Value:
     if not whole or (np.abs(given.astype(np.float64)) >= _LARGEST).any():
         raise WrongValue(variable.name, value, _expected(variable))
     return given.astype(np.int64)
+
+
+def _expected(variable: Variable) -> str:
+    noun = "numbers" if variable.dtype == "real" else "whole numbers"
+    if isinstance(variable.bounds, Categories) and variable.bounds.labels:
+        noun = " or ".join(map(repr, variable.bounds.labels))
+    where = f" of shape {variable.shape}" if variable.shape else ""
+    drawn = [f'Draw("{name}")' for name in SPACES if variable.space(name) is not None]
+    return f"{noun}{where}" + (f", or {', '.join(drawn)}" if drawn else "")
 
 
 def _out_of_bounds(
@@ -140,3 +136,93 @@ def check_space(
     if not inside:
         words = none if found is None else found.describe(variable.shape, values) + without
         raise _out_of_bounds(variable, value, words, nearest, name)
+
+
+def refuse_time(name: str, act: Any) -> None:
+    """Refuse an intervention with a time, or several, where there is no episode for it."""
+    is_plan = isinstance(act, tuple) and any(hasattr(one, "time") for one in act)
+    if is_plan or getattr(act, "time", None) is not None:
+        said = "interventions one after another count" if is_plan else f"a time ({act.time}) counts"
+        raise InterventionError(
+            f"do({name}): {said} in the plan of an episode: give it to rollout, sample, effect or "
+            "counterfactual, to given or reset(do=…) of a World, or to a curriculum",
+            variable=name,
+            value=act,
+        )
+
+
+def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -> Intervention:
+    """Return a checked intervention: type, shape, finite, fixed bounds, known parents."""
+    name, said, follows = variable.name, "", list[str]()
+    kind = type(value)  # the classes of interventions are final
+    if kind is tuple or kind in ACTS:
+        refuse_time(name, value)
+    if kind is Hard or kind not in ACTS:
+        if kind is Hard:
+            value = value.value
+            if len(variable.shape) > 1 and np.size(value) == np.prod(variable.shape):
+                value = np.reshape(value, variable.shape)
+        number, bounds = coerce(variable, value), variable.bounds
+        if bounds is not None and not bounds.parents() and not bounds.contains(number, {}):
+            check_bounds(variable, number, {})
+        return Hard.of(number)
+    if kind is Draw:
+        check_draw(variable, value)
+        follows = sorted(value.drawn_from(variable).parents())
+    elif kind is Mechanism:
+        value = _complete(variable, value)
+        follows = sorted(parent.name for parent in value.parents)
+        own = (name, *variable.parts)
+        if any(parent.name in own and not parent.lag for parent in value.parents):
+            said = "a variable cannot follow itself within an instant; use Shift or Scale"
+    elif kind is Null:
+        said = "a variable cannot be taken away; a body of a world can be"
+    elif kind in SOFT and variable.dtype == "categorical":
+        said = f"categories have no order, so there is no {value!r}; set a category, Draw one, or "
+        said += "give a Mechanism"
+    elif kind in SOFT:
+        coerce(variable, value.by if np.ndim(value.by) else np.full(variable.shape, value.by))
+    for unknown in (parent for parent in follows if parent not in declared):
+        raise UnknownVariable(unknown, declared)
+    if said:
+        raise InterventionError(f"do({name}): {said}", variable=name, value=value)
+    return value  # type: ignore[no-any-return]
+
+
+def _complete(variable: Variable, value: Mechanism) -> Mechanism:
+    """Fill in what a mechanism leaves out: function and noise of the variable."""
+    own = variable if isinstance(variable, Derived) else None
+    noise = None if own is None else own.noise
+    if value.function is None and (own is None or noise is None):
+        said = "it has no noise that could be another one"
+    elif value.function is None and own is not None:
+        fields = ("parents", "inverse_noise")
+        kept = {"function": own.mechanism, **{name: getattr(own, name) for name in fields}}
+        return value.model_copy(update=kept)
+    elif value.noise is not None and not value.equation.takes_noise:
+        said = "its function does not take noise; give it an argument `noise`"
+    elif value.noise is None and noise is None and _needs_noise(value.equation):
+        said = "its function takes noise, of which there is none; give Mechanism(…, noise=…)"
+    else:
+        return value
+    raise InterventionError(f"do({variable.name}): {said}", variable=variable.name, value=value)
+
+
+def _needs_noise(equation: Any) -> bool:
+    return isinstance(equation, Function) and equation.takes_noise
+
+
+def settable_causes(declared: Mapping[str, Variable], name: str) -> list[str]:
+    """Return the nearest causes that can be set, past others that cannot."""
+    found: dict[str, None] = {}
+    stack, seen = [name], {name}
+    while stack:
+        for parent in declared[stack.pop(0)].all_parents:
+            if parent.name in seen:
+                continue
+            seen.add(parent.name)
+            if declared[parent.name].settable:
+                found[parent.name] = None
+            else:
+                stack.append(parent.name)
+    return list(found)

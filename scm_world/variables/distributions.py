@@ -96,8 +96,6 @@ class Cylinder(Sampler):
 class Continuous(Sampler):
     """A continuous distribution of scipy, by its name there, component by component.
 
-    ``Laplace``, ``Exponential``, ``Gamma``, ``StudentT`` and ``Gumbel`` make the usual ones.
-
     Attributes:
         family: Name of the distribution in ``scipy.stats``.
         parameters: Its arguments, ``loc`` and ``scale`` among them.
@@ -143,36 +141,9 @@ class Continuous(Sampler):
         return f"{self.family}({', '.join(f'{k}={v:g}' for k, v in self.parameters.items())})"
 
 
-def Laplace(loc: float = 0.0, scale: float = 1.0) -> Continuous:  # noqa: N802 # a distribution
-    """Return the Laplace distribution; its standard deviation is √2 times the scale."""
-    return Continuous("laplace", loc=loc, scale=scale)
-
-
-def Exponential(scale: float = 1.0, loc: float = 0.0) -> Continuous:  # noqa: N802
-    """Return the exponential distribution, whose mean is the scale (plus ``loc``)."""
-    return Continuous("expon", loc=loc, scale=scale)
-
-
-def Gamma(shape: float, scale: float = 1.0, loc: float = 0.0) -> Continuous:  # noqa: N802
-    """Return the gamma distribution, whose mean is shape times scale (plus ``loc``)."""
-    return Continuous("gamma", a=shape, loc=loc, scale=scale)
-
-
-def StudentT(df: float, loc: float = 0.0, scale: float = 1.0) -> Continuous:  # noqa: N802
-    """Return Student's t distribution with ``df`` degrees of freedom."""
-    return Continuous("t", df=df, loc=loc, scale=scale)
-
-
-def Gumbel(loc: float = 0.0, scale: float = 1.0) -> Continuous:  # noqa: N802
-    """Return the Gumbel distribution of maxima."""
-    return Continuous("gumbel_r", loc=loc, scale=scale)
-
-
 @final
 class Discrete(Sampler):
-    """A few numbers, each with a probability, component by component.
-
-    ``Bernoulli``, ``Categorical`` and ``Empirical`` make the usual ones.
+    """A few numbers, such as those of a sample, each with a probability, component by component.
 
     Attributes:
         values: The numbers.
@@ -221,16 +192,6 @@ class Discrete(Sampler):
 def Bernoulli(p: float) -> Discrete:  # noqa: N802
     """Return the distribution of 1, with probability ``p``, and 0."""
     return Discrete((0, 1), (1.0 - p, p))
-
-
-def Categorical(probabilities: Any, values: Any = None) -> Discrete:  # noqa: N802
-    """Return whole numbers with probabilities: 0, 1, … unless others are given."""
-    return Discrete(range(np.size(probabilities)) if values is None else values, probabilities)
-
-
-def Empirical(sample: Any) -> Discrete:  # noqa: N802
-    """Return the numbers of a sample, each as often as it is there."""
-    return Discrete(np.ravel(np.asarray(sample, dtype=float)))
 
 
 def _finite(source: Any) -> Any:

@@ -25,6 +25,7 @@ from scm_world.variables.kinds import (
     InverseNoise,
     Parent,
     SpaceName,
+    Variable,
     names,
 )
 from scm_world.variables.mechanisms import EQUATIONS, Equation, check_order
@@ -119,6 +120,13 @@ class Draw(TimedIntervention):
         if not isinstance(source, Frozen | dict) and source not in SPACES:
             raise UnknownOption("Draw(source)", source, (*SPACES, "a distribution, such as a Box"))
         super().__init__(source=source, **fields)
+
+    def drawn_from(self, variable: Variable) -> Distribution:
+        """Return the distribution that a variable is drawn from."""
+        space = variable.space(self.source) if isinstance(self.source, str) else self.source
+        if space is None:
+            raise ModelError([f"{variable.name!r} has no space {self.source}"])
+        return space
 
 
 @final

@@ -3,6 +3,7 @@
 from scm_world.world.audit import Applied, Audit
 from scm_world.world.batch import Batch
 from scm_world.world.simulation import Simulation
-from scm_world.world.snapshot import WorldSnapshot
+from scm_world.world.snapshot import Snapshot
+from scm_world.world.system import CausalSystem
 
-__all__ = ["Applied", "Audit", "Batch", "Simulation", "WorldSnapshot"]
+__all__ = ["Applied", "Audit", "Batch", "CausalSystem", "Simulation", "Snapshot"]

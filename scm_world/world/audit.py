@@ -88,7 +88,7 @@ class Audit:
         lines += [f"  new: {name}" for name in self.came]
         lines += [f"  gone: {name}" for name in self.went]
         lines += [f"  note: {remark}" for remark in self.remarks]
-        return "\n".join(lines)
+        return "\n".join(lines) or "nothing was asked for, and nothing has changed"
 
 
 def _show(value: Value) -> str:

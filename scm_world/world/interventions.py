@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import chain
@@ -22,14 +22,14 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.acceptance import refuse_time
-from scm_world.graph.evaluate import AppliedIntervention, noise_of, source_of
+from scm_world.graph.evaluate import noise_of
 from scm_world.models import Difference
 from scm_world.models.scene import SURFACES, Overlap
 from scm_world.variables import (
     SOFT,
     Draw,
     Hard,
+    Intervention,
     Mechanism,
     Natural,
     Null,
@@ -39,7 +39,7 @@ from scm_world.variables import (
     divided,
     whole_of,
 )
-from scm_world.variables.checks import check_bounds, check_space, coerce
+from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import CompiledTask, PendingInterventions, StepBase
 from scm_world.world.mechanisms import Rows
@@ -76,6 +76,22 @@ def merged(model: SCM, *requests: Mapping[str, Any]) -> dict[str, Any]:
         kept = {n: a for n, a in found.items() if not mine.issuperset(targets(n))}
         found = {**kept, **acts}
     return found
+
+
+def fixed_action(name: str, acts: Sequence[Intervention]) -> Value:
+    """Return the action that is taken from now on, given the interventions on its parts.
+
+    Raises:
+        InterventionError: It is another action at every step.
+    """
+    values = [np.asarray(act.value) for act in acts if isinstance(act, Hard)]
+    if len(values) == len(acts):
+        return values[0] if len(values) == 1 else np.concatenate([v.ravel() for v in values])
+    raise InterventionError(
+        f"do({name}): {acts[0]!r} is another action at every step, so it cannot be compared "
+        "with a space; leave out `space`, or give one action as numbers",
+        variable=name,
+    )
 
 
 @final
@@ -352,7 +368,7 @@ class Transaction:
                 case Mechanism():
                     wanted = self._followed(requested, act)
                 case Draw():
-                    source = source_of(AppliedIntervention(act, requested))
+                    source = act.drawn_from(requested)
                     wanted = self._key.draw(source, whole, requested.shape, self.row, act.stream)
                 case _:
                     wanted = present = self.compiled.coordinates(name, self.row)
@@ -401,8 +417,10 @@ class Transaction:
             if not unknown.isdisjoint({name, *targets, *chain(*spaces)}):
                 continue
             try:
-                acts = targets[0] in actions
-                value = self._held(name) if acts else self.compiled.coordinates(name, self.row)
+                if targets[0] in actions:
+                    value = fixed_action(name, [self.acts[target][1] for target in targets])
+                else:
+                    value = self.compiled.coordinates(name, self.row)
                 check_space(requested, value, space, self.row)
             except InterventionError as problem:
                 if not self._asked_within(requested, space):
@@ -420,18 +438,6 @@ class Transaction:
         except InterventionError:
             return False
         return True
-
-    def _held(self, name: str) -> Value:
-        """Return the action that is to be taken from now on."""
-        acts = [self.acts[target][1] for target in self.compiled.model.targets(name)]
-        values = [np.asarray(act.value) for act in acts if isinstance(act, Hard)]
-        if len(values) == len(acts):
-            return values[0] if len(values) == 1 else np.concatenate([v.ravel() for v in values])
-        raise InterventionError(
-            f"do({name}): {acts[0]!r} is another action at every step, so it cannot be compared "
-            "with a space; leave out `space`, or give one action as numbers",
-            variable=name,
-        )
 
     def _as_asked(self) -> list[InterventionError]:
         """Say of a bundle, if that was asked for, what is wrong with its parts."""
@@ -504,7 +510,7 @@ class Transaction:
             whole = whole_of(act, asked)
             if type(act) is Draw and asked == name and whole in where:
                 requested = compiled.model.declared(whole)
-                source, shape = source_of(AppliedIntervention(act, requested)), requested.shape
+                source, shape = act.drawn_from(requested), requested.shape
                 if source.parents():
                     return None
                 streams = (key.stream(whole, act.stream, n) for n in attempts)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
-import gymnasium
 import numpy as np
 
-from scm_world._arguments import whole_number
 from scm_world._types import ArrayLike, Floats, Value
 from scm_world.backends import Backend, backends, make_backend
 from scm_world.backends.base import EngineSnapshot
@@ -45,13 +41,14 @@ from scm_world.world.compiled_task import (
 from scm_world.world.interventions import Transaction, difference, feasible, overlaps
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
-from scm_world.world.snapshot import WorldSnapshot
+from scm_world.world.snapshot import Snapshot
 from scm_world.world.structures import StructureCache, as_task
+from scm_world.world.system import CausalSystem
 
 READ_BACK = 1e-6  # how far a backend may report a number from what it was given
 
 
-class Simulation:
+class Simulation(CausalSystem):
     """The causal model of a task, stepped by a physics backend; ``scm_world.World`` adds questions.
 
     Args:
@@ -91,6 +88,8 @@ class Simulation:
         1
     """
 
+    compiled: CompiledTask
+
     def __init__(
         self,
         task: Task | StructureCache | str = "pushing",
@@ -123,8 +122,7 @@ class Simulation:
             name, allowed = "options of a world with these structures", (str(shared.options),)
             raise UnknownOption(name, self.options, allowed)
         self.structures = shared or StructureCache(kind, self.options)
-        self._checked = self._closed = False
-        self.version = 0  # counts changes of anything but what physics moves
+        self._checked = False
         self._origin: EngineSnapshot | None = None
         self._origin_row: Rows | None = None
         self._have_no_episode()
@@ -159,26 +157,6 @@ class Simulation:
         """How many control steps of the episode are over."""
         return int(self.row.numbers[self.row.mechanisms.clock])
 
-    @property
-    def has_begun(self) -> bool:
-        """Whether there is an episode."""
-        return self._started
-
-    def __getitem__(self, name: str) -> Value:
-        """Give the present value of one variable.
-
-        Raises:
-            UnknownVariable: No variable has this name.
-            NotReset: There is no episode yet.
-        """
-        self.model.declared(name)
-        return np.array(self.evaluate((name,))[name])
-
-    def values(self) -> dict[str, Value]:
-        """Give the present value of every variable, as copies."""
-        row = self.evaluate()
-        return {name: np.array(row[name]) for name in self.model}
-
     def previous(self) -> dict[str, Value]:
         """Give the values of one control step ago that present variables depend on."""
         self._require_episode()
@@ -189,7 +167,7 @@ class Simulation:
         }
 
     def evaluate(self, names: tuple[str, ...] | None = None) -> Rows:
-        """Compute some variables, all if None, and give all present values without copying them.
+        """Compute some variables, all if None, and return all present values without copying them.
 
         For loops that cannot wait; the values change with the next step.
 
@@ -210,40 +188,6 @@ class Simulation:
         """Describe the cameras whose places are variables: the three of the robot."""
         self._require_episode()
         return self.composition.cameras(self.row.copy())
-
-    def reset(
-        self,
-        *,
-        seed: int | None = None,
-        episode: int = 0,
-        do: Mapping[str, Any] | None = None,
-        space: AnyRegion | None = None,
-    ) -> Audit | None:
-        """Begin an episode. Nothing that was done in the last one remains.
-
-        Args:
-            seed: Of the noise. Without it the next episode of the same noise begins, or of a
-                fresh seed if there was none.
-            episode: Number of the episode, with a seed.
-            do: An intervention that takes part in the beginning: a block of another size stands
-                on the floor. It holds until the next reset.
-            space: In which every target of it must lie; see ``do``.
-
-        Returns:
-            The audit of the intervention, or None if there was none.
-
-        Raises:
-            InterventionError: The intervention was refused. The episode has begun without it.
-        """
-        if seed is not None:
-            number = whole_number("episode", episode, least=0)
-            self.noise, self.episode = CompiledNoise(seed), number
-        elif not self._started:
-            self.noise, self.episode = CompiledNoise(secrets.randbits(63)), 0
-        else:
-            self.episode += 1
-        self._begin()
-        return self.do(do, space=space) if do else None
 
     def _begin(self) -> None:
         self._lost, self._offset = "", 0
@@ -323,11 +267,6 @@ class Simulation:
         return self.compiled.task
 
     @property
-    def model(self) -> SCM:
-        """The causal model of the present structure, without interventions."""
-        return self.compiled.model
-
-    @property
     def composition(self) -> Composition:
         """The entities."""
         return self.compiled.composition
@@ -343,32 +282,9 @@ class Simulation:
         return self.structures.steps
 
     @property
-    def action_low(self) -> Floats:
-        """Lower end of all actions, shape (n_actions,)."""
-        return self.compiled.action_bounds[0]
-
-    @property
-    def action_high(self) -> Floats:
-        """Upper end of all actions, shape (n_actions,)."""
-        return self.compiled.action_bounds[1]
-
-    @property
-    def action_space(self) -> gymnasium.spaces.Box:
-        """The space of actions in SI units."""
-        low, high = self.compiled.action_bounds
-        return gymnasium.spaces.Box(low, high, dtype=np.float64)
-
-    @property
-    def observation_space(self) -> gymnasium.spaces.Dict:
-        """The space of the observed variables by name, in SI units; nothing is clipped."""
-        names = (part.variable for part in self.task.observation.rows)
-        shapes = {name: self.model.declared(name).shape for name in names}
-        return gymnasium.spaces.Dict(
-            {
-                name: gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float64)
-                for name, shape in shapes.items()
-            }
-        )
+    def observed(self) -> tuple[str, ...]:
+        """The names of the observed variables."""
+        return tuple(part.variable for part in self.task.observation.rows)
 
     @property
     def identity(self) -> tuple[Any, ...]:
@@ -705,7 +621,7 @@ class Simulation:
         """The live state, flat, shape (size,)."""
         return self.state.vector
 
-    def snapshot(self) -> WorldSnapshot:
+    def snapshot(self) -> Snapshot:
         """Save everything that decides the future of the world. It can be pickled.
 
         Raises:
@@ -713,7 +629,7 @@ class Simulation:
             EngineFailure: The backend has lost the state.
         """
         self._require_state()
-        return WorldSnapshot(
+        return Snapshot(
             engine=self.backend.snapshot(),
             present=self._step_base(),
             base=self.base,
@@ -724,7 +640,7 @@ class Simulation:
             world=self.identity,
         )
 
-    def restore(self, snapshot: WorldSnapshot) -> None:
+    def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot, bit for bit.
 
         Raises:
@@ -732,7 +648,7 @@ class Simulation:
                 was.
             EngineFailure: The backend failed on the way; the world needs a reset or a snapshot.
         """
-        if not isinstance(snapshot, WorldSnapshot):
+        if not isinstance(snapshot, Snapshot):
             raise SnapshotMismatch(f"{snapshot!r} is no snapshot of a world")
         if snapshot.world != self.identity:
             raise SnapshotMismatch(
@@ -767,55 +683,12 @@ class Simulation:
         self.noise, self.episode = noise, snapshot.episode
         self._keep_base(base)
 
-    @contextmanager
-    def unchanged(self) -> Iterator[None]:
-        """Go back to the present afterwards, bit for bit, also after an error or Ctrl-C.
-
-        A world without an episode has none afterwards. One whose backend has lost the state still
-        needs a reset or a snapshot.
-
-        Example:
-            >>> world = Simulation("pushing", backend="fake")
-            >>> world.reset(seed=5)
-            >>> with world.unchanged():
-            ...     world.reset(seed=0)
-            ...     world.step(np.zeros(9))
-            >>> world.noise.seed, world.index
-            (5, 0)
-        """
-        back = self.way_back()
-        try:
-            yield
-        finally:
-            back()
-
-    def way_back(self) -> Callable[[], None]:
-        """Return what goes back to the present, bit for bit; see ``unchanged``."""
-        started, lost = self._started, self._lost
-        noise = self.noise, self.episode, self._offset
-        before = self.snapshot() if started and not lost else None
-
-        def back() -> None:
-            if before is not None:
-                self.restore(before)
-            elif not started:
-                self._have_no_episode()
-            else:
-                self._lost, self._base = lost, None
-                self.noise, self.episode, self._offset = noise
-
-        return back
-
     def close(self) -> None:
         """Free the engine. There is no episode any more."""
         self._closed |= self._started
         self._started = False
         self.version += 1
         self.backend.close()
-
-    def _require_episode(self) -> None:
-        if not self._started:
-            raise NotReset(closed=self._closed)
 
     def _require_state(self) -> None:
         """Refuse to continue without an episode, or from a state that the backend has lost."""

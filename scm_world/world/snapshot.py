@@ -18,20 +18,19 @@ from scm_world.world.compiled_task import Plan, StepBase
 from scm_world.world.mechanisms import Rows
 from scm_world.world.structures import StructureCache
 
-PARTS = ("engine", "present", "base")
-
 
 @final
 @dataclass(frozen=True, eq=False)
-class WorldSnapshot:
+class Snapshot:
     """All that decides the future of a world: physics, causes, noise, clock and memory.
 
     A pickled snapshot leaves the model and what is compiled out: the world that goes back to it
     has the same ones. Its parts are bytes until a world opens them.
 
     Attributes:
-        engine: The engine's part.
-        present: The world, its memory of one control step ago included.
+        engine: The engine's part; None of equations.
+        present: The world, its memory of one control step ago included: a ``StepBase``, or of
+            equations their values.
         base: The world at this control step before anyone intervened; None after a step.
         index: The control step.
         offset: By how much interventions have moved the clock; noise follows the steps taken.
@@ -41,8 +40,8 @@ class WorldSnapshot:
         memory: What a subclass keeps.
     """
 
-    engine: EngineSnapshot | bytes
-    present: StepBase | bytes
+    engine: EngineSnapshot | bytes | None
+    present: Any
     base: StepBase | bytes | None
     index: int
     offset: int
@@ -53,11 +52,12 @@ class WorldSnapshot:
 
     def __reduce__(self) -> tuple[Any, ...]:
         content = vars(self)
-        return WorldSnapshot, tuple(
-            _packed(value) if name in PARTS else value for name, value in content.items()
+        return Snapshot, tuple(
+            _packed(value) if isinstance(value, StepBase | EngineSnapshot) else value
+            for value in content.values()
         )
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> WorldSnapshot:
+    def __deepcopy__(self, memo: dict[int, Any]) -> Snapshot:
         return self  # nothing writes into it
 
     def opened(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import gymnasium
@@ -11,7 +12,6 @@ from typer.testing import CliRunner, Result
 from scm_world.cli import app
 from scm_world.evaluation.recording import record
 from scm_world.policies import load_policy
-from scm_world.runs.study import settings_in
 from scm_world.training import imitation
 from scm_world.training.recipe import recipe
 
@@ -61,8 +61,7 @@ def test_it_says_what_comes_next(tmp_path: Path) -> None:
         assert f"scm-world evaluate {tmp_path}/run/policy.safetensors pick_and_place" in done.output
         assert "scm-world train pick_and_place --start" in done.output
         assert "--set network.hidden=[4]" in done.output
-    about = settings_in(tmp_path / "run", "clone")
-    made = about["lesson"]
+    made = json.loads((tmp_path / "run" / "study.json").read_text())["settings"]
     assert (made["episodes"], made["network"]["hidden"], made["keep"]) == (1, [4], 0.0)
     assert made["network"]["activation"] == "relu"  # a dotted name leaves the other parts alone
 

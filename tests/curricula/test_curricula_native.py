@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from curriculum_envs import PUSHING
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from scm_world.curricula import (
     CurriculumEnv,
@@ -25,8 +25,7 @@ from scm_world.curricula import (
     stages,
     together,
 )
-from scm_world.env.native import NativeVectorEnv
-from scm_world.env.processes import ProcessVectorEnv
+from scm_world.env import ScmWorldVectorEnv
 from scm_world.errors import InterventionError, UnknownOption
 
 FRICTION, MASS = "floor_friction", "tool_block.mass"
@@ -155,10 +154,10 @@ def test_it_is_what_is_made_where_the_engine_has_it() -> None:
     """MuJoCo steps many in one call; others take turns; there may be a time limit."""
     part = goals("A")
     processes = make_vec(PUSHING, 2, part, backend="fake", workers=2)
-    assert isinstance(processes.env, ProcessVectorEnv)
+    assert isinstance(processes.env, AsyncVectorEnv)
     processes.close()
     native = make_vec(PUSHING, 2, part, disable_env_checker=True, threads=2)
-    assert isinstance(native.env, NativeVectorEnv)
+    assert isinstance(native.env, ScmWorldVectorEnv)
     assert [*native.env.get_attr("curriculum")] == [native.curriculum] * 2
     assert [state["noise"] for state in native.state()["members"]] == [None, None]
     limited = make_vec(PUSHING, 2, part, backend="fake", max_episode_steps=2)

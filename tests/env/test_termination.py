@@ -76,7 +76,7 @@ def test_evaluations_and_recordings_have_the_length_until_then() -> None:
     """Scores add up the rewards of the steps that there were."""
     steps = played(gymnasium.make(MODEL, model=Leaning()))
     found = evaluate(lambda _: PUSH, "P0", task=Leaning(), n=1)
-    assert found.columns["steps"].tolist() == [len(steps)]
+    assert found.frame["steps"].tolist() == [len(steps)]
     assert found.score("P0", "return").value == pytest.approx(sum(one[0] for one in steps))
     made = record(lambda _: PUSH, gymnasium.make(MODEL, model=Leaning()), 2)
     for episode in made.episodes:

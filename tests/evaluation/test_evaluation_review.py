@@ -75,7 +75,7 @@ def test_a_file_does_not_decide_what_is_called() -> None:
     act = {"kind": "mechanism", "function": function, "parents": []}
     env = {**found.about["env"], "start": {"floor_friction": act}}
     with pytest.raises(ModelError, match=r"os:getcwd.*trusted"):
-        again(Evaluation({**found.about, "env": env}, found.columns))
+        again(Evaluation({**found.about, "env": env}, found.frame))
 
 
 class Noisy:

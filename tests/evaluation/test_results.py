@@ -119,8 +119,8 @@ def test_files_keep_every_bit(kind: str, tmp_path: Path) -> None:
         again = Evaluation.load(path)
         assert again == found
         assert again.about == json.loads(json.dumps(dict(found.about)))
-        assert {n: c.dtype.kind for n, c in again.columns.items()} == {
-            n: c.dtype.kind for n, c in found.columns.items()
+        assert {n: c.dtype.kind for n, c in again.frame.items()} == {
+            n: c.dtype.kind for n, c in found.frame.items()
         }
     data = json.loads(summary.read_text())
     assert [*data["scores"][0]] == ["agent", "engine", "protocol", *METRICS]

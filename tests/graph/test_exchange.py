@@ -14,7 +14,7 @@ from graph_models import small
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.graph.exchange import space_lines, to_digraph
-from scm_world.graph.views import to_dag, unrolled, window_of
+from scm_world.graph.views import to_dag, unrolled
 from scm_world.queries import identify
 from scm_world.tasks import TASKS, make_task
 from scm_world.variables import Affine, Box, Either, Exogenous, Measured, Parent, Switch
@@ -126,14 +126,17 @@ def test_two_slices_separate_what_a_long_past_separates(seed: int) -> None:
     for cause, effect, lag in product(names, names, range(longest + 1)):
         if (lag or cause < effect) and rng.random() < 0.25:
             graph.add_edge(cause, effect, lag, lag=lag)
-    window = window_of(graph)
-    long = unrolled(graph, 60)
-    nodes = [node for node in window if node[1] <= 0]
+    held = {n for n in names if graph.nodes[n]["role"] == "parameter" and not graph.in_degree(n)}
+    past = max((lag for *_, lag in graph.edges(keys=True)), default=0)
+    window, long = to_dag(graph), unrolled(graph, 60)
+    nodes = [(name, slice_) for slice_ in range(-past, 1) for name in names]
+    named = {(n, t): f"{n}@{'=' * (n in held)}{t}" if t else n for n, t in nodes}
     for _ in range(30):
         x, y, *rest = (nodes[i] for i in rng.permutation(len(nodes)))
         given = set(rest[: rng.integers(0, len(rest) + 1)])
         separated = nx.is_d_separator(long, {x}, {y}, given)
-        assert nx.is_d_separator(window, {x}, {y}, given) == separated, (x, y, given)
+        ends = {named[x]}, {named[y]}, {named[node] for node in given}
+        assert nx.is_d_separator(window, *ends) == separated, ends
 
 
 def test_libraries_learn_of_the_unobserved_past() -> None:

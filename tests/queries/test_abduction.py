@@ -22,15 +22,15 @@ from scm_world.variables import (
     Action,
     Bernoulli,
     Box,
-    Categorical,
     Categories,
+    Continuous,
     Derived,
+    Discrete,
     Draw,
     Either,
     Exogenous,
     Hard,
     Integers,
-    Laplace,
     Linear,
     Mechanism,
     Natural,
@@ -82,7 +82,7 @@ def chain() -> SCM:
                 name="y",
                 parents=("x", "u"),
                 mechanism=Linear(weights=(2.0, 1.0)),
-                noise=Laplace(),
+                noise=Continuous("laplace"),
             ),
             Derived(
                 name="z",
@@ -194,7 +194,7 @@ def test_a_table_keeps_the_category_that_is_most_likely_the_same() -> None:
     kind: dict[str, Any] = {"dtype": "categorical", "bounds": Categories(labels=("dry", "wet"))}
     model = SCM(
         [
-            Exogenous(name="rain", distribution=Categorical([0.5, 0.5]), **kind),
+            Exogenous(name="rain", distribution=Discrete((0, 1)), **kind),
             Derived(
                 name="grass",
                 parents=("rain",),
@@ -489,7 +489,7 @@ def test_labels_and_their_probabilities() -> None:
     table = np.array([[0.7, 0.2, 0.1], [0.1, 0.8, 0.1], [0.2, 0.3, 0.5]])
     model = SCM(
         [
-            Exogenous(name="c", distribution=Categorical(prior), **kind),
+            Exogenous(name="c", distribution=Discrete(range(len(prior)), prior), **kind),
             Derived(name="g", parents=("c",), mechanism=Table(table), **kind),
         ]
     )
@@ -721,7 +721,7 @@ def test_hidden_categories_have_their_posterior() -> None:
     model = SCM(
         [
             Exogenous(name="d", distribution=Bernoulli(0.001), **bit),
-            Exogenous(name="c", distribution=Categorical(prior["c"]), **kind),
+            Exogenous(name="c", distribution=Discrete(range(len(prior["c"])), prior["c"]), **kind),
             Derived(name="e", parents=("d", "c"), mechanism=Table(table), **bit),
             Derived(
                 name="y",
@@ -875,7 +875,7 @@ def random_model(rng: np.random.Generator) -> SCM:
     found: list[Any] = []
     for place, name in enumerate(names):
         if place == 0 or rng.random() < 0.2:
-            source = [Normal(), Laplace(), None][rng.integers(0, 3)]
+            source = [Normal(), Continuous("laplace"), None][rng.integers(0, 3)]
             found.append(Exogenous(name=name, distribution=source, default=1.0))
             continue
         lags = {other: 0 for other in names[:place] if rng.random() < 0.5}

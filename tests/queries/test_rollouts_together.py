@@ -12,7 +12,7 @@ import pytest
 
 from scm_world.backends.mujoco.batch import MujocoBatch
 from scm_world.discovery.data import Design
-from scm_world.discovery.data.worlds import WorldRows
+from scm_world.discovery.data.worlds import EpisodeRows
 from scm_world.errors import EngineFailure, OutOfBounds, UnknownVariable
 from scm_world.queries import Outcome, World
 from scm_world.queries import twins as parallel
@@ -256,6 +256,6 @@ def test_a_failure_of_the_engine_ends_one_unit(monkeypatch: pytest.MonkeyPatch) 
 def test_a_source_elsewhere_has_one_thread() -> None:
     """Workers share the cores; here a source has all of them."""
     world = World("pushing", backend="fake")
-    source: Any = WorldRows(world, Design("single", ("tool_block.mass",)), Setting())
+    source: Any = EpisodeRows(world, Design("single", ("tool_block.mass",)), Setting())
     assert source._setting.workers is None
     assert pickle.loads(pickle.dumps(source))._setting.workers == 1  # noqa: S301 # our own

@@ -18,8 +18,7 @@ from scm_world.cli.discovery import SMALL
 from scm_world.discovery.plots import draw_verification
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.queries.comparison import Comparison
-from scm_world.queries.verification import Verification
-from scm_world.queries.verify import verify
+from scm_world.queries.verification import Verification, verify
 from scm_world.queries.world import World
 from scm_world.tasks import TASKS
 from scm_world.tasks.trifinger.entities.block_world import BlockWorld

@@ -157,7 +157,7 @@ def test_results_that_say_something_else_are_not_played_again(changed: dict[str,
     short = {"max_episode_length": 1}
     found = evaluate("still", "P0", task="reaching", n=1, backend="fake", env=short)
     with pytest.raises(ScmWorldError):
-        again(Evaluation({**found.about, **changed}, found.columns))
+        again(Evaluation({**found.about, **changed}, found.frame))
 
 
 def test_damaged_episodes_are_told(episode_file: Path, tmp_path: Path) -> None:

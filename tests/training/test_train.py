@@ -29,7 +29,6 @@ from scm_world.errors import (
 )
 from scm_world.evaluation import evaluate
 from scm_world.policies import load_policy, save_policy
-from scm_world.runs.study import settings_in
 from scm_world.training.export import begin_with
 from scm_world.training.loop import train
 from scm_world.training.recipe import Recipe, recipe
@@ -200,10 +199,9 @@ def test_a_run_is_whole(tmp_path: Path) -> None:
         "study.json",
         "tensorboard",
     }
-    about: Any = load_policy(found.policy).about.card
-    assert about["versions"]["stable-baselines3"]
-    assert Recipe.from_dict(about["recipe"]) == found.recipe
-    assert settings_in(folder, "training")["seed"] == 3
+    card: Any = load_policy(found.policy).about.card
+    assert card["versions"]["stable-baselines3"]
+    assert Recipe.from_dict(card["recipe"]) == found.recipe
     names = sorted(path.name for path in (folder / "evaluations").iterdir())
     assert names == ["128.json", "256.json"]
     head = (folder / "progress.csv").read_text().partition("\n")[0].split(",")
@@ -224,9 +222,9 @@ def test_one_training_is_not_another(tmp_path: Path) -> None:
     one, two = (weights(tmp_path / name / "policy.safetensors") for name in ("one", "two"))
     assert not np.array_equal(one["layers.0.weight"], two["layers.0.weight"])
     for options, said in (
-        ({"seed": 4}, "training: seed differ"),
+        ({"seed": 4}, "seed differ"),
         ({"backend": "mujoco"}, "backend differ"),
-        ({"name": RECIPES["ppo"].but(**{"rate.initial": 0.25})}, r"recipe\.rate\.initial differ"),
+        ({"name": RECIPES["ppo"].but(**{"rate.initial": 0.25})}, "rate differ"),
         ({"start": tmp_path / "two" / "policy.safetensors"}, "start differ"),
     ):
         with pytest.raises(UnreadableFile, match=said):
@@ -236,7 +234,7 @@ def test_one_training_is_not_another(tmp_path: Path) -> None:
     with pytest.raises(UnreadableFile, match="thesis"):
         run("ppo", tmp_path / "strange")
     (tmp_path / "strange" / "study.json").write_text("{")
-    with pytest.raises(UnreadableFile, match=r"study\.json"):
+    with pytest.raises(UnreadableFile, match="strange"):
         run("ppo", tmp_path / "strange")
 
 
@@ -245,11 +243,11 @@ def test_a_training_becomes_longer(tmp_path: Path) -> None:
     run("ppo", tmp_path / "longer", steps=128)
     found = run("ppo", tmp_path / "longer")
     assert found.steps == 256
-    assert run("ppo", tmp_path / "longer", steps=128).steps == 256
+    assert run("ppo", tmp_path / "longer", steps=128).steps == 256  # there is nothing left
     for name, value in {"rate.schedule": "linear", "network.log_std_end": -3.0}.items():
         line = RECIPES["ppo"].but(**{name: value, "steps": 64})
         run(line, tmp_path / name)
-        with pytest.raises(UnreadableFile, match=r"recipe\.steps differ"):
+        with pytest.raises(UnreadableFile, match="steps differ"):
             run(line, tmp_path / name, steps=128)
 
 

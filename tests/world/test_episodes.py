@@ -15,7 +15,7 @@ from worlds import PARAMS, PHYSICS, PUSHING, actions, begin, play, same, shared,
 
 from scm_world.errors import InterventionError, NotReset, SnapshotMismatch, UnknownOption
 from scm_world.variables import Draw, Shift
-from scm_world.world import Simulation, WorldSnapshot
+from scm_world.world import Simulation, Snapshot
 
 HERE = Path(__file__).parent
 
@@ -218,7 +218,7 @@ def test_a_snapshot_remembers_what_was_done_at_its_instant(backend: str, task: s
     """Interventions after restoring mean what they would have meant without."""
     world = begin(backend, task)
     world.do({"block.size": Shift(0.005), "tool_block.cartesian_position": Shift([0, 0, 0.1])})
-    start: WorldSnapshot = pickle.loads(pickle.dumps(world.snapshot()))  # noqa: S301
+    start: Snapshot = pickle.loads(pickle.dumps(world.snapshot()))  # noqa: S301
     world.do({"block.size": [0.07, 0.06, 0.066]})
     expected = world.values()
     world.restore(start)

@@ -17,12 +17,11 @@ from scm_world.discovery.data.dataset import (
     TARGETS,
     Column,
     Dataset,
-    Regime,
     check_names,
+    regimes_as_dict,
+    regimes_from_dict,
 )
 from scm_world.errors import DAMAGED, ModelError, UnreadableFile, in_one_line
-from scm_world.queries.plans import FORMAT as PLAN
-from scm_world.queries.plans import Plan
 from scm_world.runs.files import Location, located, read_bytes, read_text, write_whole
 from scm_world.runs.study import Study, settings_in
 
@@ -40,11 +39,7 @@ def shard_name(index: int) -> str:
 
 
 def settings_of(about: dict[str, Any], columns: Sequence[Column], shard: int) -> dict[str, Any]:
-    """Return the settings of a study; its episodes may become more.
-
-    Raises:
-        ModelError: ``about`` is not plain data, or a column has a name that all files have.
-    """
+    """Return the settings of a study; its episodes may become more."""
     check_names(columns)
     found = {**about, ABOUT: {"columns": [asdict(c) for c in columns], "shard": shard}}
     try:
@@ -74,21 +69,12 @@ def write_count(folder: Location, episodes: int, files: int) -> None:
 
 
 def encoded(table: Dataset) -> bytes:
-    """Return rows as a Parquet file, the same bytes every time; regimes are in its metadata.
-
-    Raises:
-        ModelError: A plan has a function without a name.
-    """
+    """Return rows as a Parquet file, the same bytes every time; regimes are in its metadata."""
     import pyarrow as arrow
     from pyarrow import parquet
 
     used, number = np.unique(table.regime, return_inverse=True)
-    acts: dict[str, int] = {}  # many regimes share them: each is written once
-    regimes = []
-    for regime in (table.regimes[kind] for kind in used):
-        done = (json.dumps(act) for act in regime.plan.as_dict()["do"].items())
-        regimes.append([[acts.setdefault(act, len(acts)) for act in done], list(regime.targets)])
-    header = {"about": table.about, "acts": [json.loads(act) for act in acts], "regimes": regimes}
+    header = {"about": table.about, **regimes_as_dict(table.regimes[kind] for kind in used)}
     numbers = {"episode": table.episode, "step": table.step, "regime": number.reshape(-1)}
     texts = [";".join(names) for names in table.target_names]
     columns = {
@@ -105,12 +91,7 @@ def encoded(table: Dataset) -> bytes:
 
 
 def decoded(data: bytes, columns: Sequence[Column], trusted: Sequence[str]) -> Dataset:
-    """Read what ``encoded`` returned.
-
-    Raises:
-        ValueError: It is damaged, or has other columns.
-        ModelError: A plan names a function outside of the trusted packages.
-    """
+    """Read what ``encoded`` returned."""
     import pyarrow as arrow
     from pyarrow import parquet
 
@@ -123,19 +104,11 @@ def decoded(data: bytes, columns: Sequence[Column], trusted: Sequence[str]) -> D
     if file.column_names != [*RESERVED, *names]:
         raise ValueError("it has other columns")
     header = json.loads(file.schema.metadata[KEY])
-    acts = [
-        (name, Plan.from_dict({"format": PLAN, "do": {name: parts}}, trusted=trusted)[name])
-        for name, parts in header["acts"]
-    ]
-    regimes = (
-        Regime(Plan(dict(acts[number] for number in numbers)), tuple(targets))
-        for numbers, targets in header["regimes"]
-    )
     values = [file[name].to_numpy() for name in names]
     return Dataset(
         values=np.stack(values, axis=1) if values else np.empty((file.num_rows, 0)),
         columns=tuple(columns),
-        regimes=tuple(regimes),
+        regimes=regimes_from_dict(header, trusted),
         about=header["about"],
         **{name: file[name].to_numpy().astype(np.int64) for name in NUMBERS},
     )
@@ -147,14 +120,11 @@ def decoded(data: bytes, columns: Sequence[Column], trusted: Sequence[str]) -> D
 def together(settings: Mapping[str, Any], parts: Sequence[Dataset]) -> Dataset:
     """Return the rows of all files as one table, with all that is said of its episodes."""
     about = {name: value for name, value in settings.items() if name != ABOUT}
-    said = {
-        name: {number: each for part in parts for number, each in part.about.get(name, {}).items()}
-        for name in ("refused", "touching")
-    }
-    about |= {"refused": said["refused"]} if said["refused"] else {}
-    if "contacts" in about and "touching" not in about:  # a saved table has it
-        whole = about["contacts"] == "episodes"
-        about["touching"] = {"whole": whole, "episodes": said["touching"]}
+    for name in ("refused", "touching"):
+        found = {
+            number: each for part in parts for number, each in part.about.get(name, {}).items()
+        }
+        about |= {name: found} if found else {}
     return replace(Dataset.joined([replace(part, about={}) for part in parts]), about=about)
 
 

@@ -19,9 +19,10 @@ from scm_world.discovery.data.dataset import (
     Column,
     Dataset,
     Ints,
-    Regime,
     check_names,
     numbers,
+    regimes_as_dict,
+    regimes_from_dict,
     whole_numbers,
 )
 from scm_world.errors import ModelError, UnknownOption
@@ -227,8 +228,8 @@ def as_frame(dataset: Dataset) -> Any:
         data.insert(0, name, getattr(dataset, name).copy())
     about = {
         "columns": [asdict(column) for column in dataset.columns],
-        "regimes": [regime.as_dict() for regime in dataset.regimes],
         "about": dataset.about,
+        **regimes_as_dict(dataset.regimes),
     }
     try:
         data.attrs[KEY] = json.dumps(about)  # one text: pandas copies it at every step
@@ -269,7 +270,7 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
         raise ModelError(lost)
     about = json.loads(frame.attrs[KEY])
     columns = {column["name"]: Column(**column) for column in about["columns"]}
-    hidden = {name for regime in about["regimes"] for name in regime["targets"]}
+    hidden = {name for _, targets in about["regimes"] for name in targets}
     known, targets = {*columns, *hidden}, {name for cell in given for name in cell}
     new = [name for name in names if name not in known]
     if targets & {*new} or targets - ({*names} if new else known):
@@ -283,7 +284,7 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
     return Dataset(
         values=values,
         columns=tuple(columns.get(name, Column(name, name)) for name in names),
-        regimes=tuple(Regime.from_dict(regime, trusted=trusted) for regime in about["regimes"]),
+        regimes=regimes_from_dict(about, trusted),
         about=about["about"],
         **{name: whole_numbers(name, frame[name]) for name in NUMBERS},
     )

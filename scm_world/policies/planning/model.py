@@ -15,7 +15,7 @@ from scm_world._types import Floats
 from scm_world.errors import ActionError, ModelError, UnknownOption, blamed
 from scm_world.runs.processes import cores
 from scm_world.tasks import Task
-from scm_world.world import Simulation, WorldSnapshot
+from scm_world.world import Simulation, Snapshot
 from scm_world.world.batch import Batch
 
 STREAM = "what a planner expects"
@@ -77,7 +77,7 @@ class PlanningModel:
         """Count the copies."""
         return len(self._copies)
 
-    def present(self, world: Simulation) -> WorldSnapshot:
+    def present(self, world: Simulation) -> Snapshot:
         """Say where the rollouts begin, if a world is as it is now.
 
         Args:
@@ -101,7 +101,7 @@ class PlanningModel:
         believed.do(self._do)
         return believed.snapshot()
 
-    def rollouts(self, start: WorldSnapshot, actions: Floats) -> dict[str, Floats]:
+    def rollouts(self, start: Snapshot, actions: Floats) -> dict[str, Floats]:
         """Try sequences of actions out.
 
         Args:

@@ -78,9 +78,9 @@ class Effects:
         """Add what was seen in another probe state."""
         for key, size in other.largest.items():
             self.see(key, size, other.settings.get(key))
-        self.violations = other.violations | self.violations
         for name, size in other.unstable.items():
             self.see_unstable(name, size)
+        self.violations = other.violations | self.violations
         self.changed += other.changed
         self.refused += other.refused
         self.touched |= other.touched
@@ -98,11 +98,11 @@ class Effects:
 
     def edges(self, declared: Container[EdgeKey]) -> set[EdgeKey]:
         """List the edges that were seen: declared ones beyond rounding, and others."""
+        least = FACTOR * self.floor
         return {
             key
             for key, size in self.largest.items()
-            if size > FACTOR * self.floor
-            and (size > RESOLUTION or (self.exact and key not in declared))
+            if size > (least if self.exact and key not in declared else max(least, RESOLUTION))
         }
 
 

@@ -11,7 +11,7 @@ found by halving: causes are left out as long as the difference remains.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import NamedTuple, final
 
@@ -56,25 +56,19 @@ class Run(NamedTuple):
 
 @final
 class Markov:
-    """The test of one world, whose backend decides some of its variables.
-
-    Args:
-        paired: The world, in the probe state in which the test is made.
-    """
+    """The test of one world, whose backend decides some of its variables."""
 
     def __init__(self, paired: Paired) -> None:
         self._paired, self._world, model = paired, paired.world, paired.model
-        deciding = frozenset(self._world.task.decided_by)
+        self._compiled, deciding = self._world.compiled, frozenset(self._world.task.decided_by)
         self._targets = tuple(
             name
             for name in paired.targets
-            if not deciding
-            or deciding.isdisjoint({name, *self._world.compiled.static_order((name,))})
+            if not deciding or deciding.isdisjoint({name, *self._compiled.static_order((name,))})
         )
         self._geometry = {
             v.name for v in model.variables if v.unit in GEOMETRY or isinstance(v.bounds, Rotations)
         }
-        self._compiled = self._world.compiled
         self._parents = {
             name: tuple(p for p in model.declared(name).all_parents if p.lag)
             for name in paired.states
@@ -106,8 +100,6 @@ class Markov:
                 for half in (chosen, changed.keys() - chosen):
                     some = {name: value for name, value in changed.items() if name in half}
                     self._see(some, partial(self._differing, base, (), [], later))
-
-    # --- the pieces -------------------------------------------------------------------------------
 
     def _groups(self, context: Changed) -> list[tuple[Collection[str], list[str]]]:
         """Group the states by their parents; those by contact act only where something touches."""
@@ -214,15 +206,19 @@ class Markov:
         least = 0.0 if self._paired.exact else RESOLUTION
         return {key: size for key, size in found.items() if size > least}
 
-    # --- the causes -------------------------------------------------------------------------------
-
     def _see(self, changed: Changed, differing: Callable[[Changed], dict[Effect, float]]) -> None:
         """Find and note the causes of what differs when everything is changed."""
         found = without_refused(changed, differing, self._geometry) or {}
         for effect in sorted(found, key=lambda one: -found[one])[:BLAMED]:
-            size = partial(self._size, effect, changed, differing)
+
+            def size(names: Collection[str], effect: Effect = effect) -> float:
+                try:
+                    return differing({name: changed[name] for name in names}).get(effect, 0.0)
+                except (InterventionError, EngineFailure):
+                    return 0.0
+
             known = self._known.setdefault(effect, set())
-            if size([]) or not size([*changed]):  # it differs by itself
+            if size([]) or not size(changed):  # it differs by itself
                 self._effects.see_unstable(effect[0], found[effect])
                 continue
             new = [name for name in changed if name not in known]
@@ -234,19 +230,6 @@ class Markov:
             change = np.concatenate([np.ravel(changed[n]) - np.ravel(first[n]) for n in causes])
             setting = setting._replace(kind=f"{setting.kind}, together", change=change)
             self._effects.violations[" & ".join(causes), *effect] = size(causes), setting
-
-    def _size(
-        self,
-        effect: Effect,
-        changed: Mapping[str, Value],
-        differing: Callable[[Changed], dict[Effect, float]],
-        names: list[str],
-    ) -> float:
-        """Compute the effect of some of the changes; 0 if they are refused."""
-        try:
-            return differing({name: changed[name] for name in names}).get(effect, 0.0)
-        except (InterventionError, EngineFailure):
-            return 0.0
 
 
 def fewest(names: list[str], differs: Callable[[list[str]], object]) -> list[str]:

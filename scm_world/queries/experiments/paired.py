@@ -55,13 +55,10 @@ class Paired:
 
     Attributes:
         world: The world; None of equations.
-        model: The causal model.
         targets: The variables that are set; of equations all.
         states: The variables that the backend decides.
-        actions: Where each variable of the action is.
         exact: Whether any difference counts; see ``Effects``.
-        probe: The present probe state.
-        here: What mechanisms are evaluated with in it.
+        here: What mechanisms are evaluated with in the present probe state.
         first: The values in it, actions included.
         setting: Its number and kind.
     """
@@ -86,10 +83,7 @@ class Paired:
     def run(self, number: int, probe: Probe, wanted: Collection[EdgeKey] | None = None) -> Effects:
         """Do all experiments of one probe state in which one variable is changed.
 
-        Args:
-            number: Of the probe state.
-            probe: The probe state.
-            wanted: The declared edges that are looked for; all edges if None.
+        Only the declared edges that are ``wanted`` are looked for; all edges if None.
         """
         effects, rng = Effects(exact=self.exact), np.random.default_rng((self.seed, number))
         self.probe, self.setting = probe, ProbeSetting(number, probe.kind)
@@ -102,8 +96,11 @@ class Paired:
             return effects
         try:
             self.world.restore(probe.snapshot)
-        except SnapshotMismatch:
-            self._see_worn(effects)
+        except SnapshotMismatch:  # a parameter that the backend has changed by itself
+            now, names = self.world.row, self.world.compiled.parameter_keys
+            found = self.world.backend.parameters(names.values())
+            for name, key in names.items():
+                effects.see_unstable(name, gap(found[key], now[name]))
             if not effects.unstable:
                 raise
             return effects
@@ -124,19 +121,8 @@ class Paired:
             effects.see_unstable(name, gap(value, later.values[name]))
         return effects
 
-    def _see_worn(self, effects: Effects) -> None:
-        """Note the parameters that the backend has changed by itself; no state comes back then."""
-        now, names = self.world.row, self.world.compiled.parameter_keys
-        found = self.world.backend.parameters(names.values())
-        for name, key in names.items():
-            effects.see_unstable(name, gap(found[key], now[name]))
-
     def at(self, changed: Mapping[str, Value]) -> Floats:
-        """Go to the probe state and change some variables; return the action, changed likewise.
-
-        Raises:
-            InterventionError: That is impossible.
-        """
+        """Go to the probe state and change some variables; return the action, changed likewise."""
         self.world.restore(self.probe.snapshot)
         request = {name: value for name, value in changed.items() if name not in self.actions}
         if request:
@@ -276,11 +262,7 @@ class Paired:
 
 @contextmanager
 def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM]:
-    """Give a world that is afterwards as it was, one that is made and closed, or equations.
-
-    Raises:
-        UnknownOption: There are options for a world that is made.
-    """
+    """Give a world that is afterwards as it was, one that is made and closed, or equations."""
     system = system.model if isinstance(system, Equations) else system
     if options and isinstance(system, Simulation | SCM):
         raise UnknownOption("option for a world that is made", next(iter(options)), ())

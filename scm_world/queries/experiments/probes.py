@@ -20,7 +20,7 @@ from scm_world.graph import SCM
 from scm_world.policies.planning import action_range
 from scm_world.tasks.base import Scenario
 from scm_world.variables import Box, Exogenous, Measured, Rotations, Variable
-from scm_world.world import Simulation, WorldSnapshot
+from scm_world.world import Simulation, Snapshot
 
 Random = np.random.Generator
 T = TypeVar("T")
@@ -141,7 +141,7 @@ def _drawn(world: Simulation, number: int, rng: Random) -> Probe:
 
 def _go(world: Simulation, rng: Random, *, onward: bool, touching: bool) -> None:
     """Go where random actions lead or anywhere that can be, there to where bodies will touch."""
-    start, found = world.snapshot(), dict[tuple[str, str], WorldSnapshot]()
+    start, found = world.snapshot(), dict[tuple[str, str], Snapshot]()
     actions = rng.uniform(*action_range(world), (LONGEST, world.compiled.n_actions))
     kept = 1 + rng.integers(KEPT)
     steps = LONGEST if onward else LONGEST * FOLLOWED

@@ -1,4 +1,4 @@
-"""Paired simulators: what learners get that do their own, paired experiments.
+"""The learner ``paired``, and the paired simulators on which it experiments.
 
 A unit is run once as it is, and again with something moved and all else the same, noise included.
 An experiment is one such run. The graph is not shown.
@@ -13,36 +13,24 @@ from typing import Any, Protocol, final
 
 import numpy as np
 
-from scm_world._types import Floats, Value, Values
+from scm_world._arguments import whole_number
+from scm_world._types import Value
 from scm_world.discovery.data.recorded import first_name
+from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import InterventionError, ModelError
-from scm_world.graph import SCM, NoiseKey
+from scm_world.graph import SCM
 from scm_world.queries.experiments.effects import Effects, gap
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes
 from scm_world.queries.outcomes import Outcome, read
 from scm_world.queries.samples import Setting
 from scm_world.queries.twins import twins_of
-from scm_world.variables import Box, Exogenous, Noise
+from scm_world.variables import Exogenous
 from scm_world.world import Simulation
 
-SMALL = 1e-6  # of the size of a variable: so little that everything answers in proportion
 MOST = 10_000  # probe states, where the budget is what counts
 OTHER = 1_000_000
 """Units from here on lend their values to the others; none of them is a unit of the experiment."""
-
-
-def paired_effects(
-    system: Simulation | SCM, states: int, seed: int, budget: float = np.inf
-) -> Effects:
-    """Move one variable at a time, in one state or unit after another, as the budget allows."""
-    paired = Paired(system, seed)
-    effects = Effects(exact=paired.exact)
-    for number, probe in enumerate(probes(system, states, seed)):
-        effects.add(paired.run(number, probe))
-        if effects.rollouts >= budget:
-            break
-    return effects
 
 
 class PairedSimulator(Protocol):
@@ -59,121 +47,68 @@ class PairedSimulator(Protocol):
         """
 
 
-@final
-class SCMSimulator:
-    """Paired experiments in a causal model without physics, whose variables are numbers.
-
-    It can move several together. All others are held while some are moved: answers are those of
-    direct effects.
-
-    Attributes:
-        lag: How many control steps later the answers are read.
-        causes: What can be moved.
-        watched: What answers.
-        notes: What it does not show.
-        used: How many experiments there were.
+def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> EstimatedGraph:
+    """Find a graph by moving one variable at a time, in paired experiments.
 
     Args:
-        model: All its variables can be set.
-        seed: Of the units.
-        lag: Whether what is moved is moved at the same instant (0) or one control step before (1);
-            what the model has if None. 1 if it has both.
+        simulator: Does the experiments.
+        seed: Not used: the simulator has its own.
+        budget: How many experiments there are.
+
+    Returns:
+        A graph; ``edge_scores`` are the largest effects over the threshold, in powers of ten.
+    """
+    del seed
+    effects = simulator.effects(whole_number("budget", budget, least=1))
+    names = simulator.names
+    at = {name: i for i, name in enumerate(names)}
+    lags = 1 + max((lag for *_, lag in effects.largest), default=0)
+    size = np.zeros((lags, len(names), len(names)))
+    for (cause, effect, lag), largest in effects.largest.items():
+        size[lag, at[cause], at[effect]] = largest
+    ratio = size / effects.threshold
+    return EstimatedGraph.of(
+        names,
+        ratio > 1.0,
+        edge_scores=np.log10(1.0 + ratio),
+        experiments=effects.rollouts,
+        bound=len(names),  # each is a cause of its own; edges between instants may form cycles
+        notes=(f"floor {effects.floor:g}, threshold {effects.threshold:g}",),
+    )
+
+
+@final
+class SystemSimulator:
+    """Paired experiments on single instants of a world, or of a causal model without physics.
+
+    Args:
+        system: The world, which is not changed, or the model; all variables of this can be set.
+        seed: Of states and values.
 
     Raises:
-        ModelError: A variable cannot be set.
+        ModelError: A variable of the model cannot be set.
     """
 
-    def __init__(self, model: SCM, seed: int = 0, *, lag: int | None = None) -> None:
-        _refuse([v.name for v in model.variables if not v.settable], "cannot be set")
-        self._model, self._seed = model, seed
-        lags = {edge.lag for edge in model.edges}
-        self.lag = max(lags, default=0) if lag is None else lag
-        others = lags - {self.lag}
-        self.notes: tuple[str, ...] = ()
-        if others:
-            self.notes = (f"edges of lag {self.lag} only, and there are others",)
-        self.names = tuple(model)
-        self.causes = self.watched = self.names
-        self.used = 0
+    def __init__(self, system: Simulation | SCM, seed: int = 0) -> None:
+        self._system, self._seed = system, seed
+        self.names = tuple(system if isinstance(system, SCM) else system.model)
+        if isinstance(system, SCM):
+            still = [v.name for v in system.variables if not v.settable]
+            if still:
+                raise ModelError([f"{name!r} cannot be set" for name in still])
 
     def effects(self, budget: int) -> Effects:
         """Move one variable at a time; see ``PairedSimulator``."""
-        units = max(1, budget // (len(self.names) + 2))
-        return paired_effects(self._model, units, self._seed)
-
-    def prepare(self, unit: int) -> None:
-        """Draw a unit, two instants of it, and run it as it is: one experiment.
-
-        Raises:
-            ModelError: A variable is a vector or not real, so that it cannot be moved a little.
-        """
-        still = [v.name for v in self._model.variables if v.shape or v.dtype != "real"]
-        _refuse(still, "is not one real number, so it cannot be moved a little")
-        noise = Noise(self._seed)
-        self._before = self._model.solve(key=NoiseKey(noise, unit, 0))
-        self._key = NoiseKey(noise, unit, 1)
-        self._now = self._model.solve(previous=self._before, key=self._key)
-        self._base = self._mechanisms(self._now, self._before)
-        self.used += 1
-
-    def answers(self, moves: Mapping[str, float]) -> Floats:
-        """Run the unit again with some causes moved: one experiment.
-
-        Args:
-            moves: How far each is moved, in its own size (1 for a variable without bounds).
-
-        Returns:
-            By how much each mechanism gives something else, shape (len(watched),).
-        """
-        source = self._before if self.lag else self._now
-        moved = {
-            **source,
-            **{n: source[n] + by * self._size(n, source) for n, by in moves.items()},
-        }
-        self.used += 1
-        if self.lag:
-            return self._mechanisms(self._now, moved) - self._base
-        return self._mechanisms(moved, self._before) - self._base
-
-    def _size(self, name: str, values: Values) -> Value:
-        bounds = self._model[name].bounds
-        if not isinstance(bounds, Box):
-            return np.ones(())
-        low, high = bounds.bounds((), values)
-        return np.asarray(np.where(np.isfinite(high - low), high - low, 1.0))
-
-    def _mechanisms(self, now: Values, before: Values) -> Floats:
-        """Compute each mechanism; 0 where there is none."""
-        found = (
-            self._model.solve(now, previous=before, key=self._key, only=(name,))[name]
-            if self._model[name].all_parents
-            else 0.0
-            for name in self.watched
-        )
-        return np.array([float(value) for value in found])
-
-
-def _refuse(names: list[str], why: str) -> None:
-    if names:
-        raise ModelError([f"{name!r} {why}" for name in names])
-
-
-@final
-class StepSimulator:
-    """Paired experiments on one control step of a world, in one state after another.
-
-    Args:
-        world: It is reset; its task and options stay.
-        seed: Of states and values.
-    """
-
-    def __init__(self, world: Simulation, seed: int = 0) -> None:
-        self._world, self._seed = world, seed
-        self.names = tuple(world.model)
-
-    def effects(self, budget: int) -> Effects:
-        """Move one variable at a time; see ``PairedSimulator``."""
-        return paired_effects(self._world, MOST, self._seed, budget)
+        system, states, most = self._system, MOST, float(budget)
+        if isinstance(system, SCM):  # each unit costs about one experiment for each variable
+            states, most = max(1, budget // (len(self.names) + 2)), np.inf
+        experiments = Paired(system, self._seed)
+        effects = Effects(exact=experiments.exact)
+        for number, probe in enumerate(probes(system, states, self._seed)):
+            effects.add(experiments.run(number, probe))
+            if effects.rollouts >= most:
+                break
+        return effects
 
 
 @final

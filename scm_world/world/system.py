@@ -1,0 +1,204 @@
+"""An episode of a causal model: what a world with a backend and equations have in common."""
+
+from __future__ import annotations
+
+import secrets
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from scm_world._arguments import whole_number
+from scm_world._types import Floats, Value, Values
+from scm_world.errors import NotReset
+from scm_world.graph import SCM
+from scm_world.variables.subsets import AnyRegion
+from scm_world.world.audit import Audit
+from scm_world.world.compiled_task import ActionVector
+from scm_world.world.philox import CompiledNoise
+from scm_world.world.snapshot import Snapshot
+
+
+class CausalSystem(ABC):
+    """A causal model that is reset, stepped and intervened on.
+
+    Attributes:
+        compiled: Its variables, and the place of each in vectors.
+        noise: Of the seed.
+        episode: Number of the episode.
+        version: Counts changes of anything but what a step changes.
+    """
+
+    compiled: ActionVector
+    noise: CompiledNoise
+    episode: int
+    version: int = 0
+    _started = False
+    _closed = False
+    _lost = ""  # why the state is not known any more
+
+    # --- reports ------------------------------------------------------------------------------
+
+    @property
+    def model(self) -> SCM:
+        """The causal model, without the interventions of this episode."""
+        return self.compiled.model
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether there is an episode."""
+        return self._started
+
+    @property
+    def observed(self) -> tuple[str, ...]:
+        """The names of the variables in ``observation_space``: all of them."""
+        return tuple(self.model)
+
+    @property
+    def action_low(self) -> Floats:
+        """Lower end of all actions, shape (n_actions,)."""
+        return self.compiled.action_bounds[0]
+
+    @property
+    def action_high(self) -> Floats:
+        """Upper end of all actions, shape (n_actions,)."""
+        return self.compiled.action_bounds[1]
+
+    @property
+    def action_space(self) -> gymnasium.spaces.Box:
+        """The space of actions in SI units."""
+        return gymnasium.spaces.Box(*self.compiled.action_bounds, dtype=np.float64)
+
+    @property
+    def observation_space(self) -> gymnasium.spaces.Dict:
+        """The space of the observed variables by name, in SI units; nothing is clipped."""
+        box, shapes = gymnasium.spaces.Box, {n: self.model.declared(n).shape for n in self.observed}
+        return gymnasium.spaces.Dict(
+            {name: box(-np.inf, np.inf, shape, np.float64) for name, shape in shapes.items()}
+        )
+
+    def __getitem__(self, name: str) -> Value:
+        """Return the present value of one variable.
+
+        Raises:
+            UnknownVariable: No variable has this name.
+            NotReset: There is no episode yet.
+        """
+        self.model.declared(name)
+        return np.array(self.evaluate((name,))[name])
+
+    def values(self) -> dict[str, Value]:
+        """Return the present value of every variable, as copies."""
+        now = self.evaluate()
+        return {name: np.array(now[name]) for name in self.model}
+
+    @abstractmethod
+    def evaluate(self, names: tuple[str, ...] | None = None) -> Values:
+        """Compute some variables, all if None, and return all present values without copying them.
+
+        For loops that cannot wait; the values change with the next step.
+
+        Raises:
+            NotReset: There is no episode yet.
+        """
+
+    # --- episodes -----------------------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        episode: int = 0,
+        do: Mapping[str, Any] | None = None,
+        space: AnyRegion | None = None,
+    ) -> Audit | None:
+        """Begin an episode. Nothing that was done in the last one remains.
+
+        Args:
+            seed: Of the noise. Without it the next episode of the same noise begins, or of a
+                fresh seed if there was none.
+            episode: Number of the episode, with a seed.
+            do: An intervention that takes part in the beginning: a block of another size stands
+                on the floor. It holds until the next reset.
+            space: In which every target of it must lie; see ``do``.
+
+        Returns:
+            The audit of the intervention, or None if there was none.
+
+        Raises:
+            InterventionError: The intervention was refused. The episode has begun without it.
+        """
+        if seed is not None:
+            number = whole_number("episode", episode, least=0)
+            self.noise, self.episode = CompiledNoise(seed), number
+        elif not self._started:
+            self.noise, self.episode = CompiledNoise(secrets.randbits(63)), 0
+        else:
+            self.episode += 1
+        self._begin()
+        return self.do(do, space=space) if do else None
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Begin the episode that ``noise`` and ``episode`` say."""
+
+    @abstractmethod
+    def _have_no_episode(self) -> None:
+        """Be as a system is that was never reset."""
+
+    @abstractmethod
+    def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
+        """Intervene now, without advancing time. All of it happens, or none of it."""
+
+    @abstractmethod
+    def snapshot(self) -> Snapshot:
+        """Return everything that decides the future."""
+
+    @abstractmethod
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go back to a snapshot, bit for bit."""
+
+    @contextmanager
+    def unchanged(self) -> Iterator[None]:
+        """Go back to the present afterwards, bit for bit, also after an error or Ctrl-C.
+
+        A world without an episode has none afterwards. One whose backend has lost the state still
+        needs a reset or a snapshot.
+
+        Example:
+            >>> from scm_world.world import Simulation
+            >>> world = Simulation("pushing", backend="fake")
+            >>> world.reset(seed=5)
+            >>> with world.unchanged():
+            ...     world.reset(seed=0)
+            ...     world.step(np.zeros(9))
+            >>> world.noise.seed, world.index
+            (5, 0)
+        """
+        back = self.way_back()
+        try:
+            yield
+        finally:
+            back()
+
+    def way_back(self) -> Callable[[], None]:
+        """Return what goes back to the present, bit for bit; see ``unchanged``."""
+        started, lost, noise = self._started, self._lost, (self.noise, self.episode)
+        before = self.snapshot() if started and not lost else None
+
+        def back() -> None:
+            if before is not None:
+                self.restore(before)
+            elif not started:
+                self._have_no_episode()
+            else:
+                self._lost, (self.noise, self.episode) = lost, noise
+
+        return back
+
+    def _require_episode(self) -> None:
+        if not self._started:
+            raise NotReset(closed=self._closed)
