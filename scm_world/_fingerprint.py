@@ -113,19 +113,12 @@ def differing(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:
 
 
 def changes(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
-    """Name the settings in which two runs differ, also inside of others.
-
-    Example:
-        >>> changes({"seed": 1, "how": {"rate": 0.1, "n": 4}}, {"seed": 1, "how": {"rate": 0.2}})
-        ['how.rate', 'how.n']
-    """
-    found: list[str] = []
+    """Name the settings in which two runs differ, and of their ``"fingerprint"`` the parts."""
+    found = []
     for name in dict.fromkeys((*there, *here)):
         before, now = there.get(name), here.get(name)
         if name == "fingerprint" and isinstance(before, dict) and isinstance(now, dict):
             found += differing(before, now)
-        elif isinstance(before, dict) and isinstance(now, dict):
-            found += [f"{name}.{inner}" for inner in changes(before, now)]
         elif before != now:
             found.append(name)
     return list(dict.fromkeys(found))

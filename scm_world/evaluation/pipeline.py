@@ -133,11 +133,12 @@ def evaluate(
         env=env,
         trusted=trusted,
     )
-    with pool_of(engine, workers) as pool, Study(out, "evaluation", {}) as study:
+    with pool_of(engine, workers) as pool:
         pool.check("task with several workers", setup.task)
         for (name, _), agent in setup.agents.items():
             pool.check(f"policy {name!r} with several workers", agent.policy)
-        rows = _all_rows(setup, pool, study, progress, tell)
+        with Study(out, "evaluation", {}) as study:
+            rows = _all_rows(setup, pool, study, progress, tell)
     policies = {who: agent.policy for who, agent in setup.agents.items()}
     return Evaluation(setup.about(), frame_of(rows), policies)
 

@@ -245,7 +245,7 @@ def test_bad_actions_are_told_with_their_place(how: str, workers: int, tmp_path:
         "episode": 3,
         "control step": 12,
     }
-    assert len(contents(tmp_path)) == (1 if workers == 1 else len(contents(tmp_path)))
+    assert len([*tmp_path.glob("parts/*.json")]) in ((1,) if workers == 1 else (0, 1))
 
 
 @pytest.mark.parametrize("workers", [1, 2])
