@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from typing import Any
-
-from gymnasium.envs.registration import EnvSpec
 
 from scm_world._arguments import one_of
 from scm_world._types import Values
@@ -31,13 +28,6 @@ def reset_options(options: Any, known: Iterable[str]) -> dict[str, Any]:
     for name in given:
         one_of("reset option", name, [*known])
     return dict(given)
-
-
-def limited(spec: EnvSpec | None, steps: int) -> EnvSpec | None:
-    """Return what Gymnasium knows of an environment the length of its episodes, if it has none."""
-    if spec is None or spec.max_episode_steps is not None:
-        return spec
-    return replace(spec, max_episode_steps=steps)
 
 
 def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, final
 from weakref import WeakKeyDictionary
 
@@ -23,7 +23,6 @@ from scm_world.env.arguments import (
     RESETS,
     asked,
     beginning_structure,
-    limited,
     reset_options,
 )
 from scm_world.env.observer import Observation, Observer, Observing
@@ -301,7 +300,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        self.__dict__["spec"] = limited(spec, self.limit)
+        if spec is not None and spec.max_episode_steps is None:
+            spec = replace(spec, max_episode_steps=self.limit)
+        self.__dict__["spec"] = spec
 
     def as_action(self, command: ArrayLike) -> NDArray[np.float64]:
         """Return the action, now, that leads to a command in SI units, shape (n,).
@@ -567,7 +568,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             SnapshotMismatch: It is none of an environment, or one of another task or engine.
         """
         if not isinstance(snapshot, EnvSnapshot):
-            raise SnapshotMismatch(f"{snapshot!r} is no snapshot; give what snapshot() returned")
+            found = type(snapshot).__name__
+            raise SnapshotMismatch(f"{found} is no snapshot; give what snapshot() returned")
         self.world.restore(snapshot.world)
         self._done = list(snapshot.interventions)
 
